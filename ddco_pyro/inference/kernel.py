@@ -34,11 +34,12 @@ from ddco_pyro.model.elementary import (
     logarithm,
     number,
     put,
+    record,
     where,
     whole,
     write,
 )  # fmt: skip
-from ddco_pyro.model.passes import LAST, PLAIN, VIEW, Lot, Room, Rows, View, fill, give, slope, take, task
+from ddco_pyro.model.passes import LAST, Lot, Room, Rows, View, fill, give, slope, take, task
 
 IMPOSSIBLE = -1
 """Marks a joint choice with an option below a choice 0, and a caller that is itself below a choice 0."""
@@ -54,9 +55,6 @@ BLOCK = 32
 
 SMALL, LARGE = 1e-300, 1e300
 """Mass of a step, and backward messages, beyond which a trajectory is done in log space."""
-
-TASK = 8 * (PLAIN + 6 * VIEW)
-"""Bytes of a task."""
 
 releasing = numba.njit(cache=True, error_model="numpy", nogil=True)
 """Keeps the compiled function on disk, with all that it calls. numba looks at this file alone: delete ``*.nb?`` in
@@ -205,6 +203,30 @@ class Tasks(NamedTuple):
     number: int
     address: int
     constants: int
+
+
+class Run(NamedTuple):
+    """What a run reads.
+
+    :param found: address of a row for each trajectory, [N, n + 2]: the gradients of what steps share, then the
+        log-likelihood, and whether it is exact.
+    :param evidence: of the joint choices, [N, T, S]; ``marginals`` where those of the choices go, [N, T, Σ C_d].
+    """
+
+    lots: Lots
+    tasks: Tasks
+    evidence: View
+    marginals: View
+    found: int
+    n: Sizes
+    of: Shape
+
+
+def run(address: int, index: int) -> Run:
+    """A run of those at an address."""
+
+
+record(run, Run)
 
 
 # --- forward ----------------------------------------------------------------------------------------------------------
@@ -436,7 +458,7 @@ def _fill(lot: Lot, tasks: Tasks, evidence: View, kept: Plane, rows: Rows, room:
         for j in range(columns):
             put(rows.control, t, j, 0.0)
     for i in range(tasks.number):
-        fill(task(tasks.address + i * TASK), lot, tasks.constants, kept, rows, room)
+        fill(task(tasks.address, i), lot, tasks.constants, kept, rows, room)
     if evidence.address != 0:
         take(evidence, lot, whole(of.starts, 1), 1, room.raw)
         for t in range(lot.begin, lot.end):
@@ -494,17 +516,14 @@ def _carve(buffer: int, steps: int, columns: int) -> tuple[Plane, int]:
 
 
 @releasing
-def eliminate(
-    first: int, last: int, lots: Lots, tasks: Tasks, evidence: View, marginals: View, found: int, buffer: int,
-    n: Sizes, of: Shape,
-) -> None:  # fmt: skip
-    """Of lots ``first`` to ``last``, fill what is ``found``, and write the posteriors and gradients that tasks ask for.
+def eliminate(first: int, last: int, of_run: int, buffer: int) -> None:
+    """Of lots ``first`` to ``last``, fill what is found, and write the posteriors and gradients that tasks ask for.
 
-    :param found: address of a row for each trajectory, [N, n + 2]: the gradients of what steps share, then the
-        log-likelihood, and whether it is exact.
-    :param evidence: of the joint choices, [N, T, S]; ``marginals`` where those of the choices go, [N, T, Σ C_d].
+    :param of_run: address of a :class:`Run`.
     :param buffer: address of :meth:`Sizes.numbers` numbers for the longest trajectory.
     """
+    what = run(of_run, 0)
+    lots, tasks, found, n, of = what.lots, what.tasks, what.found, what.n, what.of
     raw, place = _carve(buffer, BLOCK, n.room)
     controls, place = _carve(place, BLOCK, n.controls + 1)
     std, place = _carve(place, BLOCK, n.room)
@@ -541,7 +560,7 @@ def eliminate(
         value, exact = lanes(0.0), lanes(0.0) == 0.0
         for begin in range(0, steps, BLOCK):
             lot = Lot(who, lengths, begin, min(begin + BLOCK, steps), own)
-            value = value + _fill(lot, tasks, evidence, kept, rows, room, of)
+            value = value + _fill(lot, tasks, what.evidence, kept, rows, room, of)
             value = value + _forward(lot, rows, messages, spread, scale, of)
         for begin in range((steps - 1) // BLOCK * BLOCK, -1, -BLOCK):
             lot = Lot(who, lengths, begin, min(begin + BLOCK, steps), own)
@@ -549,9 +568,9 @@ def eliminate(
                 _clear(plane, BLOCK)
             exact = exact & _backward(lot, rows, messages, spread, scale, back, sums, of)
             for i in range(tasks.number):
-                slope(task(tasks.address + i * TASK), lot, tasks.constants, kept, rows, sums, total, room)
-            if marginals.address != 0:
-                give(marginals, lot, n.marginals, 1, sums.choice)
+                slope(task(tasks.address, i), lot, tasks.constants, kept, rows, sums, total, room)
+            if what.marginals.address != 0:
+                give(what.marginals, lot, n.marginals, 1, sums.choice)
         put(total, 0, n.shared, value)
         put(total, 0, n.shared + 1, where(exact, 1.0, 0.0))
         for lane in range(LANES):

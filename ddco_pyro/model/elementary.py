@@ -9,19 +9,40 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_type_hints
 
 import numba
 import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
+from numba import _dynfunc
 from numba.core import cgutils, types
-from numba.core.typing.templates import ConcreteTemplate, infer_global
-from numba.extending import lower_builtin, models, register_model
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler
+from numba.core.typing.templates import AttributeTemplate, ConcreteTemplate, infer_getattr, infer_global
+from numba.extending import lower_builtin, lower_getattr_generic, models, register_model
 
 Array = np.ndarray
 
+class _Linked(JITCodeLibrary):
+    def finalize(self) -> None:
+        for library in dict.fromkeys(self._linking_libraries):
+            self._final_module.link_in(library._get_module_for_linking(), preserve=True)
+        self._finalized = True
+
+
+def _none(library, fndesc, env):
+    return _dynfunc.make_function(fndesc.lookup_module(), fndesc.qualname, "", 0, env, (library,))
+
+
+class _Part(Compiler):
+    def define_pipelines(self):
+        self.state.targetctx = self.state.targetctx.subtarget(get_executable=_none)
+        self.state.library = _Linked(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
+        return super().define_pipelines()
+
+
 jit = numba.njit(  # type: ignore[call-overload]
-    error_model="numpy", fastmath={"contract"}, no_cpython_wrapper=True, no_cfunc_wrapper=True
+    error_model="numpy", fastmath={"contract"}, no_cpython_wrapper=True, no_cfunc_wrapper=True, pipeline_class=_Part
 )
 """Compiles functions that compiled functions alone call."""
 
@@ -47,6 +68,26 @@ class _Kind(types.Type):  # type: ignore[misc]
 Lanes, Mask = type("Lanes", (_Kind,), {})("Lanes"), type("Mask", (_Kind,), {})("Mask")
 Number, Whole, Rows = types.float64, types.intp, types.NamedUniTuple(types.intp, 2, Plane)
 
+class Record(types.Type):  # type: ignore[misc]
+    """The address of the fields of a NamedTuple, one right after the other: whole numbers, and such records."""
+
+    def __init__(self, of: type) -> None:
+        super().__init__(of.__name__)
+        self.fields, self.words = {}, 0
+        for name, kind in get_type_hints(of).items():
+            inner = Record(kind) if hasattr(kind, "_fields") else None
+            self.fields[name] = self.words, inner or Whole
+            self.words += inner.words if inner else 1
+
+
+@infer_getattr
+class _Fields(AttributeTemplate):  # type: ignore[misc]
+    key = Record
+
+    def generic_resolve(self, of: Record, name: str) -> Any:
+        return of.fields[name][1]
+
+
 I1, I32, I64, DOUBLE = ir.IntType(1), ir.IntType(32), ir.IntType(64), ir.DoubleType()
 MASK, INTEGERS, WORDS, DOUBLES, FLOATS = (ir.VectorType(one, LANES) for one in (I1, I32, I64, DOUBLE, ir.FloatType()))
 
@@ -60,6 +101,22 @@ def _model(kind: Any, value: Any) -> None:
 
 _model(Lanes, DOUBLES)
 _model(Mask, MASK)
+
+
+@register_model(Record)
+class _RecordModel(models.PrimitiveModel):  # type: ignore[misc]
+    def __init__(self, manager: Any, of: Any) -> None:
+        super().__init__(manager, of, I64)
+
+
+@lower_getattr_generic(Record)
+def _field(context: Any, builder: Any, of: Record, value: Any, name: str) -> Any:
+    words, kind = of.fields[name]
+    if kind != Whole:
+        return builder.add(value, I64(8 * words))
+    read = builder.load(_place(builder, value, I64(words), I64))
+    read.set_metadata("invariant.load", builder.module.add_metadata([]))
+    return read
 
 
 def _constant(vector: Any, value: int) -> Any:
@@ -325,6 +382,17 @@ _instruction(gather, _by_precision(_gather), Lanes, (*(Whole,) * LANES, types.bo
 _instruction(scatter, _by_precision(_scatter), types.void, (*(Whole,) * LANES, types.boolean, Lanes))
 for _function, _emit in ((gather_square, _gather_square), (scatter_square, _scatter_square)):
     _instruction(_function, _by_precision(_emit), types.void, (*(Whole,) * LANES, types.boolean, Rows, Whole, Whole))
+
+
+def record(function: Any, of: type) -> None:
+    """Compile calls of ``function(address, index)`` to a record: which one of those side by side at an address."""
+    kind = Record(of)
+
+    def emit(builder: Any, address: Any, index: Any) -> Any:
+        return builder.add(address, builder.mul(index, I64(8 * kind.words)))
+
+    _instruction(function, emit, kind, (Whole, Whole))
+
 
 LOG2_E = math.log2(math.e)
 LN2_HIGH, LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10

@@ -28,6 +28,7 @@ from ddco_pyro.model.elementary import (
     logarithm,
     number,
     put,
+    record,
     scatter,
     scatter_square,
     where,
@@ -121,9 +122,6 @@ class Task(NamedTuple):
     posterior: View
 
 
-PLAIN, VIEW = len(Task._fields) - 6, len(View._fields)
-
-
 class Lot(NamedTuple):
     """Four trajectories side by side, and a block of their steps.
 
@@ -167,24 +165,11 @@ class Room(NamedTuple):
     of_std: Plane
 
 
-@jit
-def view(numbers: int, which: int) -> View:
-    """A view of a :class:`Task` in numbers."""
-    i = PLAIN + VIEW * which
-    return View(
-        whole(numbers, i), whole(numbers, i + 1), whole(numbers, i + 2), whole(numbers, i + 3), whole(numbers, i + 4),
-        whole(numbers, i + 5),
-    )  # fmt: skip
+def task(address: int, index: int) -> Task:
+    """A task of those at an address."""
 
 
-@jit
-def task(numbers: int) -> Task:
-    """The task in numbers at an address."""
-    return Task(
-        whole(numbers, 0), whole(numbers, 1), whole(numbers, 2), whole(numbers, 3), whole(numbers, 4),
-        whole(numbers, 5), whole(numbers, 6), whole(numbers, 7), whole(numbers, 8), view(numbers, 0), view(numbers, 1),
-        view(numbers, 2), view(numbers, 3), view(numbers, 4), view(numbers, 5),
-    )  # fmt: skip
+record(task, Task)
 
 
 @jit
