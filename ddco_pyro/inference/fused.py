@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from ddco_pyro.inference import kernel, logspace
-from ddco_pyro.inference.kernel import Lots, Run, Shape, Sizes, Structure, Tasks
+from ddco_pyro.inference.kernel import Lots, Shape, Sizes, Structure, Tasks
 from ddco_pyro.model.elementary import LANES, Array
 from ddco_pyro.model.links import Link, links_of
 from ddco_pyro.model.passes import NORMAL, Pass, view_of
@@ -181,20 +181,22 @@ def eliminate(
     trajectories.reshape(-1)[-run.number :], each.reshape(-1)[-run.number :] = order, run.lengths[order]
     found = np.empty((run.number, run.shared + 2))
     tasks, constants = np.array(run.tasks, dtype=np.int64), np.concatenate([NOTHING, *run.constants])
-    reading = Run(
-        Lots(trajectories.ctypes.data, each.ctypes.data),
-        Tasks(len(tasks), tasks.ctypes.data, constants.ctypes.data),
-        view_of(joint),
-        view_of(choices),
+    reading = [
+        *Lots(trajectories.ctypes.data, each.ctypes.data),
+        *Tasks(len(tasks), tasks.ctypes.data, constants.ctypes.data),
+        *view_of(joint),
+        *view_of(choices),
         found.ctypes.data,
-        sizes,
-        Shape.of(tables.sizes),
-    )
-    numbers = np.array(list(chain.from_iterable(x if isinstance(x, tuple) else (x,) for x in reading)))
+        *Shape.of(tables.sizes),
+    ]
 
     def some(first: int, last: int) -> None:
-        buffer = _buffer(sizes.numbers(int(each[first:last, -1].max())))
-        kernel.eliminate(first, last, numbers.ctypes.data, buffer.ctypes.data)
+        rows, columns = sizes.planes(int(each[first:last, -1].max())).T
+        ends = np.cumsum(LANES * rows * columns)
+        buffer = _buffer(int(ends[-1]))
+        addresses = buffer.ctypes.data + 8 * np.append(0, ends[:-1])
+        numbers = np.append(reading, np.stack([addresses, columns], 1))  # a :class:`kernel.Run`
+        kernel.eliminate(first, last, numbers.ctypes.data)
 
     kernel.on_threads(some, each.sum(1))
     run.take_shared(found)

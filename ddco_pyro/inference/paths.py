@@ -18,14 +18,26 @@ from torch import Tensor
 from ddco_pyro.inference.arguments import refuse_impossible
 from ddco_pyro.inference.kernel import Structure, on_threads, releasing
 from ddco_pyro.model.elementary import Array, jit
-from ddco_pyro.model.passes import Rows
 from ddco_pyro.model.tables import Tables
+
 
 class Path(NamedTuple):
     """Choices h and terminations b of every level, lowest first, each int64 [..., N, T]; -1 past the lengths."""
 
     choices: tuple[Tensor, ...]
     terminations: tuple[Tensor, ...]
+
+
+class Rows(NamedTuple):
+    """Logarithms of every step: tables of all levels side by side, [N, T, n].
+
+    :param choice: the evidence of the joint choices; no columns where there is none.
+    """
+
+    selection: Array
+    termination: Array
+    control: Array
+    choice: Array
 
 
 def most_likely_path(tables: Tables, lengths: Tensor) -> Path:
@@ -148,19 +160,19 @@ def _share(first: float, second: float, best: bool) -> float:
 
 @jit
 def _forward(n: int, steps: int, rows: Rows, best: bool, keeps: Array, ways: Array, of: Structure) -> float:
-    """Fill ``keeps`` and ``ways``, both [1 + T, messages], of one trajectory; returns log p(ξ), or the best path's.
+    """Fill ``keeps`` and ``ways``, both [1 + T, messages], of trajectory n; returns log p(ξ), or the best path's.
 
     keeps[t] has, for each entry of a level's message, the probability that its last choice was kept at t, not selected.
     ways[t] has, for the choices of each level below one entry, the distribution function of the choice that terminated
     at t. The first entries of ways[T] are the distribution function of the last joint choice.
     """
-    depth, entries = len(of.sizes), keeps.shape[1]
-    messages, spread = ways[steps], keeps[steps]
-    for i in range(entries):
+    depth, weighted = len(of.sizes), rows.choice.size > 0
+    messages, spread = ways[steps], keeps[steps]  # rows that nothing else needs before the end
+    for i in range(len(messages)):
         messages[i] = -np.inf
     messages[of.starts[depth]] = 0.0  # at t = 0 everything is selected
     for t in range(steps):
-        for i in range(entries):
+        for i in range(len(messages)):
             keeps[t, i] = 0.0
         for d in range(depth if t > 0 else 0):
             c, below = of.sizes[d], of.starts[d]
@@ -180,7 +192,9 @@ def _forward(n: int, steps: int, rows: Rows, best: bool, keeps: Array, ways: Arr
                     if first < 0:
                         spread[below + j] = -np.inf
                     else:
-                        kept = messages[below + j] + rows.termination[n, t, of.ends[d] + 2 * j - 2] if t > 0 else -np.inf
+                        kept = -np.inf
+                        if t > 0:
+                            kept = messages[below + j] + rows.termination[n, t, of.ends[d] + 2 * j - 2]
                         selected = mass + rows.selection[n, t, first + j]
                         spread[below + j] = _plus(kept, selected, best)
                         keeps[t, below + j] = _share(kept, selected, best)
@@ -188,7 +202,7 @@ def _forward(n: int, steps: int, rows: Rows, best: bool, keeps: Array, ways: Arr
         for s in range(len(of.actors)):
             actor = of.actors[s]
             messages[s] = spread[s] + rows.control[n, t, actor] if actor >= 0 else -np.inf
-            if rows.choice.shape[2]:
+            if weighted:
                 messages[s] += rows.choice[n, t, s]
     return _cumulative(ways[steps, : of.starts[1]], best)
 
@@ -224,16 +238,16 @@ def _back(
 @releasing
 def _trace_all(
     first: int, last: int, rows: Rows, lengths: Array, best: bool, uniforms: Array, joint: Array, terminated: Array,
-    possible: Array, of: Structure, keeps: Array, ways: Array
+    possible: Array, of: Structure, keeps: Array, ways: Array,
 ) -> None:  # fmt: skip
     """Of trajectories ``first`` to ``last``, fill the ``joint`` choices [M, N, T] of M paths, and how many levels
     ``terminated`` before each.
 
     ``possible`` [N] says which trajectories have a probability above 0; the paths of others mean nothing.
 
-    :param rows: logarithms, [N, T, n]; ``choice`` holds the evidence of the joint choices.
     :param best: the most likely path instead of a draw from the posterior.
     :param uniforms: numbers uniform in [0, 1), [M, N, 1 + T, 2·D].
+    :param keeps: room for :func:`_forward`; ``ways`` likewise.
     """
     for n in range(first, last):
         steps = lengths[n]

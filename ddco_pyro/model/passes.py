@@ -140,7 +140,7 @@ class Lot(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """What the passes give of every step, or posteriors: tables of all levels side by side, planes or arrays [T, n].
+    """What the passes give of every step, or posteriors: tables of all levels side by side.
 
     :param selection: selection probabilities, Σ callers·C_d columns.
     :param termination: termination probabilities, Σ 2·k_d columns.
@@ -149,10 +149,10 @@ class Rows(NamedTuple):
         columns. It has no columns where there are none.
     """
 
-    selection: Any
-    termination: Any
-    control: Any
-    choice: Any
+    selection: Plane
+    termination: Plane
+    control: Plane
+    choice: Plane
 
 
 class Room(NamedTuple):
@@ -165,7 +165,7 @@ class Room(NamedTuple):
     of_std: Plane
 
 
-def task(address: int, index: int) -> Task:
+def task(address: int, index: int) -> Any:
     """A task of those at an address."""
 
 
