@@ -1,8 +1,9 @@
 """What fits, gradient steps and exact inference cost: ``python benchmarks/performance.py [PART ...]``.
 
 Each part measures pairs that run one right after the other, on one thread. A part's rows go to
-``benchmarks/results/PART.json`` as soon as they are known, and all tables into ``docs/performance.md``. Parts that are
-not named are measured unless their result is what this very code has given: an interrupted run goes on.
+``benchmarks/results/PART.json`` as soon as they are known, all tables into ``docs/performance.md``, and all ratios into
+``docs/results/performance.csv``, which pages quote. Parts that are not named are measured unless their result is what
+this very code has given: an interrupted run goes on.
 """
 
 from __future__ import annotations
@@ -32,10 +33,12 @@ from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.events import EpochEnded, Event
 from ddco_pyro.inference import Engine, fused
 from ddco_pyro.inference.engines import log_likelihood
+from ddco_pyro.metrics import write_table
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.tables import Tables, complete
 from ddco_pyro.spec import Spec, load_spec, parse_spec, with_overrides
+from ddco_pyro.study.cells import COLUMNS
 from ddco_pyro.training.data import demonstrations, parts
 from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.restarts import Trainer
@@ -43,6 +46,7 @@ from ddco_pyro.training.restarts import Trainer
 ROOT = Path(__file__).parents[1]
 COMMAND = ROOT / ".venv/bin/ddco-pyro" if (ROOT / ".venv").exists() else Path(sys.executable).with_name("ddco-pyro")
 RESULTS, PAGE = ROOT / "benchmarks/results", ROOT / "docs/performance.md"
+RATIOS = ROOT / "docs/results/performance.csv"
 BEGIN, END = "<!-- tables, written by make bench -->\n", "<!-- end of tables -->\n"
 SIZES = ((100, 15), (50, 200), (50, 2000))
 FEATURES, CONTROLS = 10, 3
@@ -382,17 +386,29 @@ def measure(part: str, again: bool) -> None:
     path.write_text(text({"rows": rows}, made_by))
 
 
-def tables() -> str:
-    """All kept rows in Markdown, a table for each part."""
-    shown = []
-    for part, rows in PARTS.items():
+def known() -> Iterator[tuple[str, str, list[Row]]]:
+    """Of each part that has been measured: its name, the command that measured it, and its rows."""
+    for part in PARTS:
         path = RESULTS / f"{part}.json"
         if path.exists():
             kept: dict[str, Any] = json.loads(path.read_text())
-            made = sentence(kept["provenance"][0])
-            title = " ".join((rows.__doc__ or "").split())
-            shown.append(f"### {part}\n\n{title} {made}\n\n" + table([Row(**r) for r in kept["results"]["rows"]], AIMS))
+            yield part, sentence(kept["provenance"][0]), [Row(**row) for row in kept["results"]["rows"]]
+
+
+def tables() -> str:
+    """All kept rows in Markdown, a table for each part."""
+    shown = []
+    for part, made, rows in known():
+        title = " ".join((PARTS[part].__doc__ or "").split())
+        shown.append(f"### {part}\n\n{title} {made}\n\n{table(rows, AIMS)}")
     return "\n".join(shown)
+
+
+def ratios() -> Iterator[dict[str, Any]]:
+    """All kept ratios as rows of a tidy table; the method is what was measured."""
+    for part, _, rows in known():
+        for row in rows:
+            yield {"study": part, "method": row.first, "measure": f"over {row.second}", "value": f"{row.ratio:.4g}"}
 
 
 def main() -> None:
@@ -409,6 +425,7 @@ def main() -> None:
         measure(part, again=bool(asked.parts))
     above, _, rest = PAGE.read_text().partition(BEGIN)
     PAGE.write_text(f"{above}{BEGIN}{tables()}{END}{rest.partition(END)[2]}")
+    write_table(RATIOS, COLUMNS, ratios())
 
 
 if __name__ == "__main__":

@@ -263,6 +263,6 @@ def test_killed_at_very_many_moments(cases: dict[str, Case], tmp_path: Path, nam
     while sum(one.total for one in found) < 10:  # ninety in all; a moment that comes after the end kills nothing
         folder = tmp_path / str(len(found))
         folder.mkdir()
-        found.append(check(cases[name], folder, kills=5, seed=len(found)))
+        found.append(check(cases[name], folder, kills=10, seed=len(found)))
     together, alone = sum(one.together for one in found), sum(one.alone for one in found)
     print(f"{name}: killed {together + alone} times, {alone} of them without its helpers")
