@@ -119,7 +119,7 @@ Lines = Record(Plane)
 class _Fields(AttributeTemplate):  # type: ignore[misc]
     key = Record
 
-    def generic_resolve(self, value: Record, attr: str) -> Any:
+    def generic_resolve(self, value: Record, attr: str) -> Any:  # type: ignore[override]
         return value.fields[attr][1]
 
 
