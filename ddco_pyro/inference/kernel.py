@@ -481,7 +481,7 @@ def _fill(lot: Lot, own: Run) -> Any:
     for i in range(tasks.number):
         fill(task(tasks.address, i), lot, tasks.constants, kept, rows, room)
     if evidence.address != 0:
-        take(evidence, lot, whole(of.starts, 1), 1, room.raw)
+        take(evidence, lot, whole(of.starts, 1), np.intp(1), room.raw)
         for t in range(lot.begin, lot.end):
             for s in range(whole(of.starts, 1)):
                 if choices > 0:
@@ -550,7 +550,7 @@ def eliminate(first: int, last: int, of_run: int) -> None:
         for lane in range(LANES):
             write(total.address, lane, float(whole(lengths, lane)))
         until = at(total, 0, 0)
-        _clear(total, 1)
+        _clear(total, np.intp(1))
         value, exact = lanes(0.0), lanes(0.0) == 0.0
         for begin in range(0, steps, BLOCK):
             lot = Lot(who, lengths, begin, min(begin + BLOCK, steps), until)
@@ -559,12 +559,12 @@ def eliminate(first: int, last: int, of_run: int) -> None:
         for begin in range((steps - 1) // BLOCK * BLOCK, -1, -BLOCK):
             lot = Lot(who, lengths, begin, min(begin + BLOCK, steps), until)
             for plane in (sums.selection, sums.termination, sums.control, sums.choice):
-                _clear(plane, BLOCK)
+                _clear(plane, np.intp(BLOCK))
             exact = exact & _backward(lot, own)
             for i in range(tasks.number):
                 slope(task(tasks.address, i), lot, tasks.constants, own.kept, rows, sums, total, own.room)
             if own.marginals.address != 0:
-                give(own.marginals, lot, sums.choice.columns, 1, sums.choice)
+                give(own.marginals, lot, sums.choice.columns, np.intp(1), sums.choice)
         put(total, 0, shared, value)
         put(total, 0, shared + 1, where(exact, 1.0, 0.0))
         for lane in range(LANES):

@@ -68,7 +68,9 @@ jit = numba.njit(  # type: ignore[call-overload]
     no_rewrites=True,
     pipeline_class=_Inner,
 )
-"""Compiles functions that compiled functions alone call, and that index no tuple."""
+"""Compiles functions that compiled functions alone call, and that index no tuple.
+
+A literal argument has a function compiled once more; ``np.intp(1)`` has not."""
 
 LANES = 4
 """Numbers in a register of AVX2; compilers of other processors split or join registers."""

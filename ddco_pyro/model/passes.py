@@ -282,7 +282,7 @@ def slope(
         for t in range(lot.end - lot.begin):
             for j in range(columns):
                 put(room.of_raw, t, j, at(found, t, of.first + j))
-        give(of.posterior, lot, columns, 1, room.of_raw)
+        give(of.posterior, lot, columns, np.intp(1), room.of_raw)
     if of.of_raw.address == 0:
         return
     if of.kind <= LOGARITHMS:
@@ -390,7 +390,7 @@ def _take_controls(of: Task, lot: Lot, room: Room) -> None:
     numbers = 1 if of.kind == CATEGORIES else of.size
     if of.kind == SWITCHES and of.option > 0:
         numbers = of.option
-    take(of.controls, lot, numbers, 1, room.controls)
+    take(of.controls, lot, numbers, np.intp(1), room.controls)
     if of.option > 0:
         for t in range(lot.end - lot.begin):
             rest = lanes(0.0) == 0.0
