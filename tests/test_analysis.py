@@ -7,13 +7,21 @@ import math
 import numpy as np
 import pytest
 import torch
-from oracle import brute_force, random_tables
+from oracle import brute_force, paths, random_tables
+from scipy import stats
 
-from ddco_pyro.evaluation.options import divergences, option_use
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.evaluation.options import Finding, diagnose, divergences, option_use
 from ddco_pyro.evaluation.worth import paired
-from ddco_pyro.inference import Posterior, posterior
+from ddco_pyro.inference import Posterior, log_likelihood, posterior
+from ddco_pyro.inference.posteriors import decompose
+from ddco_pyro.metrics import Alike, Use
+from ddco_pyro.model.batch import Batch, encode
 from ddco_pyro.model.emissions import Gaussian
+from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
+from ddco_pyro.spec import parse_spec
+from ddco_pyro.training.networks import Dimensions
 
 
 def test_use_of_options_by_sums_over_every_path():
@@ -126,3 +134,209 @@ def test_its_error_covers_the_truth_as_often_as_it_says():
 
 def test_one_demonstration_alone_has_no_error():
     assert paired(np.array([2.0]), np.array([1.0]), np.array([4.0])).standard_error is None
+
+
+# --- the parts of a log-likelihood ------------------------------------------------------------------------------------
+
+
+LENGTHS = (3, 2)
+
+
+def make_demonstrations() -> Demonstrations:
+    """Two demonstrations of three control dimensions, the second of them constant."""
+    random = np.random.default_rng(0)
+    return Demonstrations(
+        tuple(
+            Demonstration(
+                f"demo_{number}",
+                {"pose": random.normal(size=(steps, 2))},
+                np.stack([random.normal(5, 3, steps), np.full(steps, 0.5), random.normal(0, 0.1, steps)], axis=1),
+            )
+            for number, steps in enumerate(LENGTHS)
+        )
+    )
+
+
+DEMOS = make_demonstrations()
+
+
+def make(counts: tuple[int, ...], emits: tuple[str, ...]) -> Hierarchy:
+    """Random networks that differ between options; σ of each level is its own."""
+    levels = [
+        {"name": f"level-{d}", "count": k, "policy": {"network": "linear"} | ({"emits": list(emits)} if d else {})}
+        for d, k in enumerate(counts)
+    ]
+    model = {"hierarchy": {"levels": levels, "meta_policy": {"network": "linear", "emits": list(emits)}}}
+    spec = parse_spec(
+        {
+            "demonstrations": {"path": "unused.hdf5"},
+            "observations": ["pose"],
+            "control": {"std": {"learn": True}},
+            **(model if counts else {"baseline": {"kind": "flat", "policy": {"network": "linear"}}}),
+        }
+    )
+    torch.manual_seed(1)
+    size = Dimensions.of(DEMOS)
+    hierarchy = Hierarchy(spec, size.shapes, size.control_size, size.steps, size.constant)
+    hierarchy.encoder.fit(DEMOS)
+    hierarchy.scaling.fit(DEMOS)
+    with torch.no_grad():
+        for parameter in hierarchy.parameters():
+            parameter.add_(torch.randn_like(parameter))
+    return hierarchy.eval()
+
+
+def exact(hierarchy: Hierarchy) -> tuple[Outputs, Batch]:
+    """What the networks say, in float64, and the batch."""
+    batch = encode(DEMOS, hierarchy.encoder, hierarchy.scaling)
+    with torch.no_grad():
+        outputs = hierarchy(batch.inputs)
+    return outputs.map(torch.Tensor.double), batch
+
+
+@pytest.mark.parametrize(
+    ("counts", "emits"),
+    [((), ("control",)), ((3,), ("options",)), ((2,), ("options", "control")), ((2, 2), ("options", "control"))],
+    ids=["flat", "options", "hybrid", "two hybrid levels"],
+)
+def test_parts_are_those_of_every_path(counts: tuple[int, ...], emits: tuple[str, ...]) -> None:
+    hierarchy = make(counts, emits)
+    outputs, batch = exact(hierarchy)
+    found = decompose(outputs, batch)
+    assert found.dimensions.shape == (2, 2)
+    tables = outputs.tables(batch.actions.double())
+    for n, length in enumerate(LENGTHS):
+        densities = _densities(hierarchy, outputs, batch, n)
+        every = [(path, joint) for path, _, joint in paths(tables, n, length, [1 + k for k in counts])]
+        total = sum(joint for _, joint in every)
+        dimensions, options = np.zeros(2), 0.0
+        for path, joint in every:
+            given = np.sum([densities[_actor(choices)][t] for t, choices in enumerate(path)], axis=0)  # [A']
+            posterior, log_prior = joint / total, math.log(joint) - given.sum()
+            dimensions += posterior * given
+            options += posterior * (log_prior - math.log(posterior))
+        np.testing.assert_allclose(found.dimensions[n], dimensions, rtol=1e-9)
+        np.testing.assert_allclose(found.options[n], options, rtol=1e-9, atol=1e-12)
+
+
+def _actor(choices: tuple[int, ...]) -> tuple[int, int]:
+    """Level and option of who emits the control: the lowest choice that is not 0, else the meta-policy."""
+    return next(((level, choice - 1) for level, choice in enumerate(choices) if choice), (len(choices), 0))
+
+
+def _densities(hierarchy: Hierarchy, outputs: Outputs, batch: Batch, n: int) -> dict[tuple[int, int], np.ndarray]:
+    """log N(a_td; μ_d, σ_d²) of each caller, [T, A'], with scipy and in the control's own units."""
+    shift, scale = hierarchy.scaling.shift.numpy(), hierarchy.scaling.scale.numpy()
+
+    def units(scaled: torch.Tensor) -> np.ndarray:
+        return scaled.detach().double().numpy() * scale + shift
+
+    actions = units(batch.actions[n, : LENGTHS[n]])
+    return {
+        (level, option): stats.norm.logpdf(
+            actions, units(emission.mean[n, : LENGTHS[n], option]), emission.std.detach().numpy() * scale
+        )
+        for level, emission in enumerate(outputs.emissions)
+        if emission is not None
+        for option in range(emission.mean.shape[2])
+    }
+
+
+@pytest.mark.parametrize("counts", [(), (3,), (2, 2)])
+def test_parts_sum_to_the_log_likelihood(counts: tuple[int, ...]) -> None:
+    hierarchy = make(counts, ("options", "control") if counts else ("control",))
+    outputs, batch = exact(hierarchy)
+    found = decompose(outputs, batch)
+    whole = hierarchy.tabulate(batch)
+    np.testing.assert_allclose(
+        found.dimensions.sum(1) + found.options, log_likelihood(whole, batch.lengths).detach(), rtol=1e-6
+    )
+    assert (found.options <= 0).all()
+    assert bool((found.options == 0).all()) == (not counts)
+
+
+# --- signs of a degenerate solution -----------------------------------------------------------------------------------
+
+
+def level(*shares, durations=None):
+    """Options that are selected ten times in each of two demonstrations."""
+    durations = durations or [5.0] * len(shares)
+    return [
+        Use(choice=choice, share=share, selected=20.0, demonstrations=2.0, duration=duration)
+        for choice, (share, duration) in enumerate(zip(shares, durations, strict=True))
+    ]
+
+
+def use(*demonstrations):
+    """The use of options under a posterior that is certain: of each demonstration, segments ``(option, steps)``."""
+    size = 1 + max(option for segments in demonstrations for option, _ in segments)
+    steps = max(sum(length for _, length in segments) for segments in demonstrations)
+    active, selected = (torch.zeros(len(demonstrations), steps, size, dtype=torch.float64) for _ in range(2))
+    for row, segments in enumerate(demonstrations):
+        start = 0
+        for option, length in segments:
+            active[row, start : start + length, option] = 1
+            selected[row, start, option] = 1
+            start += length
+    return option_use(Posterior((active,), (selected,), (active,)))
+
+
+def short(option, selections, duration=1.0):
+    return Finding("never_persisting", 1, option, duration, selections=selections)
+
+
+def lasting(duration):
+    return [level(0.0, 0.5, 0.5, durations=[None, duration, 5.0])]
+
+
+@pytest.mark.parametrize(
+    ("levels", "found"),
+    [
+        ([], []),
+        ([level(0.0, 0.3, 0.3, 0.4)], []),
+        ([level(0.0, 0.0099, 0.5, 0.4901)], [Finding("unused", 1, 1, 0.0099)]),
+        ([level(0.0, 0.01, 0.5, 0.49)], []),
+        ([level(0.0, 0.1, 0.9)], []),
+        ([level(0.0, 0.099, 0.901)], [Finding("dominating", 1, 2, 0.901)]),
+        ([level(0.0, 1.0)], []),  # a single option cannot dominate
+        (lasting(1.49), [short(1, 10.0, 1.49)]),
+        (lasting(1.5), []),
+        (lasting(None), []),
+        ([level(0.5, 0.25, 0.25, durations=[1.0, 5.0, 5.0])], []),
+        ([level(0.51, 0.245, 0.245, durations=[1.0, 5.0, 5.0])], [Finding("high_fitting", 1, 0, 0.51)]),
+        # an unused option is not also said to be short
+        ([level(0.0, 0.001, 0.4995, 0.4995, durations=[None, 1.0, 5.0, 5.0])], [Finding("unused", 1, 1, 0.001)]),
+        # the meta-policy does all the work of option 1, which ends at once and is selected again; option 2 lasts
+        (use(*[[(1, 1)] * 6 + [(2, 6)]] * 4), [short(1, 6.0)]),
+        # two options take turns at every step
+        (use(*[[(1, 1), (2, 1)] * 4] * 3), [short(1, 4.0), short(2, 4.0)]),
+        # the first reach of every demonstration, and a grasp: each is selected once and ends by design
+        (use(*[[(1, 1), (2, 6), (3, 1), (2, 7)]] * 4), []),
+        # one demonstration in ten flickers; that it is not in the others is no excuse
+        (use([(1, 1)] * 10, *[[(2, 5), (3, 5)]] * 9), [short(1, 10.0)]),
+    ],
+)
+def test_signs_of_a_degenerate_solution(levels, found):
+    assert diagnose(levels) == found
+
+
+def pair(first, second, divergence):
+    return Alike(options=(first, second), divergence=divergence)
+
+
+@pytest.mark.parametrize(("divergence", "redundant"), [(0.0999, True), (0.1, False)])
+def test_redundant_below_a_tenth_of_a_nat(divergence, redundant):
+    alike = [pair(1, 2, 3.0), pair(1, 3, divergence), pair(2, 3, 4.0)]
+    found = diagnose([level(0.0, 0.3, 0.3, 0.4)], [alike])
+    assert found == ([Finding("redundant", 1, 3, divergence, other=1)] if redundant else [])
+
+
+def test_an_unused_option_is_not_also_said_to_be_redundant():
+    found = diagnose([level(0.0, 0.001, 0.5, 0.499)], [[pair(1, 2, 0.0), pair(1, 3, 0.0), pair(2, 3, 1.0)]])
+    assert [one.kind for one in found] == ["unused"]
+
+
+def test_control_by_a_caller_above_does_not_count_for_the_one_below():
+    upper = level(0.6, 0.2, 0.2)
+    lower = level(0.7, 0.15, 0.15)  # the upper options emit control in 0.1 of the 0.4 in which they act
+    assert [(one.kind, one.level) for one in diagnose([lower, upper])] == [("high_fitting", 2)]

@@ -7,16 +7,19 @@ import json
 import math
 from dataclasses import replace
 
+import h5py
 import numpy as np
 import pytest
 import toy_task
 from scipy import stats
 
-from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
 from ddco_pyro.events import DemonstrationsDone
 from ddco_pyro.simulation.collect import cache_folder, cache_path, collect
 from ddco_pyro.simulation.episodes import run_episode
-from ddco_pyro.spec import DemonstrationsSpec
+from ddco_pyro.spec import DemonstrationsSpec, SpecError, parse_spec, with_overrides
+from ddco_pyro.training.data import demonstrations, dimensions
+from ddco_pyro.training.networks import Dimensions, build_hierarchy, check_networks
 
 TASK = "toy_task:task"
 SPEC = DemonstrationsSpec(count=5, seed=20)
@@ -104,15 +107,6 @@ def test_another_version_of_a_simulator_or_of_the_tasks_package_has_another_file
     assert (cache_path(toy_task.task, TASK, SPEC) == named) == (package == "toy-task")
 
 
-def test_a_file_of_ones_own_is_written_and_then_kept(tmp_path):
-    path = tmp_path / "new" / "demos.hdf5"
-    assert collect(TASK, SPEC, path) == path
-    before = path.stat().st_mtime_ns
-    collect(TASK, SPEC, path)
-    assert path.stat().st_mtime_ns == before
-    assert [one.name for one in path.parent.iterdir()] == ["demos.hdf5"]
-
-
 def test_where_the_cache_is(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
     monkeypatch.setenv("DDCO_PYRO_CACHE", str(tmp_path / "own"))
@@ -128,3 +122,150 @@ def test_an_unknown_supervisor_is_refused_in_one_line():
     message = r"^task 'toy' has no policy 'expert' to record \(it has: open_loop, supervisor\)$"
     with pytest.raises(DemonstrationsError, match=message):
         collect(TASK, DemonstrationsSpec(supervisor="expert"))
+
+
+# --- which demonstrations a spec means --------------------------------------------------------------------------------
+
+
+SIZE = Dimensions({"offsets": (4,), "camera": (8, 8, 3), "visited": (1,)}, control_size=2, steps=12)
+
+
+def spec(**changes):
+    given = {"task": TASK, "observations": ["offsets"], "baseline": "flat", "demonstrations": {"count": 3}}
+    return parse_spec(given | changes)
+
+
+@pytest.fixture
+def path(tmp_path):
+    records = [
+        Demonstration(f"demo_{n}", {"offsets": np.zeros((n, 7))}, np.arange(3.0 * n).reshape(n, 3)) for n in (4, 9)
+    ]
+    Demonstrations(tuple(records)).write(tmp_path / "demos.hdf5")
+    return tmp_path / "demos.hdf5"
+
+
+def test_dimensions_come_from_the_file(path):
+    for given in (spec(demonstrations={"path": str(path)}), spec(task=None, demonstrations={"path": str(path)})):
+        assert dimensions(given) == Dimensions({"offsets": (7,)}, 3, 9)
+
+
+def test_what_never_changes_is_constant(path):
+    """In all demonstrations: dimension 1 changes from one to the other, within neither."""
+    with h5py.File(path, "r+") as file:
+        for name, value in (("demo_4", 1.0), ("demo_9", 2.0)):
+            file[f"data/{name}/actions"][:, 1:] = [value, -0.25]
+    found = dimensions(spec(demonstrations={"path": str(path)}))
+    assert (found.constant, found.control_size) == ({2: -0.25}, 3)
+    assert [one.note for one in found.control[1:]] == [
+        "takes two values, 1 and 2",
+        "constant (-0.25): no part of the model, emitted as it is",
+    ]
+    hierarchy = build_hierarchy(spec(control={"kind": "gaussian", "scale": [4.0, 2.0, 8.0]}), found)
+    assert hierarchy.scaling.scale.tolist() == [4.0, 2.0]
+    with pytest.raises(SpecError, match=r"control.scale: has 2 numbers, but the control has 3 dimensions"):
+        check_networks(spec(control={"scale": [4.0, 2.0]}), found)
+
+
+def test_a_control_that_never_changes_is_refused(path):
+    with h5py.File(path, "r+") as file:
+        for group in file["data"].values():
+            group["actions"][:] = [0.5, -0.0, 1]
+    with pytest.raises(DemonstrationsError, match=r"^actions: every dimension is constant \(0.5, 0, 1\) in all"):
+        dimensions(spec(demonstrations={"path": str(path)}))
+
+
+def test_demonstrations_can_be_left_out(path):
+    """Nothing of them is looked at: they may hold NaN, and other shapes than the rest."""
+    with h5py.File(path, "r+") as file:
+        file["data/demo_4/actions"][2] = np.nan
+        file["mask/valid"] = [b"demo_4", b"demo_9"]
+    left = spec(demonstrations={"path": str(path), "exclude": ["demo_4"]})
+    found = demonstrations(left)
+    assert (found.names, dict(found.masks)) == (("demo_9",), {"valid": ("demo_9",)})
+    with pytest.raises(DemonstrationsError, match=r"demo_4: actions is nan at step 2, index \[0\]; repair it, or"):
+        demonstrations(spec(demonstrations={"path": str(path)}))
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (["demo_9", "demo_04"], r"exclude: there is no demonstration 'demo_04' \(did you mean 'demo_4'\?\)$"),
+        (["demo_4", "demo_9"], r"demonstrations.exclude: leaves every demonstration out; keep some$"),
+    ],
+)
+def test_leaving_out_the_wrong_ones_is_refused(path, names, message):
+    for ask in (demonstrations, dimensions):
+        with pytest.raises(DemonstrationsError, match=message):
+            ask(spec(demonstrations={"path": str(path), "exclude": names}))
+
+
+def test_dimensions_come_from_the_task_where_there_is_no_file_yet(tmp_path):
+    absent = {"path": str(tmp_path / "later.hdf5")}
+    for given in (spec(), spec(demonstrations=absent)):
+        assert dimensions(given) == Dimensions({"offsets": (4,), "visited": (1,)}, 2, 1)
+    assert not any(tmp_path.iterdir())
+
+
+def test_demonstrations_are_collected_where_there_is_no_file_yet(tmp_path):
+    path, told = tmp_path / "later.hdf5", []
+    given = spec(demonstrations={"path": str(path), "count": 3, "labels": "phase"})
+    found = demonstrations(given, told.append)
+    assert (found.names, told[-1]) == (("demo_0", "demo_1", "demo_2"), DemonstrationsDone(3, 3))
+    assert (set(found[0].observations), set(found[0].labels)) == ({"offsets"}, {"phase"})
+    assert path.exists()
+
+
+def test_demonstrations_may_come_from_another_task(tmp_path):
+    """``toy_task:short`` has episodes of 5 steps; the task to roll out in does not exist."""
+    elsewhere = {"task": "toy_task:short", "path": str(tmp_path / "demos.hdf5"), "count": 3}
+    given = spec(task="not_registered", demonstrations=elsewhere)
+    assert dimensions(given) == Dimensions({"offsets": (4,), "visited": (1,)}, 2, 5)
+    assert demonstrations(given).lengths == (5, 5, 5)
+
+
+LEVEL = {"count": 2, "policy": {"network": "linear"}}
+CONV = {"network": "conv"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"observations": ["offsets", "pose", "jaw"]}, r"^observations: there is no pose, jaw \(there are: camera, of"),
+        ({"control": {"scale": [1.0]}}, r"^control\.scale: has 1 numbers, but the control has 2 dimensions$"),
+        (
+            {"observations": ["visited"], "report": {"trajectory": "visited"}},
+            r"^report\.trajectory: 'visited' has shape \[1\] at each step; name a vector of three numbers or more$",
+        ),
+        ({"observations": ["camera"]}, r"^baseline\.policy: reads vectors, but camera are images"),
+        (
+            {"baseline": None, "hierarchy": {"levels": [LEVEL, LEVEL | {"name": "task", "termination": CONV}]}},
+            r"^hierarchy\.levels\.1\.termination: needs an image",
+        ),
+        (
+            {"baseline": None, "hierarchy": {"levels": [LEVEL], "meta_policy": {"network": "nowhere:Net"}}},
+            r"^hierarchy\.meta_policy: network 'nowhere:Net' cannot be imported",
+        ),
+    ],
+)
+def test_a_spec_that_does_not_fit_says_where(changes, message):
+    with pytest.raises(SpecError, match=message):
+        build_hierarchy(spec(**changes), SIZE)
+
+
+def test_only_what_the_spec_names_has_to_be_in_order(path):
+    with h5py.File(path, "r+") as file:
+        file["data/demo_9/obs/unused"] = np.full((9, 1), np.nan)
+    assert dimensions(spec(demonstrations={"path": str(path)})) == Dimensions({"offsets": (7,)}, 3, 9)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ({"hierarchy.levels.0.policy.hidden": [10**6, 10**6]}, r"the networks have \d+ parameters, more than 50000000"),
+        ({"hierarchy.levels.0.policy.hidden": [10**30]}, "the networks have more parameters than a machine can count"),
+        ({"hierarchy.levels.0.count": 10**9}, "the levels have 1000000001 joint choices, at most 10000"),
+    ],
+)
+def test_a_model_that_fills_the_memory_is_refused_before_it_is_made(toy_spec, overrides, message):
+    with pytest.raises(SpecError, match=message):
+        check_networks(with_overrides(toy_spec, overrides), Dimensions({"offsets": (4,), "visited": (1,)}, 2, 12))

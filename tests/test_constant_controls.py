@@ -16,11 +16,10 @@ import ddco_pyro
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.comparison import CompareError, compare
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.exporting import TOLERANCE, export, runner
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.selection import folds as dividing
-from ddco_pyro.spec import Spec, parse_spec, with_overrides
+from ddco_pyro.spec import Spec, parse_spec
 
 STILL = {1: 0.1, 3: -7.0}
 """Dimension to value; 0.1 is no float32."""
@@ -139,30 +138,6 @@ def test_the_controller_emits_them(whole: Fit, reduced: Fit, control: str) -> No
     acting, expected = (Controller(one.hierarchy, control, seed=3) for one in (whole, reduced))
     for observation in observations():
         check_control(acting.act(observation), expected.act(observation))
-
-
-@pytest.mark.parametrize("control", ["mean", "sample"])
-def test_many_at_once_emit_them(whole: Fit, reduced: Fit, control: str) -> None:
-    controls = []
-    for one in (whole, reduced):
-        controller = Controller(one.hierarchy, control)
-        controller.reset_all(range(6))
-        controls.append(controller.act_all(observations()))
-    for found, expected in zip(*controls, strict=True):
-        check_control(found, expected)
-
-
-@pytest.mark.parametrize("control", ["mean", "sample"])
-@pytest.mark.usefixtures("numpy_alone")
-def test_exported_controllers_emit_them(whole: Fit, tmp_path: Path, control: str) -> None:
-    changed = Fit(with_overrides(whole.spec, {"rollout.control": control}), whole.hierarchy)
-    ((difference, _),) = export(changed, tmp_path).values()
-    assert difference < TOLERANCE
-    exported, original = runner.Runner(tmp_path), changed.controller()
-    for observation in observations():
-        found, expected = exported.act(observation), original.act(observation)
-        assert {d: found[d] for d in STILL} == STILL
-        np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
 def test_the_monitor_takes_whole_controls(whole: Fit, reduced: Fit) -> None:

@@ -95,16 +95,6 @@ def test_an_option_that_always_ends_is_followed_by_a_draw_from_eta():
     assert stats.chisquare(observed, 500 * eta).pvalue > P_VALUE
 
 
-def test_the_first_choice_is_drawn_from_eta_by_the_seed():
-    eta = np.array([0.6, 0.3, 0.1])
-    controller = Controller(by_hand(MEANS, [SELDOM] * 3, np.log(eta)))
-    first = []
-    for seed in range(500):
-        controller.reset(seed)
-        first += play(controller, 1)[0]
-    assert stats.chisquare(np.bincount(first, minlength=4)[1:], 500 * eta).pvalue > P_VALUE
-
-
 def test_options_end_as_often_as_psi_says():
     """Among four equally likely options an ending shows as a change in three cases of four."""
     means = [[0.0, float(k)] for k in range(4)]

@@ -141,6 +141,7 @@ def test_a_run_of_a_file_that_has_changed_is_not_shown(changing: Path) -> None:
         (run, ["report", run]),
         (run / "baselines" / "flat", ["report", run / "baselines" / "flat"]),
         (run, ["merge", run, "--out", changing / "merged"]),
+        (run, ["compare", run, run / "baselines" / "flat", "--out", changing / "compared"]),
     ):
         assert call(*command) == (2, "", f"ddco-pyro: {REFUSED.format(folder=folder, what=what)}\n")
     assert contents(changing) == before
@@ -152,22 +153,6 @@ def test_what_makes_no_difference_is_not_refused(changing: Path, tmp_path: Path)
     run = shutil.copytree(changing / "interrupted", tmp_path / "run")
     ddco_pyro.fit(run / "spec.yaml", out=run)
     assert (run / "model.safetensors").read_bytes() == (changing / "run" / "model.safetensors").read_bytes()
-
-
-def test_other_demonstrations_from_memory_are_refused(tmp_path: Path) -> None:
-    """A finished run of them is no result of these."""
-    demos = labelled()
-    masked = replace(demos, masks={"valid": demos.names[3:5]})
-    records = tuple(replace(one, labels={"phase": np.ones(len(one), int)}) for one in demos)
-    spec = with_overrides(spec_of(tmp_path / "unused.hdf5"), {"compare_with": [], "training.epochs": 1})
-    fit = ddco_pyro.fit(spec, labelled(), out=tmp_path / "run")
-    assert ddco_pyro.fit(spec, labelled(), out=tmp_path / "run").metrics == fit.metrics
-    before = contents(tmp_path)
-    for other, what in ((masked, "mask/valid"), (replace(demos, demonstrations=records), "labels/phase")):
-        with pytest.raises(BadInput) as refused:
-            ddco_pyro.fit(spec, other, out=tmp_path / "run")
-        assert str(refused.value) == REFUSED.format(folder=tmp_path / "run", what=f"{what} changed")
-    assert contents(tmp_path) == before
 
 
 def test_a_baseline_of_other_demonstrations_is_not_taken_over(finished: Path, tmp_path: Path) -> None:

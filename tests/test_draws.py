@@ -12,9 +12,9 @@ import torch
 from hierarchies import make_hierarchy
 from oracle import brute_force, paths
 from planted import make_spec, make_truth, plant
+from random_demonstrations import of_states
 from scipy import stats
 
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.inferred import infer
 from ddco_pyro.fitting.draws import Boundary, Draws, draw, matched
@@ -22,16 +22,6 @@ from ddco_pyro.inference import sample_paths
 from ddco_pyro.model.tables import NEVER, Tables
 
 LENGTHS = (4, 2, 3)
-
-
-def demonstrations(lengths=LENGTHS) -> Demonstrations:
-    random = np.random.default_rng(0)
-    return Demonstrations(
-        tuple(
-            Demonstration(f"demo_{n}", {"state": random.normal(size=(steps, 3))}, random.normal(size=(steps, 2)))
-            for n, steps in enumerate(lengths)
-        )
-    )
 
 
 def drawn(hierarchy, demos, draws, seed=0, chains=1) -> Draws:
@@ -43,7 +33,7 @@ def drawn(hierarchy, demos, draws, seed=0, chains=1) -> Draws:
 @pytest.mark.parametrize(("counts", "steps"), [((3,), 4), ((2, 1), 3), ((1, 2, 1), 2)])
 def test_draws_have_the_probabilities_of_the_paths(counts, steps) -> None:
     """Whole paths of all levels, and u, v and w, by chi-square with the expected counts of a sum over every path."""
-    hierarchy, demos, draws = make_hierarchy(counts, ("options", "control")), demonstrations((steps, steps - 1)), 3000
+    hierarchy, demos, draws = make_hierarchy(counts, ("options", "control")), of_states((steps, steps - 1)), 3000
     found = drawn(hierarchy, demos, draws)
     (piece,) = infer(hierarchy, demos)
     assert found.log_likelihood == pytest.approx(piece.log_likelihood[None])
@@ -79,7 +69,7 @@ def _agree(counts: np.ndarray, probabilities: np.ndarray, draws: int) -> None:
 
 
 def test_past_the_end_there_is_nothing() -> None:
-    found = drawn(make_hierarchy((2, 2)), demonstrations(), 5)
+    found = drawn(make_hierarchy((2, 2)), of_states(LENGTHS), 5)
     assert found.demonstrations == ("demo_0", "demo_1", "demo_2")
     for options, starts in zip(found.options.values(), found.starts.values(), strict=True):
         assert (options.shape, options.dtype, starts.dtype) == ((1, 5, 3, 4), np.int8, bool)
@@ -96,15 +86,15 @@ def test_a_demonstrations_draws_depend_on_its_place_and_the_seed_alone() -> None
     whole, some, other = (
         drawn(hierarchy, demos, 6, seed).options["level-1"]
         for demos, seed in (
-            (demonstrations(lengths), 1),
-            (demonstrations(lengths[:2]), 1),
-            (demonstrations(lengths), 2),
+            (of_states(lengths), 1),
+            (of_states(lengths[:2]), 1),
+            (of_states(lengths), 2),
         )
     )
     np.testing.assert_array_equal(whole[:, :, :2], some)
     assert not np.array_equal(whole, other)
     assert not np.array_equal(whole[:, 0], whole[:, 1])
-    both = drawn(hierarchy, demonstrations(lengths), 6, 1, chains=2).options["level-1"]
+    both = drawn(hierarchy, of_states(lengths), 6, 1, chains=2).options["level-1"]
     np.testing.assert_array_equal(both[:1], whole)
     assert not np.array_equal(both[0], both[1])
 
@@ -143,7 +133,7 @@ STATISTICS = {
 
 
 def test_a_model_with_other_numbers_is_numbered_like_the_first() -> None:
-    hierarchy, demos, order = make_hierarchy((3,), network="linear"), demonstrations((60, 50)), [2, 0, 1]
+    hierarchy, demos, order = make_hierarchy((3,), network="linear"), of_states((60, 50)), [2, 0, 1]
     other = deepcopy(hierarchy)
     with torch.no_grad():
         level = other.levels[0]
@@ -235,7 +225,7 @@ def test_a_boundary_is_looked_for_between_its_neighbours_and_with_its_options() 
 
 def test_a_data_tree_holds_the_draws_by_name() -> None:
     pytest.importorskip("xarray")
-    found = drawn(make_hierarchy((2, 3)), demonstrations(), 5, chains=2)
+    found = drawn(make_hierarchy((2, 3)), of_states(LENGTHS), 5, chains=2)
     tree = found.to_datatree()
     option = tree["posterior"]["level-2"]
     assert option.dims == ("chain", "draw", "demonstration", "step")
@@ -254,6 +244,6 @@ def test_what_is_missing_is_named(monkeypatch: pytest.MonkeyPatch, toy_run) -> N
 
     monkeypatch.setitem(sys.modules, "xarray", None)
     with pytest.raises(BadInput, match=r"pip install 'ddco-pyro\[xarray\]'"):
-        drawn(make_hierarchy((2,)), demonstrations(), 2).to_datatree()
+        drawn(make_hierarchy((2,)), of_states(LENGTHS), 2).to_datatree()
     with pytest.raises(BadInput, match="is a flat policy without options"):
         toy_run.baselines["flat"].draws(toy_run.demonstrations)

@@ -62,11 +62,6 @@ def test_the_table_is_what_the_episodes_gave(rolled, rows):
         np.testing.assert_equal({key: float(row[key]) for key in ("success", "error")}, episode.outcome)
 
 
-def test_progress_is_told_for_every_episode(rolled):
-    *_, told, _ = rolled
-    assert told == [EpisodeEnded(name, len(METHODS) * EPISODES) for name in METHODS for _ in range(EPISODES)]
-
-
 def test_metrics_can_be_computed_again_from_the_table(rolled, rows):
     run, results, _, before = rolled
     metrics = json.loads((run.folder / "metrics.json").read_text())

@@ -45,18 +45,10 @@ def test_gradient_is_the_papers_gradient_equation(emits):
         torch.testing.assert_close(ours, paper, atol=1e-9, rtol=1e-7)
 
 
-def test_one_option_that_never_ends_is_flat_behaviour_cloning():
+@pytest.mark.parametrize("counts", [(1,), ()])
+def test_one_option_or_none_is_flat_behaviour_cloning(counts):
     """With k = 1 the latents say nothing, so the likelihood is the product of the option's Gaussians."""
-    hierarchy, batch = make_hierarchy((1,)), make_batch()
-    tables = hierarchy.tabulate(batch)
-    mean = hierarchy(batch.inputs).emissions[0].mean[:, :, 0]
-    density = Normal(mean.double(), 0.7).log_prob(batch.actions.double()).sum(-1)
-    alive = torch.arange(4) < batch.lengths[:, None]
-    torch.testing.assert_close(log_likelihood(tables, batch.lengths), (density * alive).sum(1), atol=1e-4, rtol=0)
-
-
-def test_a_baseline_is_the_gaussian_of_its_policy():
-    hierarchy, batch = make_hierarchy(()), make_batch()
+    hierarchy, batch = make_hierarchy(counts), make_batch()
     mean = hierarchy(batch.inputs).emissions[0].mean[:, :, 0]
     density = Normal(mean.double(), 0.7).log_prob(batch.actions.double()).sum(-1)
     alive = torch.arange(4) < batch.lengths[:, None]

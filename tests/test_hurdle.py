@@ -13,7 +13,7 @@ from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.controls import control_dimensions, control_parts, described
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.exporting import TOLERANCE, export, runner
-from ddco_pyro.spec import ControlSpec, SpecError, dump_spec, load_spec, parse_spec, with_overrides
+from ddco_pyro.spec import ControlSpec, SpecError, load_spec, parse_spec, with_overrides
 
 
 def spec_of(options=3, epochs=6, path="unused.hdf5", **control):
@@ -183,14 +183,6 @@ def test_a_controller_rests_as_often_as_the_demonstrations(fitted):
     for dimension, value in ((0, 0.0), (1, STILL)):
         share = (np.concatenate(steps)[:, dimension] == value).mean()
         assert abs(share - (shown[:, dimension] == value).mean()) < 0.1
-
-
-def test_commands_say_it_in_a_line(fitted, tmp_path):
-    (tmp_path / "spec.yaml").write_text(dump_spec(fitted.spec))
-    line = "control dimensions 1-2: hurdle (exactly 0.3 in"
-    checked = call("check", tmp_path / "spec.yaml")
-    assert sum(said.startswith(line) for said in checked.out.splitlines()) == 1
-    assert line in call("inspect", fitted.spec.demonstrations.path).out
 
 
 @pytest.mark.parametrize("row", ROWS)

@@ -15,7 +15,7 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.hdf5 import DemonstrationsError
 from ddco_pyro.data.importing import Choice, import_demonstrations
 from ddco_pyro.data.inspection import inspect
-from ddco_pyro.data.sources.metadata import check_keys, filled, inside
+from ddco_pyro.data.sources.metadata import check_keys
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.spec import parse_spec
 
@@ -148,15 +148,6 @@ def test_rows_of_an_episode_that_is_not_named_are_not_annotated(tmp_path: Path, 
     assert sorted(path.name for path in tmp_path.iterdir()) == ["dataset"]
 
 
-def test_a_copy_into_the_dataset_itself_is_refused(tmp_path: Path, run: Path) -> None:
-    dataset = odd.changed()(tmp_path)
-    before = contents(tmp_path)
-    refused(
-        call("segment", run, dataset, "--lerobot", dataset / "data" / "new"), "lies in .*, which this command reads"
-    )
-    assert contents(tmp_path) == before
-
-
 def test_data_need_not_lie_under_data(tmp_path: Path, run: Path) -> None:
     dataset = odd.changed(odd.info(data_path="steps/{episode_index}-{file_index:03d}.parquet"))(tmp_path)
     (dataset / "steps").mkdir()
@@ -168,27 +159,6 @@ def test_data_need_not_lie_under_data(tmp_path: Path, run: Path) -> None:
     columns = odd.parquet.read_table(out / "steps" / "2-000.parquet").column_names
     assert "language_persistent" in columns
     assert "language_persistent" in json.loads((out / "meta" / "info.json").read_text())["features"]
-
-
-def test_placeholders() -> None:
-    assert filled(
-        Path("d"),
-        "d/{chunk_index:03d}/{video_key}/{file_index}",
-        {"chunk_index": 7, "file_index": 12, "video_key": "a.b"},
-    ) == ("d/007/a.b/12")
-    assert filled(Path("d"), "{chunk_index:012d}", {"chunk_index": 1}) == "000000000001"
-    for template in ("{chunk_index:3d}", "{chunk_index!r}", "{{x}}", "{video_key:03d}", "{file_index", "{}"):
-        with pytest.raises(DemonstrationsError, match=r"may have only \{chunk_index\}, \{video_key\}, and"):
-            filled(Path("d"), template, {"chunk_index": 1, "video_key": "a"})
-
-
-def test_inside(tmp_path: Path) -> None:
-    (tmp_path / "data").mkdir()
-    assert inside(tmp_path / "data", "a/./b") == tmp_path / "data" / "a" / "b"
-    (tmp_path / "data" / "link").symlink_to(tmp_path)
-    for relative in ("..", "a/../b", "/etc", "link", "link/x", "a\0b"):
-        with pytest.raises(DemonstrationsError):
-            inside(tmp_path / "data", relative)
 
 
 def test_keys_of_observations() -> None:

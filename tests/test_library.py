@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import signal
 import subprocess
@@ -16,6 +15,7 @@ import numpy as np
 import pytest
 import yaml
 from command_line import call
+from random_demonstrations import demonstrations
 from selecting import DATA, data_at, two_skills
 
 import ddco_pyro
@@ -24,8 +24,9 @@ from ddco_pyro.errors import BadInput
 from ddco_pyro.events import TrainingBegan
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.fitting.run import RunError
+from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.report import write_report
-from ddco_pyro.spec import SpecError, load_spec, parse_spec, with_overrides
+from ddco_pyro.spec import load_spec, parse_spec, with_overrides
 
 FLAT = {"kind": "flat", "policy": {"network": "linear"}}
 
@@ -122,34 +123,10 @@ def test_the_spec_says_what_is_seen_of_demonstrations_from_memory(in_memory: ddc
     assert numbers(ddco_pyro.fit(in_memory.spec, Demonstrations(tuple(more[:-1])))) == numbers(in_memory)
     with pytest.raises(DemonstrationsError, match=r"there is no demonstration 'another'"):
         ddco_pyro.fit(with_overrides(spec, {"demonstrations.exclude": ["another"]}), Demonstrations(tuple(more)))
-    with pytest.raises(
-        DemonstrationsError, match=r"there is no obs/plac .did you mean 'place'..; there is: place, turn"
-    ):
+    with pytest.raises(DemonstrationsError, match=r"there is no obs/plac .did you mean 'place'..; there is: place"):
         ddco_pyro.fit(with_overrides(in_memory.spec, {"observations": ["plac"]}), two_skills())
     with pytest.raises(DemonstrationsError, match=r"there is no labels/phase; there is: nothing"):
         ddco_pyro.fit(with_overrides(in_memory.spec, {"demonstrations.labels": "phase"}), two_skills())
-
-
-def test_several_baselines_of_a_kind(commanded: Path, tmp_path: Path) -> None:
-    wide = {"kind": "flat", "policy": {"network": "mlp", "hidden": [4]}}
-    grid = {"grid": {"hierarchy.levels.0.count": [1, 2]}}  # which baselines have nothing to do with
-    data = spec_for(commanded / "demos.hdf5", compare_with=[FLAT, wide], selection=grid)
-    fit = ddco_pyro.fit(parse_spec(data), out=tmp_path / "run")
-    loaded = ddco_pyro.load(tmp_path / "run")
-    for one in (fit, loaded):
-        assert list(one.metrics.comparison) == list(one.baselines) == ["flat", "flat_2"]
-        networks = [beside.spec.baseline.policy.network for beside in one.baselines.values()]
-        assert networks == ["linear", "mlp"]
-    outcomes = {"ddco": (1, 1), "flat": (0, 1), "flat_2": (0, 0)}
-    rows = [f"{name},{seed},{value}" for name, values in outcomes.items() for seed, value in enumerate(values)]
-    (tmp_path / "run" / "rollouts.csv").write_text("\n".join(["method,seed,success", *rows]))
-    both = [tmp_path / "run" / "baselines" / name for name in ("flat", "flat_2")]
-    assert call("compare", tmp_path / "run", *both, "--out", tmp_path / "compared").status == 0
-    pairs = json.loads((tmp_path / "compared" / "compare.json").read_text())["rollouts"]
-    successes = {
-        Path(pair[name]).name: pair[rate] for pair in pairs for name, rate in (("run", "rate"), ("other", "other_rate"))
-    }
-    assert {name: rate["successes"] for name, rate in successes.items()} == {"run": 2, "flat": 1, "flat_2": 0}
 
 
 BESIDE = {"kind": "flat", "policy": {"network": "mlp", "hidden": [4]}, "optimizer": {"name": "adam"}}
@@ -294,12 +271,37 @@ def test_check_reads_no_observations(commanded: Path, reads: Counter) -> None:
     assert reads == {name: 1.0 for name in everything(commanded / "demos.hdf5") if name.endswith("/actions")}
 
 
-def test_a_spec_that_does_not_fit_is_refused_before_anything_is_written(commanded: Path, tmp_path: Path) -> None:
-    spec = with_overrides(load_spec(commanded / "spec.yaml"), {"control.scale": [1.0, 2.0, 3.0]})
-    with pytest.raises(SpecError, match=r"control\.scale: has 3 numbers, but the control has 2 dimensions"):
-        ddco_pyro.fit(spec, out=tmp_path / "run")
-    with pytest.raises(SpecError, match=r"control\.scale: has 3 numbers"):
-        ddco_pyro.fit(spec, two_skills(), out=tmp_path / "run")
-    with pytest.raises(BadInput, match=r"nowhere\.hdf5: there is no such file"):
-        ddco_pyro.fit(spec, tmp_path / "nowhere.hdf5", out=tmp_path / "run")
-    assert not any(tmp_path.iterdir())
+# --- how often a fit builds a model -----------------------------------------------------------------------------------
+
+
+MOST_BUILDS = 4
+
+
+def make_spec(*baselines):
+    return parse_spec(
+        yaml.safe_load(
+            f"""
+            demonstrations: {{path: unused.hdf5, valid_fraction: 0.2}}
+            observations: [pose]
+            hierarchy:
+              levels: [{{count: 2, policy: {{network: mlp, hidden: [8]}}, termination: {{network: linear}}}}]
+              meta_policy: {{network: linear}}
+            training: {{epochs: 1, layerwise: false, initialize: random}}
+            compare_with: [{", ".join(baselines)}]
+            """
+        )
+    )
+
+
+@pytest.mark.parametrize("baselines", [(), ("flat", "mixture")])
+def test_a_model_is_built_a_few_times(monkeypatch, baselines):
+    builds, init = [], Hierarchy.__init__
+
+    def counted(self, *arguments, **named):
+        builds.append(arguments)
+        init(self, *arguments, **named)
+
+    monkeypatch.setattr(Hierarchy, "__init__", counted)
+    ddco_pyro.fit(make_spec(*baselines), demonstrations(6))
+    print(f"{len(builds)} builds of {1 + len(baselines)} models")
+    assert len(builds) <= MOST_BUILDS * (1 + len(baselines))

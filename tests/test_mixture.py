@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,7 +26,7 @@ from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.tables import always_ends
 from ddco_pyro.segmenting import LevelLabels
 from ddco_pyro.selection.grid import candidates
-from ddco_pyro.spec import DurationSpec, SpecError, load_spec, parse_spec, with_overrides
+from ddco_pyro.spec import DurationSpec, SpecError, parse_spec, with_overrides
 from ddco_pyro.training.networks import (
     Dimensions,
     baseline_spec,
@@ -38,8 +37,6 @@ from ddco_pyro.training.networks import (
 )
 from ddco_pyro.training.objective import log_duration_prior
 from ddco_pyro.training.upper import Constants, fitted
-
-SPECS = Path(__file__).parent.parent / "specs"
 
 # --- the likelihood ---------------------------------------------------------------------------------------------------
 
@@ -272,13 +269,6 @@ def test_its_segments_are_runs_of_one_expert():
     ended, active = np.ones(6, int), np.eye(3)[options]
     assert LevelLabels.of(options, ended, active, lasts=False).runs() == [(1, 0, 2), (2, 2, 5), (1, 5, 6)]
     assert len(LevelLabels.of(options, ended, active, lasts=True).runs()) == 6
-
-
-def test_shipped_specs_compare_with_it():
-    hierarchies = [path for path in sorted(SPECS.glob("*.yaml")) if "\nhierarchy:" in path.read_text()]
-    assert len(hierarchies) > 10
-    for path in hierarchies:
-        assert "mixture" in [baseline.kind for baseline in load_spec(path).compare_with], path
 
 
 def test_planted_memory_shows_in_the_likelihood():

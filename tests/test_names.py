@@ -167,15 +167,6 @@ def test_names_that_do_not_fit_are_refused(files, text, problem):
     path.unlink()
 
 
-def test_the_command_refuses_names_that_do_not_fit(files):
-    (files / "run" / "names.yaml").unlink(missing_ok=True)
-    for arguments in (["a,b"], ["--level", "arm", "a,b,c"], ["a,,c"], ["--level", "arm"]):
-        ended = call("name", files / "run", *arguments)
-        assert (ended.status, ended.out, ended.err.count("\n")) == (2, "", 1)
-    assert not (files / "run" / "names.yaml").exists()
-    assert ddco_pyro.load(files / "run").names == {"skill": ("control", "option 1", "option 2", "option 3")}
-
-
 def test_label_names_that_are_none_are_refused_before_anything_is_written(tmp_path):
     demos = labelled()
     wrong = Demonstrations(demos.demonstrations, attributes={"label_names": "phase"})

@@ -127,15 +127,6 @@ def test_a_memory_with_a_horizon_is_made_afresh_for_each_window(horizon, start):
     assert_close(torch.cat(said, dim=1), torch.cat(expected, dim=1))
 
 
-def test_no_option_is_trained_by_another_options_memory():
-    network = make(network="lstm", hidden=[8])
-    answer(network, make_inputs())[0][:, :, 1].sum().backward()
-    for parameter in network.parameters():
-        per_option = parameter.grad.abs().flatten(1).sum(1)
-        assert per_option[1] > 0
-        assert per_option[[0, 2, 3]].tolist() == [0, 0, 0]
-
-
 @pytest.mark.parametrize(
     ("how", "message"),
     [

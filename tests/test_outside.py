@@ -15,8 +15,7 @@ from odd_files import Row
 from odd_files.hdf5 import ROWS, STEPS, changed, demonstrations, last_not_whole, linked, raw, virtual
 
 from ddco_pyro.data import memory
-from ddco_pyro.data.checks import usable
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import Damaged
 from ddco_pyro.data.hdf5 import DemonstrationsError
 from ddco_pyro.data.sources import open_source
@@ -127,25 +126,6 @@ def test_a_minari_episode_that_is_not_whole(tmp_path: Path) -> None:
 
 
 # --- values -----------------------------------------------------------------------------------------------------------
-
-
-def test_infinities_of_16_bits_cannot_be_used() -> None:
-    values = np.array([1.0, np.inf, -np.inf, np.nan, 65504], np.float16)
-    assert usable(values).tolist() == [True, False, False, False, True]
-    assert usable(np.array([1e30, 2e30, np.inf])).tolist() == [True, False, False]
-
-
-def test_discrete_actions_in_memory_and_in_a_file_are_the_same(tmp_path: Path) -> None:
-    actions = np.array([0, 2, 1])
-    demo = Demonstration("demo_0", {"x": np.zeros((3, 1))}, actions)
-    np.testing.assert_array_equal(demo.actions, [[0.0], [2.0], [1.0]])
-    Demonstrations((demo,)).write(tmp_path / "a.hdf5")
-    with h5py.File(tmp_path / "b.hdf5", "w") as file:
-        file["data/demo_0/obs/x"], file["data/demo_0/actions"] = np.zeros((3, 1)), actions
-    for name in ("a.hdf5", "b.hdf5"):
-        np.testing.assert_array_equal(Demonstrations.read(tmp_path / name)[0].actions, demo.actions)
-    with pytest.raises(DemonstrationsError, match=r"actions is float64 of shape \[steps\]"):
-        Demonstration("demo_0", {"x": np.zeros((3, 1))}, actions.astype(float))
 
 
 def test_a_damaged_file_is_said_by_another_process() -> None:

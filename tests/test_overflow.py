@@ -94,15 +94,6 @@ def test_what_can_be_held_has_a_likelihood(tmp_path: Path, key: str) -> None:
     assert "nan" not in ended.out
 
 
-def test_a_fold_says_it_too(tmp_path: Path) -> None:
-    spec = spec_with(tmp_path, "data/demo_1/actions", 1e15)
-    grid = "selection={folds: 2, grid: {hierarchy.levels.0.count: [1, 2]}}"
-    ended = call("select", spec, "--out", tmp_path / "select", "--jobs", "1", "--set", grid)
-    assert ended.status == 1
-    assert "unexpected" not in ended.err
-    assert "first reason: demo_1: actions at step 5 is " in ended.err.splitlines()[-1]
-
-
 # --- what no bound on numbers can know --------------------------------------------------------------------------------
 
 

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from unittest import mock
 
@@ -23,12 +24,13 @@ from killing import struck
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import only_one
-from ddco_pyro.errors import BadInput
+from ddco_pyro.errors import BadInput, Failed
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.model.batch import STEPS_AT_ONCE
 from ddco_pyro.spec import dump_spec, parse_spec
 from ddco_pyro.training import restarts as restarting
 from ddco_pyro.training.checkpoint import Progress, Restart
+from ddco_pyro.training.jobs import beside, early_process
 from ddco_pyro.training.launching import check_processes, launched, requested, together
 from ddco_pyro.training.loop import StageTraining
 from ddco_pyro.training.networks import Dimensions
@@ -327,19 +329,6 @@ def test_two_processes_of_torchrun_give_the_bits_of_one(demos, tmp_path):
     assert_same_run(tmp_path / "run", tmp_path / "alone")
 
 
-@pytest.mark.slow
-def test_torchrun_goes_on_and_refuses_as_one_process_does(whole, tmp_path):
-    spec, run = whole
-    folder = shutil.copytree(run, tmp_path / "run")
-    ended = torchrun(spec, folder, "--resume")  # it is finished
-    assert (ended.returncode, ended.stdout.count("report: ")) == (0, 1), ended.stderr
-    assert_same_run(folder, run)
-    ended = torchrun(spec, folder)
-    assert (ended.returncode, ended.stdout) == (1, "")
-    assert ended.stderr.count("ddco-pyro: ") == 1
-    assert f"ddco-pyro: {folder}: holds a run of this spec already; show it with --resume" in ended.stderr
-
-
 # --- what is refused --------------------------------------------------------------------------------------------------
 
 
@@ -364,3 +353,67 @@ def test_torchrun_decides_how_many_there_are(monkeypatch):
     assert (requested(None, None), requested(3, None)) == (1, 3)
     with pytest.raises(BadInput, match=r"^--processes 3: torchrun started 2; leave it out$"):
         requested(3, launched())
+
+
+# --- processes beside this one ----------------------------------------------------------------------------------------
+
+
+def alive(process: int) -> bool:
+    """Whether there is such a process, which is not a zombie."""
+    try:
+        with open(f"/proc/{process}/stat") as file:
+            return file.read().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def test_a_process_is_ready_before_there_is_work_and_ends_with_it() -> None:
+    with early_process("json"):
+        with beside(1, [os.getpid, os.getpid], "dead") as results:
+            first = list(results)
+        with beside(1, [os.getpid], "dead") as results:
+            again = list(results)
+    with beside(2, [os.getpid], "dead") as results:
+        later = list(results)
+    assert len(set(first + again)) == 1
+    assert os.getpid() not in first + later
+    assert first[0] != later[0]
+    assert not alive(first[0])
+    assert not alive(later[0])
+
+
+def test_a_process_that_is_killed_is_one_line() -> None:
+    kill = partial(signal.raise_signal, signal.SIGKILL)
+    with beside(1, [kill], "a process was ended") as results, pytest.raises(Failed, match=r"^a process was ended$"):
+        next(results)
+
+
+def test_so_is_one_that_is_killed_before_there_is_work() -> None:
+    with early_process("json"):
+        with beside(1, [os.getpid], "dead") as results:
+            (process,) = results
+        os.kill(process, signal.SIGKILL)
+        while alive(process):
+            time.sleep(0.01)
+        ended = beside(1, [os.getpid], "a process was ended")
+        with pytest.raises(Failed, match=r"^a process was ended$"), ended as results:
+            next(results)
+
+
+KILLED = """
+import os, signal
+from ddco_pyro.training.jobs import beside, early_process
+with early_process("json"), beside(1, [os.getpid], "dead") as results:
+    print(*results, flush=True)
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_a_process_ends_with_the_one_that_is_killed_while_it_waits_for_work(tmp_path) -> None:
+    with open(tmp_path / "process", "w") as file:
+        killed = subprocess.run([sys.executable, "-c", KILLED], stdout=file)
+    assert killed.returncode == -signal.SIGKILL
+    process, deadline = int((tmp_path / "process").read_text()), time.monotonic() + 10
+    while alive(process) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not alive(process)

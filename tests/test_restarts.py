@@ -7,9 +7,9 @@ import pytest
 import torch
 import user_networks
 from planted import make_spec, make_trainer
+from random_demonstrations import of_states
 from sklearn.metrics import normalized_mutual_info_score
 
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.drawing import words
 from ddco_pyro.events import EpochEnded, RestartDiverged, RestartStopped
 from ddco_pyro.inference import segment
@@ -26,13 +26,7 @@ QUICK = {"initialize": "random", "layerwise": False, "epochs": 14, "patience": 5
 
 @pytest.fixture(scope="module")
 def demos():
-    random = np.random.default_rng(0)
-    return Demonstrations(
-        tuple(
-            Demonstration(f"demo_{n}", {"state": random.normal(size=(6, 3))}, random.normal(size=(6, 2)))
-            for n in range(10)
-        )
-    )
+    return of_states([6] * 10)
 
 
 @pytest.fixture(scope="module")

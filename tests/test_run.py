@@ -14,12 +14,11 @@ from sklearn.metrics import normalized_mutual_info_score
 
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.data.files import Damaged
 from ddco_pyro.events import EpochEnded
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.run import RunError, claim, claimed
 from ddco_pyro.metrics import Counts
-from ddco_pyro.spec import dump_spec, load_spec, with_overrides
+from ddco_pyro.spec import dump_spec, with_overrides
 from ddco_pyro.training.data import demonstrations
 from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.restarts import train_model
@@ -252,13 +251,6 @@ def test_a_finished_run_is_left_as_it_is(copied, toy_spec):
     assert {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in before} == before
 
 
-def test_a_run_of_another_spec_is_refused(copied, toy_spec):
-    other = with_overrides(toy_spec, {"seed": 1})
-    with pytest.raises(RunError, match=r"run: holds a run of another spec; choose another --out or remove it$"):
-        fit(other, out=copied)
-    assert load_spec(copied / "spec.yaml") == toy_spec
-
-
 def test_claiming_a_folder(tmp_path, toy_spec):
     folder = tmp_path / "run"
     claim(folder, toy_spec, resume=False)
@@ -293,20 +285,7 @@ def test_what_is_not_a_finished_run_is_not_loaded(copied, removed, message):
         ddco_pyro.load(copied)
 
 
-def test_a_damaged_model_is_not_loaded(copied):
-    model = copied / "model.safetensors"
-    content = model.read_bytes()
-    for damaged in (b"", content[:40], content[:-8], b"\xff" * 100):
-        model.write_bytes(damaged)
-        with pytest.raises(
-            Damaged, match=r"run/model\.safetensors: is damaged: .*; remove it and fit again: ddco-pyro fit"
-        ):
-            ddco_pyro.load(copied)
-
-
 def test_a_model_of_another_spec_is_not_loaded(copied, toy_spec):
     (copied / "spec.yaml").write_text(dump_spec(with_overrides(toy_spec, {"hierarchy.levels.0.count": 3})))
-    with pytest.raises(
-        RunError, match=r"run/model\.safetensors: is of another spec than spec\.yaml; remove it and fit"
-    ):
+    with pytest.raises(RunError, match=r"run/model\.safetensors: is of another spec than spec\.yaml; remove it and"):
         ddco_pyro.load(copied)

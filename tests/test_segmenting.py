@@ -3,26 +3,38 @@
 from __future__ import annotations
 
 import csv
+import json
 import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
+import pyarrow
+import pyarrow.compute
 import pyarrow.parquet as parquet
 import pytest
+import yaml
 from command_line import call
 from sklearn.metrics import normalized_mutual_info_score
 from time_lines import embedded, tracks, unpacked
 
 import ddco_pyro
-from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.importing import import_demonstrations
 from ddco_pyro.data.sources import open_source
 from ddco_pyro.drawing.colours import option_colour
+from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.agreement import agreement
-from ddco_pyro.segmenting import Segmented, recorded, segments
+from ddco_pyro.fitting.fit import fit
+from ddco_pyro.segmenting import LevelLabels, Segmented, Segments, recorded, segments
 from ddco_pyro.segmenting.baselines import BASELINES, segment
+from ddco_pyro.segmenting.formats import Asked
+from ddco_pyro.segmenting.formats.lerobot import Annotated
+from ddco_pyro.spec import ObservationSpec, parse_spec
 from ddco_pyro.training.data import demonstrations
 from ddco_pyro.training.data import parts as split_in_parts
 
@@ -73,36 +85,20 @@ def test_they_are_the_fits_own(toy_run, toy_spec, file, at_once, monkeypatch):
         np.testing.assert_array_equal(one.labels["phase"], demo.labels["phase"])
 
 
-NOTHING = (
-    "ddco-pyro: name what to write, such as --html PAGE, --csv FILE or --lerobot FOLDER; labels for each step go to "
-    "--out FILE (a copy) or with --in-place into DEMOS; --baselines measures agreement with labels\n"
-)
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--level", "option"], NOTHING),
-        (["--in-place", "--out", "copy.hdf5"], "ddco-pyro: --out and --in-place exclude each other; keep one\n"),
-        (["--out", "FILE"], "ddco-pyro: --out FILE: is what this command reads; choose another place\n"),
-        (
-            ["--mimicgen", "copy.hdf5"],
-            "ddco-pyro: FILE: demo_0: has no datagen_info/eef_pose, so the file is not prepared for --mimicgen; first: "
-            "python mimicgen/scripts/prepare_src_dataset.py --dataset FILE\n",
-        ),
+        (["--level", "option"], "name what to write, such as --html PAGE, --csv FILE or --lerobot FOLDER; labels"),
+        (["--in-place", "--out", "copy.hdf5"], "--out and --in-place exclude each other; keep one"),
+        (["--mimicgen", "copy.hdf5"], "demo_0: has no datagen_info/eef_pose"),
     ],
 )
 def test_what_to_write_has_to_be_said(toy_run, file, monkeypatch, options, message):
     monkeypatch.chdir(file.parent)
     before = file.read_bytes()
-    named = [option.replace("FILE", str(file)) for option in options]
-    assert call("segment", toy_run.folder, file, *named) == (
-        2,
-        "",
-        message.replace("FILE", str(file))
-        .replace(f"{file} (a copy)", "FILE (a copy)")
-        .replace("--csv " + str(file), "--csv FILE"),
-    )
+    ended = call("segment", toy_run.folder, file, *options)
+    assert (ended.status, ended.out, ended.err.count("\n")) == (2, "", 1)
+    assert message in ended.err
     assert [path.name for path in file.parent.iterdir()] == ["demos.hdf5"]
     assert file.read_bytes() == before
 
@@ -381,3 +377,255 @@ def test_a_policy_without_options_is_refused(toy_run, file):
     ended = call("segment", toy_run.folder / "baselines" / "flat", file, "--in-place")
     assert ended.status == 2
     assert "is a flat policy without options; name a run with a hierarchy" in ended.err
+
+
+# --- subtasks of LeRobot datasets -------------------------------------------------------------------------------------
+
+
+LEROBOT = Path(__file__).parent / "fixtures" / "lerobot"
+LANGUAGE = Path(__file__).parent / "fixtures" / "lerobot_language"
+SPEC = """
+demonstrations: {path: PATH, valid_fraction: 0.25}
+observations: [state]
+control: {std: 0.5}
+hierarchy:
+  levels:
+    - {name: skill, count: 2, policy: {network: linear}}
+    - {name: phase, count: 2, policy: {network: linear, emits: [options, control]}}
+  meta_policy: {network: linear}
+training: {epochs: 2, batch_size: 3}
+"""
+
+
+@pytest.fixture(scope="module")
+def lerobot_run(tmp_path_factory):
+    """A run of two levels on the LeRobot fixture, imported."""
+    folder = tmp_path_factory.mktemp("lerobot")
+    import_demonstrations(LEROBOT, folder / "demos.hdf5")
+    spec = parse_spec(yaml.safe_load(SPEC.replace("PATH", str(folder / "demos.hdf5"))))
+    return fit(spec, out=folder / "run")
+
+
+def files(folder):
+    return {path.relative_to(folder) for path in folder.rglob("*") if path.is_file()}
+
+
+def rows_of(folder):
+    return parquet.read_table(next((folder / "data").rglob("*.parquet")))
+
+
+def test_subtasks_are_written_as_lerobot_writes_them(tmp_path):
+    """Beside what LeRobot's own annotation writer made of the same subtasks (``fixtures/write_lerobot_language.py``).
+
+    ``fixtures/read_formats.py`` has LeRobot read what is written here; 0.6.1 did.
+    """
+    options = {int(key): np.array(value) for key, value in json.loads((LANGUAGE / "options.json").read_text()).items()}
+    level = {key: LevelLabels(value, np.ones(len(value), bool), np.ones(len(value))) for key, value in options.items()}
+    found = Segmented(
+        tuple(Segments(f"demo_{key}", {"skill": one}, 0.0, False) for key, one in level.items()), {"skill": 2}, 10.0
+    )
+    with open_source(LEROBOT) as source:
+        fit = SimpleNamespace(names={"skill": ("control", "option 1", "option 2")})
+        asked = Asked(fit, tmp_path, LEROBOT, source, "skill")  # type: ignore[arg-type]
+        Annotated("--lerobot", tmp_path / "out", asked).write(found)
+    ours, theirs = rows_of(tmp_path / "out"), parquet.read_table(LANGUAGE / "data.parquet")
+    assert ours.column_names == theirs.column_names
+    assert ours.to_pylist() == theirs.to_pylist()
+    features = [
+        json.loads(path.read_text())["features"] for path in (tmp_path / "out/meta/info.json", LANGUAGE / "info.json")
+    ]
+    assert features[0] == features[1]
+    frames = parquet.ParquetFile(next((tmp_path / "out" / "data").rglob("*.parquet")))
+    assert [frames.metadata.row_group(group).num_rows for group in range(frames.num_row_groups)] == [5, 6, 7, 8]
+
+
+def test_subtasks_begin_at_the_very_times_of_frames(lerobot_run, tmp_path):
+    """To the bit, in the frames' own type."""
+    out = tmp_path / "annotated"
+    assert call("segment", lerobot_run.folder, LEROBOT, "--lerobot", out).status == 0
+    table = rows_of(out)
+    entry = table.schema.field("language_persistent").type.value_type
+    assert entry.field("timestamp").type == table.schema.field("timestamp").type == pyarrow.float32()
+    for one in look(lerobot_run.folder, LEROBOT).segments:
+        rows = table.filter(pyarrow.compute.equal(table["episode_index"], int(one.name[5:])))
+        times, entries = rows["timestamp"].to_pylist(), rows["language_persistent"].to_pylist()
+        assert all(row == entries[0] for row in entries)
+        options = one.levels["skill"].options.tolist()
+        active = [[said for said in entries[0] if said["timestamp"] <= time][-1] for time in times]
+        assert [said["content"] for said in active] == [
+            f"skill {option}" if option else "control" for option in options
+        ]
+        assert {said["timestamp"] for said in entries[0]} <= set(times)
+
+
+def test_the_older_form_of_subtasks(lerobot_run, tmp_path):
+    """``fixtures/write_lerobot.py`` says how the dataset was made; LeRobot 0.4.4 reads what is written here."""
+    out = tmp_path / "annotated"
+    older = ("--lerobot", out, "--level", "phase", "--lerobot-format", "0.4")
+    assert call("segment", lerobot_run.folder, LEROBOT, *older).status == 0
+    found = look(lerobot_run.folder, LEROBOT)
+    table = rows_of(out).to_pylist()
+    for one in found.segments:
+        rows = [row for row in table if row["episode_index"] == int(one.name[5:])]
+        assert [row["subtask_index"] for row in rows] == one.levels["phase"].options.tolist()
+    names = parquet.read_table(out / "meta" / "subtasks.parquet").to_pylist()
+    assert [row["subtask"] for row in names] == ["control", "phase 1", "phase 2"]
+    with open_source(out) as source:  # and it can be read here again
+        np.testing.assert_array_equal(
+            source.recording("demo_2").labels["subtask"].array(), found.segments[2].levels["phase"].options
+        )
+
+
+@pytest.mark.parametrize(
+    ("form", "features", "more"),
+    [
+        (
+            "0.6",
+            {"language_persistent": "language", "language_events": "language"},
+            {Path("meta/lerobot_annotations.json")},
+        ),
+        ("0.4", {"subtask_index": "int64"}, {Path("meta/subtasks.parquet")}),
+    ],
+)
+def test_a_copy_with_subtasks(lerobot_run, tmp_path, form, features, more):
+    out = tmp_path / "annotated"
+    arguments = ("segment", lerobot_run.folder, LEROBOT, "--lerobot", out, "--level", "phase", "--lerobot-format", form)
+    ended = call(*arguments)
+    assert (ended.status, ended.out) == (0, f"{out}\n")
+    info, before = (json.loads((folder / "meta" / "info.json").read_text()) for folder in (out, LEROBOT))
+    for name, dtype in features.items():
+        assert info["features"].pop(name) == {"dtype": dtype, "shape": [1], "names": None}
+    assert info == before
+    assert files(out) == files(LEROBOT) | more
+    assert rows_of(out).drop_columns(list(features)).to_pylist() == rows_of(LEROBOT).to_pylist()
+    with open_source(out) as source:
+        assert source.names == ("demo_0", "demo_1", "demo_2", "demo_3")
+    time = (out / "meta" / "info.json").stat().st_mtime_ns
+    again = call(*arguments)
+    assert (again.status, again.out) == (0, f"{out}\n")
+    assert (out / "meta" / "info.json").stat().st_mtime_ns == time  # it is this very copy
+    other = {"0.4": "0.6", "0.6": "0.4"}[form]
+    for wrong, message in (
+        ([LEROBOT, "--lerobot", out, "--lerobot-format", form], "annotated: exists; choose another --lerobot"),
+        ([LEROBOT, "--lerobot", out, "--level", "phase", "--lerobot-format", other], "annotated: exists"),
+        ([out, "--lerobot", tmp_path / "twice"], "has subtasks already; name a dataset without them"),
+        ([out, "--lerobot", tmp_path / "twice", "--lerobot-format", other], "has subtasks already; name a dataset"),
+    ):
+        ended = call("segment", lerobot_run.folder, *wrong)
+        assert (ended.status, ended.err.count("\n")) == (2, 1 + ended.err.count("segmenting: "))
+        assert message in ended.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--lerobot", "OUT", "--level", "skil"], "there is no level 'skil' (there is: skill"),
+        (["--html", "OUT", "--out", "OUT2"], "labels go into HDF5 files only; name another format, such as --csv"),
+    ],
+)
+def test_what_cannot_be_written_of_a_lerobot_dataset(lerobot_run, tmp_path, arguments, message):
+    named = [one.replace("OUT", str(tmp_path / "out")) for one in arguments]
+    ended = call("segment", lerobot_run.folder, LEROBOT, *named)
+    assert (ended.status, ended.err.count("\n")) == (2, 1)
+    assert message in ended.err
+    assert not list(tmp_path.iterdir())
+
+
+# --- baselines that segment -------------------------------------------------------------------------------------------
+
+
+CENTRES = np.array([[-2.0, 0.0], [2.0, 0.0], [0.0, 3.0]])
+
+
+def planted(number=10, seed=0, noise=0.3):
+    """Three kinds of steps in an order of their own, at three places in units that differ; the gripper (control 1)
+    is closed in the second kind alone. ``place`` says where in one unit, control 0 in another.
+    """
+    random = np.random.default_rng(seed)
+    demos = []
+    for index in range(number):
+        kind = np.repeat(random.permutation(3), random.integers(6, 12, 3))
+        seen = CENTRES[kind] + noise * random.normal(size=(len(kind), 2))
+        controls = np.stack([seen[:, 0] / 50, np.where(kind == 1, 1.0, 0.0)], axis=1)
+        demos.append(Demonstration(f"demo_{index}", {"place": 1000 * seen}, controls, {"kind": kind}))
+    return Demonstrations(tuple(demos))
+
+
+def scores(name, valid, **settings):
+    found = segment(name, planted(), valid, 3, 0, **settings)
+    return agreement(found, [demo.labels["kind"] for demo in valid])
+
+
+@pytest.mark.parametrize("name", ["kmeans", "gmm", "hmm", "change_points"])
+def test_kinds_that_lie_apart_are_found_in_demonstrations_not_seen(name):
+    found = scores(name, planted(4, seed=1))
+    assert found.matched_globally.accuracy > 0.97
+    assert found.boundary_f1_1 > 0.97
+
+
+def test_time_tells_apart_what_a_step_alone_does_not():
+    """With much noise a hidden Markov model and change points use the steps around; the gripper is left out."""
+    train, noisy = (
+        Demonstrations(tuple(Demonstration(d.name, d.observations, d.actions[:, :1], d.labels) for d in demos))
+        for demos in (planted(30, noise=1.0), planted(10, seed=1, noise=1.0))
+    )
+    truth = [demo.labels["kind"] for demo in noisy]
+    nmi = {name: agreement(segment(name, train, noisy, 3, 0), truth).nmi for name in BASELINES}
+    assert min(nmi["hmm"], nmi["change_points"]) > nmi["kmeans"] + 0.1
+
+
+def test_equal_lengths():
+    (found,) = segment("equal", planted(), planted(1).select(["demo_0"]), 4, 0)
+    sizes = np.bincount(found)
+    assert len(sizes) == 4
+    assert sizes.max() - sizes.min() <= 1
+    assert (np.diff(found) >= 0).all()
+    short = Demonstrations((Demonstration("demo_0", {"place": np.zeros((2, 2))}, np.zeros((2, 2))),))
+    assert segment("equal", planted(), short, 4, 0)[0].tolist() == [0, 2]
+
+
+def test_gripper_changes():
+    closed = [[0, 0, 1, 1, 1, 0, 1], [1, 1, 0, 0, 0, 0, 0]]
+    demos = [
+        Demonstration(f"demo_{n}", {"place": np.zeros((7, 1))}, np.stack([np.linspace(-1, 1, 7), one], 1))
+        for n, one in enumerate(closed)
+    ]
+    valid = Demonstrations(tuple(demos))
+    found = segment("gripper", planted(), valid, 2, 0)
+    assert [one.tolist() for one in found] == [[0, 0, 1, 1, 1, 2, 3], [0, 0, 1, 1, 1, 1, 1]]
+    assert segment("gripper", valid, valid, 2, 0, gripper=0)[0].tolist() == [0, 0, 0, 0, 1, 1, 1]
+    with pytest.raises(BadInput, match="there is no control dimension 2; there are 2"):
+        segment("gripper", valid, valid, 2, 0, gripper=2)
+
+
+@pytest.mark.parametrize("name", BASELINES)
+def test_it_is_what_the_seed_says_and_looks_at_observations_alone_that_are_named(name):
+    train, valid = planted(), planted(3, seed=1)
+    random = np.random.default_rng(3)
+    more = [
+        Demonstrations(
+            tuple(
+                Demonstration(d.name, {**d.observations, "noise": random.normal(size=(len(d), 4))}, d.actions)
+                for d in one
+            )
+        )
+        for one in (train, valid)
+    ]
+    named = segment(name, *more, 3, 5, observations=[ObservationSpec(key="place")])
+    for one, other in zip(segment(name, train, valid, 3, 5), named, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("name", BASELINES)
+def test_fewer_different_steps_than_kinds(name):
+    """Constant controls, two different steps, demonstrations of one step."""
+    demos = [Demonstration(f"demo_{n}", {"x": np.full((1 + n, 1), n % 2)}, np.ones((1 + n, 2))) for n in range(3)]
+    found = segment(name, Demonstrations(tuple(demos)), Demonstrations(tuple(demos)), 5, 0)
+    assert [len(one) for one in found] == [1, 2, 3]
+
+
+def test_a_package_that_is_missing_is_a_line(monkeypatch):
+    for name, package in (("hmm", "hmmlearn"), ("change_points", "ruptures")):
+        monkeypatch.setitem(sys.modules, package, None)
+        with pytest.raises(BadInput, match=r"needs \w+; install it with: pip install 'ddco-pyro\[segments\]'"):
+            segment(name, planted(2), planted(2), 2, 0)

@@ -4,31 +4,23 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import signal
 import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
-from killing import struck
+from killing import COMMAND, struck
 from selecting import Told, data_at, kept, score, spec_at, two_skills
 
 import ddco_pyro
 from ddco_pyro.errors import Failed
-from ddco_pyro.fitting.digest import OtherDemonstrations
 from ddco_pyro.fitting.fitted import Fit
-from ddco_pyro.fitting.run import RunError
-from ddco_pyro.selection import SelectionFailed, Workers, check, final_spec, folds, select
-from ddco_pyro.selection.folds import BackendError, FoldError
-from ddco_pyro.spec import SpecError, with_overrides
+from ddco_pyro.selection import SelectionFailed, Workers, final_spec, folds, select
 from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.restarts import train_model
 
 ONE = Workers(1)
-COMMAND = Path(sys.executable).with_name("ddco-pyro")
 
 
 @pytest.fixture(scope="module")
@@ -103,16 +95,6 @@ def test_what_is_there_is_not_done_again(finished, monkeypatch):
     assert (told.begun, told.pairs) == ([(8, 8)], [])
     assert (folder / "selection.json").read_bytes() == before
     assert again.choice == made.choice
-
-
-def test_other_demonstrations_are_refused(finished, tmp_path):
-    spec, folder, *_ = finished
-    run = shutil.copytree(folder, tmp_path / "run")
-    with pytest.raises(OtherDemonstrations, match=r"other demonstrations \(actions and obs/place changed\)"):
-        select(spec, run, Told(), ONE, demos=two_skills(seed=1))
-    moved = with_overrides(spec, {"demonstrations.path": str(tmp_path / "other.hdf5")})
-    with pytest.raises(RunError, match="run: holds a run of another spec"):
-        select(moved, run, Told(), ONE)
 
 
 def test_the_final_fit_is_on_all_the_data(finished):
@@ -202,17 +184,6 @@ def test_giving_up_does_not_depend_on_interruptions(tmp_path, monkeypatch):
 
 
 # --- before any work --------------------------------------------------------------------------------------------------
-
-
-def test_everything_is_checked_before_any_work(tmp_path):
-    assert [one.number for one in check(spec_at(tmp_path), ONE)] == [0, 1]
-    with pytest.raises(SpecError, match="is empty"):
-        check(spec_at(tmp_path, grid={}))
-    with pytest.raises(FoldError, match="13 folds of 12 demonstrations"):
-        check(spec_at(tmp_path, folds=13))
-    for jobs in (0, -2):
-        with pytest.raises(BackendError, match=f"^--jobs {jobs}: give a number of processes, or -1 for one on each"):
-            Workers(jobs)
 
 
 # --- in processes -----------------------------------------------------------------------------------------------------

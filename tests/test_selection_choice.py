@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import json
 import math
+import re
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy import stats
-from selecting import DATA, candidate, score
+from selecting import DATA, candidate, score, spec_at, two_skills
 
+from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.selection.choice import as_data, choose, hopeless, markdown, table
-from ddco_pyro.spec import parse_spec
+from ddco_pyro.selection.folds import FoldError, assign, divide, keep_folds
+from ddco_pyro.selection.grid import candidates, wide
+from ddco_pyro.spec import SpecError, parse_spec, with_overrides
+from ddco_pyro.training.networks import Dimensions
 
 
 def rows(values, lengths=(10,), parameters=None):
@@ -130,3 +138,139 @@ def test_different_fixed_errors_are_noted():
     scores = [score(c, f, 1.0) for c in (0, 1) for f in (0, 1)]
     assert "control.std differs" in choose(both, scores, 2).notes[0]
     assert choose([both[0], both[0]], scores, 2).notes == []
+
+
+# --- candidates: every point of the grid ------------------------------------------------------------------------------
+
+
+PLACE, TURN = {"place": (2,)}, {"turn": (1,)}
+SIZE = Dimensions(PLACE | TURN, 2, 10)
+
+LEVEL = DATA["hierarchy"]["levels"][0]
+PHASE = {**LEVEL, "name": "phase", "count": 3}
+
+
+def with_grid(grid, **changes):
+    return parse_spec({**DATA, "demonstrations": {"path": "demos.hdf5"}, "selection": {"grid": grid}, **changes})
+
+
+def test_every_point_of_the_grid_is_a_candidate():
+    spec = with_grid({"hierarchy.levels.0.count": [1, 3], "control.std": [0.1, 0.2, 0.5]})
+    found = candidates(spec, SIZE)
+    assert [one.number for one in found] == list(range(6))
+    assert [tuple(one.values.values()) for one in found] == [(k, std) for k in (1, 3) for std in (0.1, 0.2, 0.5)]
+    assert found[4].name == "count = 3, std = 0.2"
+    expected = {"hierarchy.levels.0.count": 3, "control.std": 0.2, "selection.grid": {}}
+    assert found[4].spec == with_overrides(spec, expected)
+
+
+def test_parameters_are_counted():
+    """k linear policies from 3 features to 2 controls and k terminations, and a meta-policy over k options."""
+    for one in candidates(with_grid({"hierarchy.levels.0.count": [1, 2, 5]}), SIZE):
+        k = one.spec.hierarchy.levels[0].count
+        assert one.parameters == k * (3 * 2 + 2) + k * (3 + 1) + (3 + 1) * k
+
+
+def test_the_number_of_levels_is_a_field_too():
+    found = candidates(with_grid({"hierarchy.levels": [[LEVEL], [LEVEL, PHASE]]}), SIZE)
+    assert [len(one.spec.hierarchy.levels) for one in found] == [1, 2]
+    assert [one.name for one in found] == ["levels = [2]", "levels = [2, 3]"]
+    assert found[0].parameters < found[1].parameters
+
+
+def test_names_tell_equal_ends_of_key_paths_apart():
+    grid = {"hierarchy.levels.0.policy.network": ["linear"], "hierarchy.meta_policy.network": ["linear", "mlp"]}
+    assert candidates(with_grid(grid), SIZE)[1].name == "policy.network = linear, meta_policy.network = mlp"
+
+
+def test_baselines_are_compared_and_not_selected():
+    spec = with_grid({"training.epochs": [1]}, compare_with=["flat"])
+    assert candidates(spec, SIZE)[0].spec.compare_with == ()
+
+
+def test_demonstrations_are_read_with_what_any_candidate_sees(tmp_path):
+    spec = spec_at(tmp_path, grid={"observations": [["place"], ["turn"]]})
+    assert {one.key for one in wide(spec).observations} == {"place", "turn"}
+    assert [[o.key for o in one.spec.observations] for one in candidates(spec, SIZE)] == [["place"], ["turn"]]
+
+
+@pytest.mark.parametrize(
+    ("grid", "problems"),
+    [
+        ({}, ["selection.grid: is empty; name what to try, such as selection.grid: {hierarchy.levels.0.count: .*}"]),
+        ({"task": ["needle"]}, ["selection.grid.task: candidates are compared on the same data; remove it"]),
+        (
+            {"demonstrations.count": [3], "training.epochs": [1]},
+            ["selection.grid.demonstrations.count: candidates are compared on the same data; remove it"],
+        ),
+        (
+            {"observations": [["place"], ["palce"], ["tern"]]},
+            [r"selection.grid: observations=\['palce'\]: .*no palce.*", r"selection.grid: .*no tern.*"],
+        ),
+    ],
+)
+def test_what_is_refused_has_a_line_each(grid, problems):
+    with pytest.raises(SpecError) as refused:
+        candidates(with_grid(grid), SIZE)
+    assert len(refused.value.problems) == len(problems)
+    for found, expected in zip(refused.value.problems, problems, strict=True):
+        assert re.fullmatch(expected, found)
+
+
+# --- folds ------------------------------------------------------------------------------------------------------------
+
+
+@given(st.data())
+def test_folds_are_an_even_partition(data):
+    count = data.draw(st.integers(4, 60))
+    folds, seed = data.draw(st.integers(2, count)), data.draw(st.integers(0, 2**32 - 1))
+    found = assign(count, folds, seed)
+    assert sorted(row for rows in found for row in rows) == list(range(count))
+    assert {len(rows) for rows in found} <= {count // folds, -(-count // folds)}
+    assert found == assign(count, folds, seed)
+
+
+def test_another_seed_divides_otherwise():
+    assert assign(30, 5, 0) != assign(30, 5, 1)
+
+
+@pytest.mark.parametrize(
+    ("count", "folds", "message"),
+    [
+        (9, 10, "selection.folds: 10 folds of 9 demonstrations; use at most 9"),
+        (2, 2, "selection.folds: 2 folds of 2 demonstrations leave less than 2 to train with"),
+    ],
+)
+def test_too_few_demonstrations_are_refused(count, folds, message):
+    with pytest.raises(FoldError, match=f"^{message}$"):
+        assign(count, folds, 0)
+
+
+def test_a_split_keeps_the_held_out_ones_out():
+    demos = two_skills(11)
+    folds = divide(demos, 4, 3)
+    assert sorted(name for names in folds.held_out for name in names) == sorted(demos.names)
+    for fold in range(4):
+        train, held_out = folds.split(fold)
+        assert held_out.names == folds.held_out[fold]
+        assert set(train.names) == set(demos.names) - set(held_out.names)
+    assert folds.dimensions.steps == max(demos.lengths)
+
+
+def test_what_its_author_set_apart_is_in_no_fold():
+    demos = two_skills(10)
+    marked = Demonstrations(demos.demonstrations, {"valid": ("demo_3", "demo_7")})
+    folds = divide(marked, 4, 0)
+    assert sorted(name for names in folds.held_out for name in names) == sorted({*demos.names} - {"demo_3", "demo_7"})
+
+
+def test_other_folds_are_refused(tmp_path):
+    path = tmp_path / "folds.json"
+    folds = divide(two_skills(6), 3, 0)
+    keep_folds(folds, path)
+    before = path.read_bytes()
+    assert json.loads(before)["folds"] == [list(names) for names in folds.held_out]
+    keep_folds(folds, path)
+    with pytest.raises(FoldError, match=r"folds\.json: another version divided these .*; choose another --out"):
+        keep_folds(divide(two_skills(6), 3, 1), path)
+    assert path.read_bytes() == before

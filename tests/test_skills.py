@@ -3,19 +3,25 @@
 import base64
 import io
 import re
+from itertools import combinations
 
 import av
 import cv2
 import numpy as np
 import pytest
 import torch
+from matplotlib.colors import to_rgb
 from scipy.cluster.hierarchy import linkage
 
+from ddco_pyro.data.demonstrations import Demonstration
+from ddco_pyro.drawing.colours import CONTROL, OPTIONS, option_rgb
 from ddco_pyro.drawing.diagrams import dendrogram, transition_graph
 from ddco_pyro.drawing.shown import frames, projection
 from ddco_pyro.report.inputs import _shares
 from ddco_pyro.report.skills import Instance, aligned, film_of, instances, sheet_of, transitions
 from ddco_pyro.segmenting import LevelLabels, Segmented, Segments
+from ddco_pyro.simulation.episodes import Episode
+from ddco_pyro.simulation.film import FRAMES_PER_SECOND, captioned, write_film
 
 PATHS = ["1112233", "112222", "2211"]
 """The options of three demonstrations of 7, 6 and 4 steps."""
@@ -125,3 +131,77 @@ def test_pictures_of_any_number_of_channels_are_shown_in_colour(channels):
     shown = frames(pictures, [1, 1, 4], height=8)
     kept = [0, 1, 2] if channels >= 3 else [0, 0, 0]
     assert np.array_equal(shown, pictures[[1, 1, 4]][..., kept])
+
+
+# --- films ------------------------------------------------------------------------------------------------------------
+
+
+HEIGHT, WIDTH = 121, 161
+
+
+@pytest.fixture
+def episode():
+    """Three steps of options 2, 1, 1 and the end; each frame is greyer than the last."""
+    frames = [np.full((HEIGHT, WIDTH, 3), 60 * t, np.uint8) for t in range(4)]
+    record = Demonstration("demo_0", {"x": np.zeros((3, 1))}, np.zeros((3, 1)))
+    return Episode(0, record, {}, np.array([[2], [1], [1]]), frames)
+
+
+def test_a_film_has_every_frame_in_even_size(episode, tmp_path):
+    path = tmp_path / "videos" / "film.mp4"
+    write_film(path, episode)
+    with av.open(path) as container:
+        stream = container.streams.video[0]
+        film = np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(stream)])
+        assert (stream.codec_context.name, stream.pix_fmt) == ("h264", "yuv420p")  # what browsers play
+        assert stream.average_rate == FRAMES_PER_SECOND
+    assert film.shape == (4, HEIGHT - 1, WIDTH - 1, 3)
+    centres = film[:, 70:100, 60:100].mean((1, 2, 3))
+    np.testing.assert_allclose(centres, [0, 60, 120, 180], atol=6)
+    assert [one.name for one in path.parent.iterdir()] == ["film.mp4"]
+
+
+def test_the_border_has_the_colour_of_the_active_option(episode):
+    for t, choice in enumerate([2, 1, 1]):
+        frame = captioned(episode, t)
+        for edge in (frame[0], frame[-1], frame[:, 0], frame[:, -1]):
+            assert (edge == option_rgb(choice)).all()
+    assert not (captioned(episode, 3)[-1] == option_rgb(1)).all(-1).any()
+    assert (episode.frames[0] == 0).all()  # the episode's own frames stay as they are
+
+
+# --- colours ----------------------------------------------------------------------------------------------------------
+
+
+# What dichromats see, in linear RGB (Machado, Oliveira & Fernandes 2009, severity 1).
+SIGHTS = {
+    "normal": np.eye(3),
+    "protanopia": np.array(
+        [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]]
+    ),
+    "deuteranopia": np.array(
+        [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]]
+    ),
+    "tritanopia": np.array(
+        [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]]
+    ),
+}
+XYZ = np.array(
+    [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]
+)
+WHITE = np.array([0.95047, 1.0, 1.08883])
+
+
+def lab(colour, sight):
+    rgb = np.array(to_rgb(colour))
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    x, y, z = XYZ @ np.clip(SIGHTS[sight] @ linear, 0, 1) / WHITE
+    x, y, z = (np.cbrt(v) if v > 0.008856 else 7.787 * v + 16 / 116 for v in (x, y, z))
+    return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
+
+
+@pytest.mark.parametrize("sight", SIGHTS)
+@pytest.mark.parametrize(("count", "distance"), [(5, 23), (10, 18)])
+def test_colours_are_told_apart_from_each_other_and_from_control(sight, count, distance):
+    for one, other in combinations((CONTROL, *OPTIONS[:count]), 2):
+        assert np.linalg.norm(lab(one, sight) - lab(other, sight)) > distance, (one, other)

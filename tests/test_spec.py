@@ -7,20 +7,27 @@ import resource
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
+import jsonschema
 import pytest
 import yaml
 from example_specs import EXAMPLE, SMALL
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from ddco_pyro.spec import (
     HierarchySpec,
+    Spec,
     SpecError,
     dump_spec,
     load_spec,
     network_spec,
     parse_spec,
+    spec_schema,
     with_overrides,
 )
+from ddco_pyro.spec.spec import edited
 from ddco_pyro.spec.yaml import read_yaml
 
 
@@ -157,13 +164,6 @@ def test_ordinary_aliases_and_merge_keys_are_read(tmp_path: Path) -> None:
     assert spec.hierarchy.meta_policy.hidden == (64,)
 
 
-def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
-    with pytest.raises(SpecError, match=r"none\.yaml: cannot be read: No such file or directory; check the path"):
-        load_spec(tmp_path / "none.yaml")
-    with pytest.raises(SpecError, match="is no file of at most 256 kB; a spec is a YAML file"):
-        load_spec(tmp_path)
-
-
 # --- overrides --------------------------------------------------------------------------------------------------------
 
 
@@ -182,14 +182,8 @@ def test_overrides_are_applied_to_the_file(tmp_path: Path) -> None:
     [
         ("seed", "override 'seed': write it as key.path=value"),
         ("seed=[1", "override 'seed=[1': line 1, column 3: not valid YAML"),
-        (
-            "control.std.learn=true",
-            "control.std.learn: cannot be set, because control.std is 0.1; set the whole of control.std",
-        ),
-        (
-            "observations.x.key=a",
-            "observations.x.key: 'x' is not the number of one of the 2 items there (the first is 0)",
-        ),
+        ("control.std.learn=true", "control.std.learn: cannot be set, because control.std is 0.1"),
+        ("observations.x.key=a", "observations.x.key: 'x' is not the number of one of the 2 items there"),
     ],
 )
 def test_overrides_that_cannot_be_applied(tmp_path: Path, override: str, message: str) -> None:
@@ -245,3 +239,289 @@ def test_a_number_is_what_its_decimal_text_says(text: str, value: object) -> Non
 def test_a_name_that_looks_like_a_number_stays_a_name(name: str) -> None:
     text = dump_spec(parse_spec({**SMALL, "observations": [name]}))
     assert parse_spec(read_yaml(text)).observed == [name]
+
+
+# --- specs that are written, and the schema ---------------------------------------------------------------------------
+
+
+counts = st.integers(1, 10**6)
+positive = st.floats(1e-300, 1e30)
+shares = st.floats(0, 1, exclude_max=True)
+texts = st.text(
+    st.characters(codec="utf-8", exclude_categories=["Cs", "Cc"]), min_size=1, max_size=8
+) | st.sampled_from(["1e-3", ".5", "null", "yes", "1", "a: b", "- c", "~", "#", "2020-01-01"])
+values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | texts,
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(texts, inner, max_size=3),
+    max_leaves=6,
+)
+perceptrons = st.fixed_dictionaries({}, optional={"hidden": counts | st.lists(counts, max_size=3), "dropout": shares})
+networks = st.one_of(
+    perceptrons,
+    st.fixed_dictionaries(
+        {"network": st.just("branches"), "of": st.dictionaries(texts, perceptrons, min_size=1, max_size=2)}
+    ),
+    st.fixed_dictionaries(
+        {"network": st.just("lstm")},
+        optional={
+            "over": st.none() | perceptrons,
+            "hidden": st.lists(counts, min_size=1),
+            "horizon": st.none() | counts,
+            "inputs": st.lists(texts),
+        },
+    ),
+    st.fixed_dictionaries({"network": st.just("linear")}),
+    st.fixed_dictionaries(
+        {}, optional={"network": st.just("per_timestep"), "hidden": st.lists(counts, max_size=3), "dropout": shares}
+    ),
+    st.fixed_dictionaries(
+        {"network": st.just("conv")}, optional={"filters": counts, "kernel": counts, "hidden": st.lists(counts)}
+    ),
+    st.fixed_dictionaries(
+        {"network": st.just("a.b:C")}, optional={"options": st.dictionaries(texts, values, max_size=3)}
+    ),
+)
+emissions = st.lists(st.sampled_from(["options", "control"]), min_size=1, unique=True)
+
+
+@st.composite
+def hierarchies(draw: st.DrawFn) -> dict[str, Any]:
+    levels = []
+    for index in range(draw(st.integers(1, 3))):
+        policy = dict(draw(networks))
+        if index:
+            policy["emits"] = draw(emissions)
+        level = {"name": f"level-{index}", "count": draw(counts), "policy": policy, "termination": draw(networks)}
+        if draw(st.booleans()):
+            heads = {"policy": policy | draw(perceptrons), "termination": {"network": "linear"}}
+            level |= heads | {"trunk": draw(networks)} if set(policy) <= {"emits", "hidden", "dropout"} else {}
+        levels.append(level)
+    return {"levels": levels, "meta_policy": {**draw(networks), "emits": draw(emissions)}}
+
+
+@st.composite
+def specs(draw: st.DrawFn) -> dict[str, Any]:
+    baselines = st.sampled_from(["flat", "per_timestep"]) | st.fixed_dictionaries(
+        {"kind": st.just("flat"), "policy": networks}
+    )
+    equal = st.just("flat_equal") | st.fixed_dictionaries(
+        {
+            "kind": st.just("flat_equal"),
+            "policy": st.fixed_dictionaries({"hidden": st.lists(counts, min_size=1, max_size=3)}),
+        }
+    )
+    observation = texts | st.fixed_dictionaries({"key": texts}, optional={"differences": st.booleans()})
+    names = st.lists(observation, min_size=1, max_size=3, unique_by=lambda o: o if isinstance(o, str) else o["key"])
+    std = positive | st.fixed_dictionaries({"learn": st.just(True)}, optional={"floor": positive})
+    scale = st.sampled_from(["standardize", "none"]) | st.lists(positive, min_size=1, max_size=3)
+    model = {"hierarchy": draw(hierarchies())} if draw(st.booleans()) else {"baseline": draw(baselines)}
+    return {
+        "demonstrations": {"path": draw(texts), "valid_fraction": draw(st.floats(0.01, 0.99))},
+        "observations": draw(names),
+        "control": {"std": draw(std), "scale": draw(scale)},
+        **model,
+        "compare_with": draw(st.lists(baselines | equal, max_size=2)),
+        "training": {
+            "epochs": draw(counts),
+            "patience": draw(st.none() | counts),
+            "clip_gradient": draw(st.none() | positive),
+            "average": draw(st.none() | st.floats(0.01, 0.99)),
+        },
+        "selection": {"grid": draw(st.sampled_from([{}, {"seed": [1, 2]}, {"control.std": [0.1, {"learn": True}]}]))},
+        "rollout": {"policies": draw(st.lists(texts, max_size=2))},
+        "seed": draw(st.integers(0, 2**32 - 1)),
+    }
+
+
+@settings(max_examples=20)
+@given(specs())
+def test_what_is_written_is_read_as_it_was(tmp_path_factory: pytest.TempPathFactory, data: dict[str, Any]) -> None:
+    spec = parse_spec(data)
+    path = tmp_path_factory.mktemp("spec") / "spec.yaml"
+    path.write_text(dump_spec(spec), encoding="utf-8")
+    assert load_spec(path, allow_code=True) == spec
+
+
+def test_all_defaults_are_written() -> None:
+    written = yaml.safe_load(dump_spec(parse_spec(SMALL)))
+    assert written["training"]["optimizer"] == {
+        "name": "adam", "ridge": {"policy": 1.0, "gate": 1.0, "termination": 1.0}, "lr": 1e-3, "schedule": "constant",
+        "warmup": 0, "momentum": 0.9, "weight_decay": 0.0,
+    }  # fmt: skip
+    assert written["hierarchy"]["levels"][0]["termination"] == {"network": "linear"}
+    assert set(written) == set(Spec.model_fields)
+
+
+VALIDATOR = jsonschema.Draft202012Validator(spec_schema())
+
+
+@settings(max_examples=50)
+@given(specs())
+def test_the_schema_accepts_what_is_accepted(data: dict[str, Any]) -> None:
+    VALIDATOR.validate(data)
+
+
+@pytest.mark.parametrize(
+    "network", [{"network": "mpl"}, {"hidden": [0]}, {"hiden": [3]}, {"dropout": 1}, {"network": "conv", "kernel": 1.5}]
+)
+def test_the_schema_refuses_networks_that_are_refused(network: dict[str, Any]) -> None:
+    VALIDATOR.validate(SMALL)
+    wrong = edited(SMALL, {"hierarchy.levels.0.policy": network})
+    with pytest.raises(SpecError):
+        parse_spec(wrong)
+    assert not VALIDATOR.is_valid(wrong)
+
+
+def described(schema: dict[str, Any]) -> list[str]:
+    """The names of the properties without a description."""
+    models = [schema, *schema["$defs"].values()]
+    fields = [(name, field) for model in models for name, field in model["properties"].items()]
+    return [name for name, field in fields if not {"description", "$ref", "const"} & set(field)]
+
+
+def test_the_schema_knows_the_keys_of_the_example() -> None:
+    schema = spec_schema()
+    example = yaml.safe_load(EXAMPLE)
+    assert set(example) <= set(schema["properties"])
+    assert set(example["training"]) <= set(schema["$defs"]["TrainingSpec"]["properties"])
+    assert {*example["hierarchy"]["levels"][0], "trunk"} == set(schema["$defs"]["LevelSpec"]["properties"])
+    assert schema["required"] == ["observations"]
+    assert schema["additionalProperties"] is False
+    assert schema["$defs"]["LevelSpec"]["properties"]["count"]["minimum"] == 1
+    assert described(schema) == []
+
+
+# --- what is refused, and in which words ------------------------------------------------------------------------------
+
+
+def refusal(overrides: dict[str, Any]) -> str:
+    with pytest.raises(SpecError) as caught:
+        parse_spec(SMALL, overrides)
+    return str(caught.value)
+
+
+REFUSED: list[tuple[dict[str, Any], str]] = [
+    *(
+        (
+            {"compare_with": ["flat", {"kind": "per_timestep", "policy": {"network": name, **settings}}]},
+            "compare_with.1.policy.network: per_timestep has a perceptron for each step: use one of linear, mlp, "
+            f"got {name!r}, or say kind: flat",
+        )
+        for name, settings in {"lstm": {}, "conv": {}, "branches": {"of": {"pose": {}}}, "module:Net": {}}.items()
+    ),
+    ({"hierarchy.levels.0.count": "5"}, "hierarchy.levels.0.count: must be a whole number, got '5'"),
+    ({"hierarchy.levels.0.count": True}, "hierarchy.levels.0.count: must be a whole number, got true"),
+    ({"hierarchy.levels": {"count": 3}}, "hierarchy.levels: must be a list, got {'count': 3}"),
+    ({"hierarchy.levels.0.cuont": 5}, "hierarchy.levels.0.cuont: unknown key; did you mean hierarchy.levels.0.count?"),
+    ({"sed": 3}, "sed: unknown key; did you mean seed?"),
+    ({"inference.xyz": 3}, "inference.xyz: unknown key; valid here: engine"),
+    ({"hierarchy.levels": [{"count": 1}, {"count": 2}]}, "hierarchy.levels.1.name: 'option' is also the name of"),
+    ({"hierarchy.levels.0.name": "a b"}, "hierarchy.levels.0.name: must be letters, digits, '_' or '-'"),
+    ({"hierarchy.levels.0.policy.emits": ["options", "control"]}, "hierarchy.levels.0.policy.emits: the lowest level"),
+    ({"hierarchy.meta_policy.emits": ["option"]}, "hierarchy.meta_policy.emits.0: must be options or control"),
+    ({"hierarchy.meta_policy.emits": ["options", "options"]}, "hierarchy.meta_policy.emits: 'options' is given twice"),
+    ({"hierarchy.meta_policy.network": "mpl"}, "hierarchy.meta_policy.network: no network is called 'mpl'"),
+    ({"hierarchy.meta_policy": {"network": "linear", "hidden": [8]}}, "hierarchy.meta_policy.hidden: does not apply"),
+    ({"control.parts": [{"name": "arm", "dims": [0, 1], "scale": [1.0]}]}, "control.parts.0.scale: has 1 numbers"),
+    (
+        {"control.parts": [{"name": "jaw", "dims": [0], "kind": "binary", "scale": [1.0]}]},
+        "control.parts.0.scale: does not apply to kind: binary; leave it out",
+    ),
+    ({"training.optimizer": {"name": "adam", "momentum": 0.5}}, "training.optimizer.momentum: is for name: momentum"),
+    ({"observations": ["step"]}, "observations: step alone says nothing about the state"),
+    ({"observations": ["state", {"key": "step", "differences": True}]}, "observations.1.differences: step grows by"),
+    (
+        {"hierarchy.meta_policy": {"network": "conv", "kernel": 3, "layers": [{"filters": 2, "kernel": 3}]}},
+        "hierarchy.meta_policy.kernel: each of layers has its own; leave it out",
+    ),
+    ({"hierarchy.meta_policy": {"network": "branches"}}, "hierarchy.meta_policy.of: missing; it has to be given"),
+    (
+        {"hierarchy.levels.0.trunk": {"network": "mlp"}, "hierarchy.levels.0.policy": {"network": "lstm"}},
+        "hierarchy.levels.0.policy.network: reads the trunk: use one of linear, mlp, got 'lstm'",
+    ),
+    ({"hierarchy.meta_policy.dropout": 1}, "hierarchy.meta_policy.dropout: must be less than 1, got 1"),
+    ({"hierarchy": None}, "hierarchy: missing; declare a hierarchy, or a baseline in its place"),
+    ({"baseline": "flat"}, "baseline: stands beside hierarchy; keep one of the two"),
+    ({"compare_with": ["flt"]}, "compare_with.0.kind: must be flat or flat_equal or per_timestep or mixture"),
+    (
+        {"compare_with": ["flat", {"kind": "flat_equal", "policy": {"network": "linear"}}]},
+        "compare_with.1.policy: flat_equal widens hidden layers, and network 'linear' has none; give it some, such as "
+        "{network: mlp, hidden: [64]}",
+    ),
+    ({"hierarchy": None, "baseline": "flat_equal"}, "baseline: flat_equal takes its size from a hierarchy"),
+    ({"training.epochs": None, "training.patience": None}, "training.epochs: epochs and training.patience are both"),
+    ({"training.labels": {"level": "optoin", "from": "phase"}}, "training.labels.level: there is no level 'optoin'"),
+    ({"training.labels": {"level": "option", "form": "phase"}}, "training.labels.from: missing; it has to be"),
+    (
+        {"hierarchy.meta_policy.emits": ["control"], "training.labels": {"level": "option", "from": "phase"}},
+        "training.labels.level: no policy selects the options of 'option'; let the policies above emit options",
+    ),
+    (
+        {"training": {"initialize": "random", "labels": {"level": "option", "from": "phase", "hold": False}}},
+        "training.labels.hold: false uses labels in initialisation alone, and that is random; say vq there",
+    ),
+    ({"training.initialize": "clusters"}, "training.initialize: must be one of 'vq', 'vq_controls', 'equal_parts'"),
+    ({"training.initialize": ["vq", "cuts"]}, "training.initialize: has 2 kinds, but training.restarts is 1"),
+    ({"training": {"initialize": "mixture", "lower_levels": "frozen"}}, "training.lower_levels: mixture trains all"),
+    ({"training.duration.mean": [20, 2]}, "training.duration.mean: has 2 numbers, but the number of levels is 1"),
+    ({"hierarchy": None, "baseline": "flat", "training.duration.mean": 20}, "training.duration: there are no options"),
+    ({"task": None}, "task: missing; name a task, or give a file in demonstrations.path"),
+    ({"observations": ["a", "a"]}, "observations.1.key: 'a' is given twice; keep one"),
+    ({"observations": ["hand_pos", "goal"], "report.trajectory": "hand_po"}, "report.trajectory: there is no"),
+    ({"control.std": -0.1}, "control.std: must be a positive number or {learn: true}, got -0.1"),
+    ({"control.scale": "standardise"}, "control.scale: must be standardize, none, or a list of positive numbers"),
+    ({"control.scale": [1.0, 0.0]}, "control.scale.1: must be greater than 0, got 0.0"),
+    ({"training.optimizer.lr": float("inf")}, "training.optimizer.lr: must be a finite number, got inf"),
+    ({"training.layerwise": "yes"}, "training.layerwise: must be true or false, got 'yes'"),
+    ({"training": None}, "training: must be a mapping (key: value), got null"),
+    ({"seed": 2**32}, "seed: must be at most 4294967295, got 4294967296"),
+]
+
+
+@pytest.mark.parametrize(("overrides", "message"), REFUSED, ids=[message.partition(",")[0] for _, message in REFUSED])
+def test_refused_with_the_key_path_and_one_line(overrides: dict[str, Any], message: str) -> None:
+    assert refusal(overrides).startswith(message)
+
+
+def test_every_problem_has_its_line() -> None:
+    message = refusal({"seed": "a", "hierarchy.levels.0.count": 0, "traning": {}})
+    assert message.splitlines() == [
+        "hierarchy.levels.0.count: must be at least 1, got 0",
+        "seed: must be a whole number, got 'a'",
+        "traning: unknown key; did you mean training?",
+    ]
+
+
+def test_keys_that_are_not_text_are_refused() -> None:
+    with pytest.raises(SpecError, match=r"^selection\.grid\.3: a key must be text"):
+        parse_spec({**SMALL, "selection": {"grid": {3: [1]}}})
+    with pytest.raises(SpecError, match=r"^3: a key must be text"):
+        parse_spec({**SMALL, 3: 4})  # type: ignore[dict-item]
+
+
+@pytest.mark.parametrize(
+    ("grid", "message"),
+    [
+        (
+            {"hierarchy.levels.0.count": [1, 0]},
+            "selection.grid.hierarchy.levels.0.count: value 0: hierarchy.levels.0.count: must be at least 1, got 0",
+        ),
+        (
+            {"hierarchy.levels.0.cuont": [1]},
+            "selection.grid.hierarchy.levels.0.cuont: value 1: hierarchy.levels.0.cuont: unknown key; "
+            "did you mean hierarchy.levels.0.count?",
+        ),
+        (
+            {"hierarchy.levels.1.count": [1]},
+            "selection.grid.hierarchy.levels.1.count: value 1: hierarchy.levels.1.count: "
+            "'1' is not the number of one of the 1 items there (the first is 0)",
+        ),
+        (
+            {"selection.folds": [3]},
+            "selection.grid.selection.folds: the selection cannot be part of its own grid; remove it",
+        ),
+        ({"seed": 3}, "selection.grid.seed: must be a list, got 3"),
+    ],
+)
+def test_every_value_of_a_grid_has_to_be_valid_in_place(grid: dict[str, Any], message: str) -> None:
+    assert refusal({"selection.grid": grid}) == message

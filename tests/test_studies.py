@@ -11,7 +11,6 @@ import signal
 from pathlib import Path
 
 import arena_playing
-import memory
 import numpy as np
 import pytest
 import sawyer
@@ -138,10 +137,7 @@ RECORDED = {"counts": [10], "held_out": 5, "test": {"first": 0, "count": 20}}
             {"grid": {"control.std": [0.1]}, "methods": {"options": {"overrides": {"control.std": 0.2}}}},
             "methods.options.overrides: has 'control.std', which the grid has, too",
         ),
-        (
-            {"overrides": {"hierarchy.levels.0.policy.network": "os:system"}},
-            "options: would import user code (os:system)",
-        ),
+        ({"overrides": {"hierarchy.levels.0.policy.network": "os:system"}}, "options: would import user code"),
         ({"world": "os:system", "tasks": ["a"], "demonstrations": RECORDED, "contrasts": []}, "would import user code"),
     ],
 )
@@ -170,10 +166,7 @@ def test_the_page_names_every_key():
     ("changes", "said"),
     [
         ({"demonstrations": {**STUDY["demonstrations"], "path": "other.hdf5"}}, "other.hdf5"),
-        (
-            {"demonstrations": {**STUDY["demonstrations"], "held_out": 7}},
-            "has 12 demonstrations for test, but",
-        ),
+        ({"demonstrations": {**STUDY["demonstrations"], "held_out": 7}}, "has 12 demonstrations for test, but"),
         ({"kept": [{"table": "spec.yaml"}]}, "spec.yaml: is damaged"),
     ],
 )
@@ -264,11 +257,6 @@ class World:
 
 WORLD = World()
 """
-
-
-def test_every_declaration_of_the_project_is_valid():
-    for path in (ROOT / "studies").glob("*.yaml"):
-        assert Study.load(path, allow_code=True).declared.contrasts
 
 
 def test_the_frozen_test_is_fresh():
@@ -622,20 +610,6 @@ def test_planted_levels_are_scored_by_their_truth(tmp_path):
     assert {name for name in found if len(found[name]) == 4} == {*found}
     assert found["truth"]["NMI, level 1"] > 0.99
     assert found["truth"]["nats"] >= max(found[name]["nats"] for name in ("limit", "search", "segments"))
-
-
-def test_the_figure_of_readme_has_the_numbers_of_its_table(tmp_path):
-    rows = memory.read()
-    chosen = memory.lines(rows, memory.WORTH)
-    assert [line[:2] for line in chosen] == [
-        ("arena", 50),
-        ("needle", 100),
-        ("arena", 50),
-        ("bins", 60),
-        ("pushing", 80),
-    ]
-    memory.draw(rows, chosen, tmp_path / "worth.png", columns=1)
-    assert (tmp_path / "worth.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_quoted_difference_is_that_of_both_tables():

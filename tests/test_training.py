@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from planted import CONTROL, TRAINING, make_spec, make_trainer, make_truth, plant, recovered
+from random_demonstrations import of_states
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.inference import log_likelihood
@@ -17,17 +18,6 @@ from ddco_pyro.training.checkpoint import Progress, Restart
 from ddco_pyro.training.loop import StageTraining, backward, train
 from ddco_pyro.training.objective import Objective, TrainingError
 from ddco_pyro.training.stages import RISING, StageEnd, plan
-
-
-def random_demonstrations(number=10, steps=8, seed=0):
-    generator = np.random.default_rng(seed)
-    return Demonstrations(
-        tuple(
-            Demonstration(f"demo_{n}", {"state": generator.normal(size=(steps, 3))}, generator.normal(size=(steps, 2)))
-            for n in range(number)
-        )
-    )
-
 
 QUICK = {"control": {"std": 1.0}, "optimizer": {"lr": 0.1}}
 """Every stage soon stops."""
@@ -143,7 +133,7 @@ def test_learning_rates_warm_up_and_fall_along_half_a_cosine(tmp_path, monkeypat
 
     monkeypatch.setattr(torch.optim, "Adam", Adam)
     optimizer = {"lr": 0.01, "schedule": "cosine", "warmup": 2}
-    trainer = make_trainer(make_spec(epochs=40, patience=None, optimizer=optimizer), random_demonstrations(), tmp_path)
+    trainer = make_trainer(make_spec(epochs=40, patience=None, optimizer=optimizer), of_states([8] * 10), tmp_path)
     trainer.run()
     parameter, expected = torch.nn.Parameter(torch.zeros(1)), []
     for epochs in epochs_of(trainer).values():
@@ -169,7 +159,7 @@ def out_of_patience(tune, patience):
 def test_stages_share_the_budget_and_what_one_leaves_goes_to_the_later_ones(tmp_path):
     """What each may take is worked out here from what the ones before it have taken."""
     spec = make_spec((2, 2), epochs=62, patience=3)
-    trainer = make_trainer(spec, random_demonstrations(), tmp_path)
+    trainer = make_trainer(spec, of_states([8] * 10), tmp_path)
     trainer.run()
     left, taken = 62, epochs_of(trainer)
     for number, stage in enumerate(plan(spec, 2)):
@@ -189,14 +179,14 @@ def test_every_model_has_the_same_budget(tmp_path, model):
     """Whatever the number of its stages: 1 or 6 here. The steps are those of minibatches of 3 out of 8."""
     training = {"epochs": 14, "patience": None, "batch_size": 3, "restarts": 2}
     spec = flat(model, **training) if isinstance(model, str) else make_spec(model, **training)
-    trainer = make_trainer(spec, random_demonstrations(), tmp_path)
+    trainer = make_trainer(spec, of_states([8] * 10), tmp_path)
     trainer.run()
     assert sum(epochs_of(trainer, 0).values()) == sum(epochs_of(trainer, 1).values()) == 14
     assert trainer.summary["budget"] == trainer.summary["spent"] == {"epochs": 14, "gradient_steps": 14 * 3}
 
 
 def test_without_a_budget_every_stage_trains_until_its_patience(tmp_path):
-    trainer = make_trainer(make_spec((2,), epochs=None, patience=2, **QUICK), random_demonstrations(), tmp_path)
+    trainer = make_trainer(make_spec((2,), epochs=None, patience=2, **QUICK), of_states([8] * 10), tmp_path)
     trainer.run()
     for stage in trainer.summary["stages"]:
         tune = [row["tune"] for row in trainer.history if row["stage"] == stage["stage"]]
@@ -212,7 +202,7 @@ def test_weight_decay_of_adamw_is_apart_from_the_gradient(name, apart, tmp_path)
     after = []
     for decay in (0.0, 1.0, 2.0):
         spec = make_spec((2,), optimizer={"name": name, "lr": 0.01, "weight_decay": decay}, **settings)
-        after.append(make_trainer(spec, random_demonstrations(), tmp_path / str(decay)).run().state_dict())
+        after.append(make_trainer(spec, of_states([8] * 10), tmp_path / str(decay)).run().state_dict())
     none, once, twice = (torch.cat([value.flatten() for value in one.values()]) for one in after)
     assert (none != once).sum() > 10
     assert torch.allclose(twice - none, 2 * (once - none), atol=1e-7) == apart
@@ -234,7 +224,7 @@ def test_the_running_mean_of_the_weights_is_evaluated_and_kept(tmp_path, monkeyp
     monkeypatch.setattr(StageTraining, "step", step)
     monkeypatch.setattr(Objective, "tune", tune)
     spec = flat(average=decay, epochs=3, batch_size=4)
-    final = make_trainer(spec, random_demonstrations(), tmp_path).run()
+    final = make_trainer(spec, of_states([8] * 10), tmp_path).run()
     assert (len(steps), len(shown)) == (3 * 2, 1 + 3)
     for epoch, seen in enumerate(shown[1:], start=1):
         taken = steps[: 2 * epoch]
@@ -262,7 +252,7 @@ def test_the_running_mean_of_the_weights_is_evaluated_and_kept(tmp_path, monkeyp
 )
 def test_resuming_gives_the_same_bits(tmp_path, optimizer, training, rows):
     spec = make_spec((2, 2), optimizer={"name": optimizer, "lr": 0.01}, restarts=2, **training)
-    demos = random_demonstrations()
+    demos = of_states([8] * 10)
     whole = make_trainer(spec, demos, tmp_path / "whole")
     expected = whole.run().state_dict()
     assert rows in (None, len(whole.history))
@@ -295,7 +285,7 @@ def test_frozen_levels_stay_as_they_were_discovered(tmp_path, monkeypatch):
         if row.stage == "meta-policy" and not before:
             before.update(Restart.read(tmp_path / "restart-0.safetensors").states["best"])
 
-    final = make_trainer(spec, random_demonstrations(), tmp_path, keep).run().state_dict()
+    final = make_trainer(spec, of_states([8] * 10), tmp_path, keep).run().state_dict()
     lower = [name for name in final if name.startswith("levels.")]
     meta = [name for name in final if name.startswith("meta_policy.network")]
     assert all(torch.equal(final[name], before[name]) for name in lower)
@@ -303,7 +293,7 @@ def test_frozen_levels_stay_as_they_were_discovered(tmp_path, monkeypatch):
 
 
 def test_both_engines_train_to_the_same_model(tmp_path):
-    demos = random_demonstrations(6, 5)
+    demos = of_states([5] * 6)
     states = []
     for engine in ("fused", "enumerate"):
         spec = make_spec((2,), epochs=8, control={"std": 1.0})
@@ -314,7 +304,7 @@ def test_both_engines_train_to_the_same_model(tmp_path):
 
 
 def test_what_is_not_finite_names_the_demonstration(tmp_path):
-    trainer = make_trainer(make_spec(), random_demonstrations(), tmp_path)
+    trainer = make_trainer(make_spec(), of_states([8] * 10), tmp_path)
     trainer.data.train.actions[trainer.data.names.index("demo_0")] = torch.inf
     with pytest.raises(TrainingError, match=r"demo_0 is not finite"):
         trainer.run()
@@ -433,3 +423,59 @@ def test_a_planted_hierarchy_is_recovered(tmp_path, counts):
     values = recovered(make_trainer(spec, demos, tmp_path).run(), truth, *plant(truth, 40, 40, seed=2))
     assert values["found"] > values["truth"] - 0.02 * abs(values["truth"]), values
     assert values["found nmi"][0] > 0.95, values
+
+
+# --- what of the tuning demonstrations decides ------------------------------------------------------------------------
+
+
+LEARNT = {"std": {"learn": True, "floor": 0.01}, "scale": "none"}
+SETTINGS = {"epochs": 200, "patience": 10, "initialize": "vq_controls"}
+
+
+@pytest.fixture(scope="module")
+def planted():
+    """30 demonstrations of 30 steps of two options."""
+    return plant(make_truth(make_spec((2,), control=CONTROL)), 30, 30, seed=1)[0]
+
+
+def cut(demos):
+    """The same with lengths of their own."""
+    each = (replace(demo, observations={"state": demo.observations["state"][: 9 + n]}, actions=demo.actions[: 9 + n])
+            for n, demo in enumerate(demos))  # fmt: skip
+    return Demonstrations(tuple(each))
+
+
+def odd(demos, name):
+    """The same, but for a demonstration whose control goes the other way, three times as far."""
+    return Demonstrations(
+        tuple(replace(demo, actions=-3 * demo.actions) if demo.name == name else demo for demo in demos)
+    )
+
+
+def per_step(model, batch):
+    with torch.no_grad():
+        return float(log_likelihood(model.tabulate(batch), batch.lengths).sum()) / batch.steps
+
+
+@pytest.mark.parametrize("number", [25, 30])
+def test_the_median_is_over_demonstrations_and_per_step_of_each(planted, tmp_path, number):
+    """Of five, and of six."""
+    spec = make_spec((2,), tune_by="median")
+    material = make_trainer(spec, cut(planted.select(planted.names[:number])), tmp_path).data
+    model, batch = material.hierarchy(0), material.tune
+    assert len(batch) == number // 5
+    with torch.no_grad():
+        values = (log_likelihood(model.tabulate(batch), batch.lengths) / batch.lengths).numpy()
+    assert Objective(material, Progress(0), plan(spec, 1)[-1]).tune(model) == pytest.approx(np.median(values))
+    assert abs(np.median(values) - float(values @ batch.lengths.numpy() / batch.steps)) > 1e-3
+
+
+def test_an_odd_demonstration_among_six_does_not_stop_training(planted, tmp_path):
+    """With the mean it does: the better the others are known, the less likely it is."""
+    _, tune = planted.split(0.2, 0)
+    demos, kept = odd(planted, tune[0].name), {}
+    for tune_by in ("mean", "median"):
+        trainer = make_trainer(make_spec((2,), control=LEARNT, tune_by=tune_by, **SETTINGS), demos, tmp_path / tune_by)
+        assert tune[0].name not in trainer.data.names
+        kept[tune_by] = per_step(trainer.run(), trainer.data.train)
+    assert kept["median"] > kept["mean"] + 0.5

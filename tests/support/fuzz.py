@@ -113,7 +113,7 @@ def damaged_file(path: Path, seed: int) -> None:
         path.write_bytes(_damage_bytes(path.read_bytes(), choose))
 
 
-Edit = Callable[[h5py.File, random.Random], None]
+Edit = Callable[[h5py.File, random.Random], object]
 
 
 def _anything(file: h5py.File, choose: random.Random) -> str:
@@ -122,26 +122,23 @@ def _anything(file: h5py.File, choose: random.Random) -> str:
     return choose.choice(found or ["data"])
 
 
+def _remove(file: h5py.File, choose: random.Random) -> str:
+    """Where something was."""
+    place = _anything(file, choose)
+    if place in file:
+        del file[place]
+    return place
+
+
 def _replace(make: Callable[[random.Random], Any]) -> Edit:
     def edit(file: h5py.File, choose: random.Random) -> None:
-        place = _anything(file, choose)
-        if place in file:
-            del file[place]
-        file[place] = make(choose)
+        file[_remove(file, choose)] = make(choose)
 
     return edit
 
 
-def _remove(file: h5py.File, choose: random.Random) -> None:
-    place = _anything(file, choose)
-    if place in file:
-        del file[place]
-
-
 def _huge(file: h5py.File, choose: random.Random) -> None:
-    place = _anything(file, choose)
-    if place in file:
-        del file[place]
+    place = _remove(file, choose)
     steps = choose.choice([10**9, 10**15])
     file.create_dataset(place, shape=(steps, 3), chunks=(1024, 3), dtype=choose.choice(["f8", "u1"]),
                         compression=choose.choice([None, "gzip"]))  # fmt: skip

@@ -6,13 +6,11 @@ import os
 import subprocess
 import sys
 import zlib
-from pathlib import Path
 from typing import NamedTuple
 
 import h5py
 import numpy as np
-
-COMMAND = Path(sys.executable).with_name("ddco-pyro")
+from killing import COMMAND
 
 
 def zeros(group: h5py.Group, place: str, shape: tuple[int, ...], chunk: tuple[int, ...], dtype: str = "f8") -> None:

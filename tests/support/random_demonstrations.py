@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
@@ -24,3 +26,14 @@ def demonstration(name: str, steps: int = 4, seed: int = 0) -> Demonstration:
 def demonstrations(number: int = 12, masks: dict[str, tuple[str, ...]] | None = None) -> Demonstrations:
     records = tuple(demonstration(f"demo_{index}", 3 + index % 4, index) for index in range(number))
     return Demonstrations(records, masks or {}, {"task": "needle", "version": 3})
+
+
+def of_states(lengths: Iterable[int], seed: int = 0) -> Demonstrations:
+    """Demonstrations of so many steps each, with a state of three numbers and a control of two."""
+    random = np.random.default_rng(seed)
+    return Demonstrations(
+        tuple(
+            Demonstration(f"demo_{n}", {"state": random.normal(size=(steps, 3))}, random.normal(size=(steps, 2)))
+            for n, steps in enumerate(lengths)
+        )
+    )

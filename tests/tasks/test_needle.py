@@ -242,11 +242,6 @@ def test_supervisor_succeeds_where_the_open_loop_plan_fails() -> None:
     assert sum(run(seed, "open_loop")["success"] for seed in seeds) <= 2
 
 
-def test_phases_cover_the_episode() -> None:
-    steps = [step for phase in needle_supervisor.PHASES.values() for step in phase]
-    assert steps == list(range(STEPS))
-
-
 def test_planned_paths_go_round_obstacles_and_repeat() -> None:
     ranges = np.array([[-1.0, 1.0]] * 3)
 
