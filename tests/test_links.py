@@ -12,7 +12,7 @@ from torch.nn.functional import log_softmax, one_hot, pad
 
 from ddco_pyro.inference import logspace
 from ddco_pyro.inference.engines import log_likelihood
-from ddco_pyro.model.elementary import LANES, Plane, at, exponential, log_normal_cdf, logarithm, put
+from ddco_pyro.model.elementary import LANES, Plane, at, exponential, log_normal_cdf, logarithm, put, record
 from ddco_pyro.model.emissions import Binary, Categorical, Clipped, Density, Gaussian, Hurdle, Product
 from ddco_pyro.model.links import Link, LinkedTables, LogTable, Selection, Termination
 from ddco_pyro.model.passes import TERMINATION_BOUND
@@ -175,19 +175,27 @@ def test_formulas_are_those_of_the_model():
     torch.testing.assert_close(Termination(logits[:, :, 0]).table, expected)
 
 
+def plane(address, index):
+    """A plane of those at an address."""
+
+
+record(plane, Plane)
+
+
 @numba.njit
-def apply(which, steps, x, results):
-    """Compute a function of lanes at an address; results are [steps, 2]."""
+def apply(which, steps, planes):
+    """Compute a function of the lanes in the first of two planes; results are [steps, 2]."""
+    x, results = plane(planes, 0), plane(planes, 1)
     for t in range(steps):
-        own = at(Plane(x, 1), t, 0)
+        own = at(x, t, 0)
         if which == 0:
             first = second = exponential(own)
         elif which == 1:
             first = second = logarithm(own)
         else:
             first, second = log_normal_cdf(own)
-        put(Plane(results, 2), t, 0, first)
-        put(Plane(results, 2), t, 1, second)
+        put(results, t, 0, first)
+        put(results, t, 1, second)
 
 
 def computed(which, x):
@@ -195,7 +203,8 @@ def computed(which, x):
     lots = -(-len(x) // LANES)
     padded, results = np.ones(lots * LANES), np.empty((lots, 2, LANES))
     padded[: len(x)] = x
-    apply(which, lots, padded.ctypes.data, results.ctypes.data)
+    planes = np.array([padded.ctypes.data, 1, results.ctypes.data, 2])
+    apply(which, lots, planes.ctypes.data)
     return results[:, 0].reshape(-1)[: len(x)], results[:, 1].reshape(-1)[: len(x)]
 
 

@@ -181,17 +181,22 @@ def eliminate(
     trajectories.reshape(-1)[-run.number :], each.reshape(-1)[-run.number :] = order, run.lengths[order]
     found = np.empty((run.number, run.shared + 2))
     tasks, constants = np.array(run.tasks, dtype=np.int64), np.concatenate([NOTHING, *run.constants])
-    others = (
-        Lots(trajectories.ctypes.data, each.ctypes.data),
-        Tasks(len(tasks), tasks.ctypes.data, constants.ctypes.data),
-        view_of(joint),
-        view_of(choices),
+    reading = [
+        *Lots(trajectories.ctypes.data, each.ctypes.data),
+        *Tasks(len(tasks), tasks.ctypes.data, constants.ctypes.data),
+        *view_of(joint),
+        *view_of(choices),
         found.ctypes.data,
-    )
+        *Shape.of(tables.sizes),
+    ]
 
     def some(first: int, last: int) -> None:
-        buffer = _buffer(sizes.numbers(int(each[first:last, -1].max())))
-        kernel.eliminate(first, last, *others, buffer.ctypes.data, sizes, Shape.of(tables.sizes))
+        rows, columns = sizes.planes(int(each[first:last, -1].max())).T
+        ends = np.cumsum(LANES * rows * columns)
+        buffer = _buffer(int(ends[-1]))
+        addresses = buffer.ctypes.data + 8 * np.append(0, ends[:-1])
+        numbers = np.append(reading, np.stack([addresses, columns], 1))  # a :class:`kernel.Run`
+        kernel.eliminate(first, last, numbers.ctypes.data)
 
     kernel.on_threads(some, each.sum(1))
     run.take_shared(found)

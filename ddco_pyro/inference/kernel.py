@@ -24,6 +24,7 @@ import torch
 from ddco_pyro.model.elementary import (
     LANES,
     Array,
+    Outer,
     Plane,
     absolute,
     apart,
@@ -34,11 +35,12 @@ from ddco_pyro.model.elementary import (
     logarithm,
     number,
     put,
+    record,
     where,
     whole,
     write,
 )  # fmt: skip
-from ddco_pyro.model.passes import LAST, PLAIN, VIEW, Lot, Room, Rows, View, fill, give, slope, take, task
+from ddco_pyro.model.passes import LAST, Lot, Room, Rows, View, fill, give, slope, take, task
 
 IMPOSSIBLE = -1
 """Marks a joint choice with an option below a choice 0, and a caller that is itself below a choice 0."""
@@ -55,10 +57,9 @@ BLOCK = 32
 SMALL, LARGE = 1e-300, 1e300
 """Mass of a step, and backward messages, beyond which a trajectory is done in log space."""
 
-TASK = 8 * (PLAIN + 6 * VIEW)
-"""Bytes of a task."""
-
-releasing = numba.njit(cache=True, error_model="numpy", nogil=True)
+releasing = numba.njit(  # type: ignore[call-overload]
+    cache=True, error_model="numpy", nogil=True, no_cfunc_wrapper=True, no_rewrites=True, pipeline_class=Outer
+)
 """Keeps the compiled function on disk, with all that it calls. numba looks at this file alone: delete ``*.nb?`` in
 ``__pycache__`` after a change to :mod:`ddco_pyro.model.passes` or :mod:`ddco_pyro.model.elementary`."""
 
@@ -146,7 +147,7 @@ def on_threads(run: Callable[[int, int], object], lengths: Array) -> None:
 
 
 class Sizes(NamedTuple):
-    """Columns of the arrays of a run.
+    """Columns of the planes of a run.
 
     :param kept: lanes that passes keep of a step; ``shared`` of a trajectory.
     :param room: the most numbers of a step that a pass takes or gives; ``controls`` likewise.
@@ -164,12 +165,14 @@ class Sizes(NamedTuple):
     messages: int
     marginals: int
 
-    def numbers(self, steps: int) -> int:
-        """Numbers that a run holds, for trajectories of at most so many steps."""
-        rows = self.selection + self.termination + self.control
-        block = rows + self.marginals + 4 * self.room + self.controls + 1
-        step = rows + self.choice + self.kept + 2 * self.messages + 1
-        return LANES * (BLOCK * block + step * steps + 2 * self.messages + self.shared + 2)
+    def planes(self, steps: int) -> Array:
+        """Rows and columns of the planes of a :class:`Run`, in its order, for trajectories of at most so many steps."""
+        rows = self.selection, self.termination, self.control
+        room = self.room, self.controls + 1, self.room, self.room, self.room
+        block = [(BLOCK, columns) for columns in (*room, *rows, self.marginals)]
+        once = [(1, self.messages), (1, self.shared + 2)]
+        step = [(steps, columns) for columns in (*rows, self.choice, self.kept, self.messages, 1)]
+        return np.array([*block, *once, *step, (1 + steps, self.messages)])
 
 
 class Shape(NamedTuple):
@@ -205,6 +208,44 @@ class Tasks(NamedTuple):
     number: int
     address: int
     constants: int
+
+
+class Run(NamedTuple):
+    """What a run reads, and its room.
+
+    :param found: address of a row for each trajectory, [N, n + 2]: the gradients of what steps share, then the
+        log-likelihood, and whether it is exact.
+    :param evidence: of the joint choices, [N, T, S]; ``marginals`` where those of the choices go, [N, T, Σ C_d].
+    :param room: of passes, for a block.
+    :param sums: the posteriors of a block.
+    :param back: [1, messages].
+    :param total: a row of ``found``.
+    :param rows: of all steps.
+    :param kept: what passes keep of each step.
+    """
+
+    lots: Lots
+    tasks: Tasks
+    evidence: View
+    marginals: View
+    found: int
+    of: Shape
+    room: Room
+    sums: Rows
+    back: Plane
+    total: Plane
+    rows: Rows
+    kept: Plane
+    spread: Plane
+    scale: Plane
+    messages: Plane
+
+
+def run(address: int, index: int) -> Any:
+    """A run of those at an address."""
+
+
+record(run, Run)
 
 
 # --- forward ----------------------------------------------------------------------------------------------------------
@@ -275,8 +316,9 @@ def _act(t: int, rows: Rows, messages: Plane, spread: Plane, of: Shape) -> Any:
 
 
 @jit
-def _forward(lot: Lot, rows: Rows, messages: Plane, spread: Plane, scale: Plane, of: Shape) -> Any:
+def _forward(lot: Lot, own: Run) -> Any:
     """Fill a block of ``messages``, ``spread`` and ``scale``; its log-likelihood, NaN where a step leaves no mass."""
+    rows, messages, spread, scale, of = own.rows, own.messages, own.spread, own.scale, own.of
     apart()
     value = lanes(0.0)
     for t in range(lot.begin, lot.end):
@@ -387,13 +429,13 @@ def _adjoint_up(t: int, i: int, rows: Rows, messages: Plane, back: Plane, sums: 
 
 
 @jit
-def _backward(
-    lot: Lot, rows: Rows, messages: Plane, spread: Plane, scale: Plane, back: Plane, sums: Rows, of: Shape
-) -> Any:
+def _backward(lot: Lot, own: Run) -> Any:
     """Fill the posteriors of a block; the lanes in which Σ_s α_t(s) β_t(s) = 1 at every step.
 
     Only underflow can change this sum.
     """
+    rows, messages, spread, scale = own.rows, own.messages, own.spread, own.scale
+    back, sums, of = own.back, own.sums, own.of
     apart()
     exact = lanes(0.0) == 0.0
     for t in range(lot.end - 1, lot.begin - 1, -1):
@@ -412,9 +454,9 @@ def _backward(
             _adjoint_up(t, i, rows, messages, back, sums, of)
         if t >= whole(lot.lengths, 0):  # gradients add up over steps
             alive = _alive(lot, t)
-            for own in (sums.selection, sums.termination, sums.control):
-                for column in range(own.columns):
-                    put(own, i, column, where(alive, at(own, i, column), 0.0))
+            for plane in (sums.selection, sums.termination, sums.control):
+                for column in range(plane.columns):
+                    put(plane, i, column, where(alive, at(plane, i, column), 0.0))
     for s in range(back.columns):  # an overflow at t = 0 shows nowhere else
         exact = exact & (at(back, 0, s) <= LARGE)
     return exact
@@ -424,21 +466,22 @@ def _backward(
 
 
 @jit
-def _fill(lot: Lot, tasks: Tasks, evidence: View, kept: Plane, rows: Rows, room: Room, of: Shape) -> Any:
+def _fill(lot: Lot, own: Run) -> Any:
     """Fill a block of rows; the sum of the logarithms that densities of controls are scaled by.
 
     A step past a trajectory's length keeps every choice and emits nothing, so it changes no probability. A step without
     a finite largest density is not scaled.
     """
+    tasks, evidence, kept, rows, room, of = own.tasks, own.evidence, own.kept, own.rows, own.room, own.of
     apart()
     choices, columns = rows.choice.columns, rows.control.columns
     for t in range(lot.begin, lot.end):
         for j in range(columns):
             put(rows.control, t, j, 0.0)
     for i in range(tasks.number):
-        fill(task(tasks.address + i * TASK), lot, tasks.constants, kept, rows, room)
+        fill(task(tasks.address, i), lot, tasks.constants, kept, rows, room)
     if evidence.address != 0:
-        take(evidence, lot, whole(of.starts, 1), 1, room.raw)
+        take(evidence, lot, whole(of.starts, 1), np.intp(1), room.raw)
         for t in range(lot.begin, lot.end):
             for s in range(whole(of.starts, 1)):
                 if choices > 0:
@@ -487,76 +530,46 @@ def _clear(plane: Plane, steps: int) -> None:
             put(plane, t, j, 0.0)
 
 
-@jit
-def _carve(buffer: int, steps: int, columns: int) -> tuple[Plane, int]:
-    """Lanes [steps, columns] that begin at an address, and the address after them."""
-    return Plane(buffer, columns), buffer + steps * columns * LANES * 8
-
-
 @releasing
-def eliminate(
-    first: int, last: int, lots: Lots, tasks: Tasks, evidence: View, marginals: View, found: int, buffer: int,
-    n: Sizes, of: Shape,
-) -> None:  # fmt: skip
-    """Of lots ``first`` to ``last``, fill what is ``found``, and write the posteriors and gradients that tasks ask for.
+def eliminate(first: int, last: int, of_run: int) -> None:
+    """Of lots ``first`` to ``last``, fill what is found, and write the posteriors and gradients that tasks ask for.
 
-    :param found: address of a row for each trajectory, [N, n + 2]: the gradients of what steps share, then the
-        log-likelihood, and whether it is exact.
-    :param evidence: of the joint choices, [N, T, S]; ``marginals`` where those of the choices go, [N, T, Σ C_d].
-    :param buffer: address of :meth:`Sizes.numbers` numbers for the longest trajectory.
+    :param of_run: address of a :class:`Run`.
     """
-    raw, place = _carve(buffer, BLOCK, n.room)
-    controls, place = _carve(place, BLOCK, n.controls + 1)
-    std, place = _carve(place, BLOCK, n.room)
-    of_raw, place = _carve(place, BLOCK, n.room)
-    of_std, place = _carve(place, BLOCK, n.room)
-    room = Room(raw, controls, std, of_raw, of_std)
-    selected, place = _carve(place, BLOCK, n.selection)
-    ended, place = _carve(place, BLOCK, n.termination)
-    acted, place = _carve(place, BLOCK, n.control)
-    chosen, place = _carve(place, BLOCK, n.marginals)
-    sums = Rows(selected, ended, acted, chosen)
-    back, place = _carve(place, 1, n.messages)
-    total, place = _carve(place, 1, n.shared + 2)
+    own = run(of_run, 0)
+    lots, tasks, of = own.lots, own.tasks, own.of
+    rows, sums, total, messages = own.rows, own.sums, own.total, own.messages
+    shared = total.columns - 2
     for lot_number in range(first, last):
         who, lengths = lots.trajectories + 8 * LANES * lot_number, lots.lengths + 8 * LANES * lot_number
         steps = whole(lengths, LAST)
-        selection, after = _carve(place, steps, n.selection)
-        termination, after = _carve(after, steps, n.termination)
-        control, after = _carve(after, steps, n.control)
-        choice, after = _carve(after, steps, n.choice)
-        rows = Rows(selection, termination, control, choice)
-        kept, after = _carve(after, steps, n.kept)
-        spread, after = _carve(after, steps, n.messages)
-        scale, after = _carve(after, steps, 1)
-        messages, after = _carve(after, 1 + steps, n.messages)
-        for s in range(n.messages):
+        for s in range(messages.columns):
             put(messages, 0, s, 0.0)
-            put(back, 0, s, 1.0)  # level 1: β
+            put(own.back, 0, s, 1.0)  # level 1: β
         put(messages, 0, whole(of.starts, of.depth), 1.0)  # at t = 0 everything is selected
         for lane in range(LANES):
             write(total.address, lane, float(whole(lengths, lane)))
-        own = at(total, 0, 0)
-        _clear(total, 1)
+        until = at(total, 0, 0)
+        _clear(total, np.intp(1))
         value, exact = lanes(0.0), lanes(0.0) == 0.0
         for begin in range(0, steps, BLOCK):
-            lot = Lot(who, lengths, begin, min(begin + BLOCK, steps), own)
-            value = value + _fill(lot, tasks, evidence, kept, rows, room, of)
-            value = value + _forward(lot, rows, messages, spread, scale, of)
+            lot = Lot(who, lengths, begin, min(begin + BLOCK, steps), until)
+            value = value + _fill(lot, own)
+            value = value + _forward(lot, own)
         for begin in range((steps - 1) // BLOCK * BLOCK, -1, -BLOCK):
-            lot = Lot(who, lengths, begin, min(begin + BLOCK, steps), own)
-            for plane in sums:
-                _clear(plane, BLOCK)
-            exact = exact & _backward(lot, rows, messages, spread, scale, back, sums, of)
+            lot = Lot(who, lengths, begin, min(begin + BLOCK, steps), until)
+            for plane in (sums.selection, sums.termination, sums.control, sums.choice):
+                _clear(plane, np.intp(BLOCK))
+            exact = exact & _backward(lot, own)
             for i in range(tasks.number):
-                slope(task(tasks.address + i * TASK), lot, tasks.constants, kept, rows, sums, total, room)
-            if marginals.address != 0:
-                give(marginals, lot, n.marginals, 1, sums.choice)
-        put(total, 0, n.shared, value)
-        put(total, 0, n.shared + 1, where(exact, 1.0, 0.0))
+                slope(task(tasks.address, i), lot, tasks.constants, own.kept, rows, sums, total, own.room)
+            if own.marginals.address != 0:
+                give(own.marginals, lot, sums.choice.columns, np.intp(1), sums.choice)
+        put(total, 0, shared, value)
+        put(total, 0, shared + 1, where(exact, 1.0, 0.0))
         for lane in range(LANES):
             if whole(lengths, lane) > 0:
                 row = whole(who, lane)
-                for column in range(n.shared + 2):
+                for column in range(shared + 2):
                     one = number(total.address, column * LANES + lane)
-                    write(found, row * (n.shared + 2) + column, one)
+                    write(own.found, row * (shared + 2) + column, one)

@@ -11,18 +11,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
 
 from ddco_pyro.inference.arguments import refuse_impossible
 from ddco_pyro.inference.kernel import Structure, on_threads, releasing
-from ddco_pyro.model.elementary import Array
-from ddco_pyro.model.passes import Rows
+from ddco_pyro.model.elementary import Array, jit
 from ddco_pyro.model.tables import Tables
-
-jit = numba.njit(cache=True, error_model="numpy")
 
 
 class Path(NamedTuple):
@@ -30,6 +26,18 @@ class Path(NamedTuple):
 
     choices: tuple[Tensor, ...]
     terminations: tuple[Tensor, ...]
+
+
+class Rows(NamedTuple):
+    """Logarithms of every step: tables of all levels side by side, [N, T, n].
+
+    :param choice: the evidence of the joint choices; no columns where there is none.
+    """
+
+    selection: Array
+    termination: Array
+    control: Array
+    choice: Array
 
 
 def most_likely_path(tables: Tables, lengths: Tensor) -> Path:
@@ -103,7 +111,12 @@ def _trace(tables: Tables, lengths: Tensor, best: bool, uniforms: np.ndarray) ->
         *(torch.cat([nothing, *(table.detach().flatten(2) for table in group)], -1).numpy() for group in groups)
     )
     others = rows, lengths.numpy(), best, uniforms, joint, terminated, possible, structure
-    on_threads(lambda first, last: _trace_all(first, last, *others), lengths.numpy())
+
+    def some(first: int, last: int) -> None:
+        room = np.empty((2, tables.steps + 1, structure.starts[-1]))
+        _trace_all(first, last, *others, *room)
+
+    on_threads(some, lengths.numpy())
     refuse_impossible(torch.from_numpy(possible))
     digits = structure.digits(np.arange(len(structure.actors)))
     ended = [np.arange(tables.depth + 1) > level for level in range(tables.depth)]
@@ -146,24 +159,27 @@ def _share(first: float, second: float, best: bool) -> float:
 
 
 @jit
-def _forward(rows: Rows, best: bool, keeps: Array, ways: Array, of: Structure) -> float:
-    """Fill ``keeps`` and ``ways``, both [1 + T, messages], of one trajectory; returns log p(ξ), or the best path's.
+def _forward(n: int, steps: int, rows: Rows, best: bool, keeps: Array, ways: Array, of: Structure) -> float:
+    """Fill ``keeps`` and ``ways``, both [1 + T, messages], of trajectory n; returns log p(ξ), or the best path's.
 
     keeps[t] has, for each entry of a level's message, the probability that its last choice was kept at t, not selected.
     ways[t] has, for the choices of each level below one entry, the distribution function of the choice that terminated
     at t. The first entries of ways[T] are the distribution function of the last joint choice.
     """
-    depth, steps = len(of.sizes), len(ways) - 1
-    messages, spread = np.full(of.starts[-1], -np.inf), np.empty(of.starts[-1])
-    keeps[:] = 0.0
+    depth, weighted = len(of.sizes), rows.choice.size > 0
+    messages, spread = ways[steps], keeps[steps]  # rows that nothing else needs before the end
+    for i in range(len(messages)):
+        messages[i] = -np.inf
     messages[of.starts[depth]] = 0.0  # at t = 0 everything is selected
     for t in range(steps):
+        for i in range(len(messages)):
+            keeps[t, i] = 0.0
         for d in range(depth if t > 0 else 0):
             c, below = of.sizes[d], of.starts[d]
             for above in range(of.starts[d + 1], of.starts[d + 2]):
                 ways[t, below] = messages[below]  # choice 0 lasts one step
                 for j in range(1, c):
-                    ways[t, below + j] = messages[below + j] + rows.termination[t, of.ends[d] + 2 * j - 1]
+                    ways[t, below + j] = messages[below + j] + rows.termination[n, t, of.ends[d] + 2 * j - 1]
                 messages[above] = _cumulative(ways[t, below : below + c], best)
                 below += c
         spread[of.starts[depth]] = messages[of.starts[depth]]
@@ -171,22 +187,23 @@ def _forward(rows: Rows, best: bool, keeps: Array, ways: Array, of: Structure) -
             c, below = of.sizes[d], of.starts[d]
             for above in range(of.starts[d + 1], of.starts[d + 2]):
                 mass, first = spread[above], of.callers[above]
-                spread[below] = mass if first < 0 else mass + rows.selection[t, first]
+                spread[below] = mass if first < 0 else mass + rows.selection[n, t, first]
                 for j in range(1, c):
                     if first < 0:
                         spread[below + j] = -np.inf
                     else:
-                        kept = messages[below + j] + rows.termination[t, of.ends[d] + 2 * j - 2] if t > 0 else -np.inf
-                        selected = mass + rows.selection[t, first + j]
+                        kept = -np.inf
+                        if t > 0:
+                            kept = messages[below + j] + rows.termination[n, t, of.ends[d] + 2 * j - 2]
+                        selected = mass + rows.selection[n, t, first + j]
                         spread[below + j] = _plus(kept, selected, best)
                         keeps[t, below + j] = _share(kept, selected, best)
                 below += c
         for s in range(len(of.actors)):
             actor = of.actors[s]
-            messages[s] = spread[s] + rows.control[t, actor] if actor >= 0 else -np.inf
-            if rows.choice.shape[1]:
-                messages[s] += rows.choice[t, s]
-    ways[steps] = messages
+            messages[s] = spread[s] + rows.control[n, t, actor] if actor >= 0 else -np.inf
+            if weighted:
+                messages[s] += rows.choice[n, t, s]
     return _cumulative(ways[steps, : of.starts[1]], best)
 
 
@@ -200,9 +217,11 @@ def _pick(distribution: Array, uniform: float) -> int:
 
 
 @jit
-def _back(keeps: Array, ways: Array, uniforms: Array, joint: Array, terminated: Array, of: Structure) -> None:
+def _back(
+    steps: int, keeps: Array, ways: Array, uniforms: Array, joint: Array, terminated: Array, of: Structure
+) -> None:
     """Fill ``joint`` [T] and the number of levels that ``terminated`` [T], from the last step to the first."""
-    depth, steps = len(of.sizes), len(joint)
+    depth = len(of.sizes)
     index = _pick(ways[steps, : of.starts[1]], uniforms[steps, 0])
     for t in range(steps - 1, -1, -1):
         joint[t] = index
@@ -219,21 +238,19 @@ def _back(keeps: Array, ways: Array, uniforms: Array, joint: Array, terminated: 
 @releasing
 def _trace_all(
     first: int, last: int, rows: Rows, lengths: Array, best: bool, uniforms: Array, joint: Array, terminated: Array,
-    possible: Array, of: Structure,
+    possible: Array, of: Structure, keeps: Array, ways: Array,
 ) -> None:  # fmt: skip
     """Of trajectories ``first`` to ``last``, fill the ``joint`` choices [M, N, T] of M paths, and how many levels
     ``terminated`` before each.
 
     ``possible`` [N] says which trajectories have a probability above 0; the paths of others mean nothing.
 
-    :param rows: logarithms, [N, T, n]; ``choice`` holds the evidence of the joint choices.
     :param best: the most likely path instead of a draw from the posterior.
     :param uniforms: numbers uniform in [0, 1), [M, N, 1 + T, 2·D].
+    :param keeps: room for :func:`_forward`; ``ways`` likewise.
     """
     for n in range(first, last):
-        own = Rows(rows.selection[n], rows.termination[n], rows.control[n], rows.choice[n])
         steps = lengths[n]
-        keeps, ways = np.empty((1 + steps, of.starts[-1])), np.empty((1 + steps, of.starts[-1]))
-        possible[n] = _forward(own, best, keeps, ways, of) > -np.inf
+        possible[n] = _forward(n, steps, rows, best, keeps, ways, of) > -np.inf
         for m in range(len(joint)):
-            _back(keeps, ways, uniforms[m, n], joint[m, n, :steps], terminated[m, n, :steps], of)
+            _back(steps, keeps, ways, uniforms[m, n], joint[m, n], terminated[m, n], of)

@@ -28,6 +28,7 @@ from ddco_pyro.model.elementary import (
     logarithm,
     number,
     put,
+    record,
     scatter,
     scatter_square,
     where,
@@ -121,9 +122,6 @@ class Task(NamedTuple):
     posterior: View
 
 
-PLAIN, VIEW = len(Task._fields) - 6, len(View._fields)
-
-
 class Lot(NamedTuple):
     """Four trajectories side by side, and a block of their steps.
 
@@ -142,7 +140,7 @@ class Lot(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """What the passes give of every step, or posteriors: tables of all levels side by side, planes or arrays [T, n].
+    """What the passes give of every step, or posteriors: tables of all levels side by side.
 
     :param selection: selection probabilities, Σ callers·C_d columns.
     :param termination: termination probabilities, Σ 2·k_d columns.
@@ -151,10 +149,10 @@ class Rows(NamedTuple):
         columns. It has no columns where there are none.
     """
 
-    selection: Any
-    termination: Any
-    control: Any
-    choice: Any
+    selection: Plane
+    termination: Plane
+    control: Plane
+    choice: Plane
 
 
 class Room(NamedTuple):
@@ -167,24 +165,11 @@ class Room(NamedTuple):
     of_std: Plane
 
 
-@jit
-def view(numbers: int, which: int) -> View:
-    """A view of a :class:`Task` in numbers."""
-    i = PLAIN + VIEW * which
-    return View(
-        whole(numbers, i), whole(numbers, i + 1), whole(numbers, i + 2), whole(numbers, i + 3), whole(numbers, i + 4),
-        whole(numbers, i + 5),
-    )  # fmt: skip
+def task(address: int, index: int) -> Any:
+    """A task of those at an address."""
 
 
-@jit
-def task(numbers: int) -> Task:
-    """The task in numbers at an address."""
-    return Task(
-        whole(numbers, 0), whole(numbers, 1), whole(numbers, 2), whole(numbers, 3), whole(numbers, 4),
-        whole(numbers, 5), whole(numbers, 6), whole(numbers, 7), whole(numbers, 8), view(numbers, 0), view(numbers, 1),
-        view(numbers, 2), view(numbers, 3), view(numbers, 4), view(numbers, 5),
-    )  # fmt: skip
+record(task, Task)
 
 
 @jit
@@ -297,7 +282,7 @@ def slope(
         for t in range(lot.end - lot.begin):
             for j in range(columns):
                 put(room.of_raw, t, j, at(found, t, of.first + j))
-        give(of.posterior, lot, columns, 1, room.of_raw)
+        give(of.posterior, lot, columns, np.intp(1), room.of_raw)
     if of.of_raw.address == 0:
         return
     if of.kind <= LOGARITHMS:
@@ -405,7 +390,7 @@ def _take_controls(of: Task, lot: Lot, room: Room) -> None:
     numbers = 1 if of.kind == CATEGORIES else of.size
     if of.kind == SWITCHES and of.option > 0:
         numbers = of.option
-    take(of.controls, lot, numbers, 1, room.controls)
+    take(of.controls, lot, numbers, np.intp(1), room.controls)
     if of.option > 0:
         for t in range(lot.end - lot.begin):
             rest = lanes(0.0) == 0.0
