@@ -30,7 +30,7 @@ demo: opengl $(DEMO)
 test: lint
 	$(BIN)/pytest -n 2 --dist worksteal -q
 
-# About an hour: planted recoveries, many kills, more processes, every notebook, dynamax, and the site besides.
+# Half an hour on two cores: planted recoveries, many kills, more processes, every notebook, dynamax, and the site besides.
 test-all: lint
 	$(BIN)/pytest -n 2 --dist worksteal -q -m ''
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
