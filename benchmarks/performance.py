@@ -421,6 +421,8 @@ def main() -> None:
     if asked.peak:
         print(peak(*asked.peak))
         return
+    if unknown := ", ".join(part for part in asked.parts if part not in PARTS):
+        parser.error(f"there is no part {unknown}; there are: {', '.join(PARTS)}")
     for part in asked.parts or PARTS:
         measure(part, again=bool(asked.parts))
     above, _, rest = PAGE.read_text().partition(BEGIN)

@@ -400,6 +400,15 @@ def test_so_is_one_that_is_killed_before_there_is_work() -> None:
             next(results)
 
 
+def test_a_process_ends_at_sigterm_whatever_this_one_does() -> None:
+    before = signal.signal(signal.SIGTERM, signal.getsignal)
+    try:
+        with early_process("json"), beside(1, [partial(signal.getsignal, signal.SIGTERM)], "dead") as results:
+            assert list(results) == [signal.SIG_DFL]
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
 KILLED = """
 import os, signal
 from ddco_pyro.training.jobs import beside, early_process

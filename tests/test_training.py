@@ -446,7 +446,7 @@ def cut(demos):
 
 
 def odd(demos, name):
-    """The same, but for a demonstration whose control goes the other way, three times as far."""
+    """The same demonstrations. The controls of the named one are multiplied by −3."""
     return Demonstrations(
         tuple(replace(demo, actions=-3 * demo.actions) if demo.name == name else demo for demo in demos)
     )

@@ -70,7 +70,7 @@ jit = numba.njit(  # type: ignore[call-overload]
 )
 """Compiles functions that compiled functions alone call, and that index no tuple.
 
-A literal argument has a function compiled once more; ``np.intp(1)`` has not."""
+A literal argument makes numba compile the function once more; ``np.intp(1)`` does not."""
 
 LANES = 4
 """Numbers in a register of AVX2; compilers of other processors split or join registers."""
