@@ -82,7 +82,7 @@ def expectation(model, ridge, batch, trained=EVERYTHING, discovering=None):
     for _ in range(400):
         made.step(batch)
         values.append(made.value)
-        if len(values) > 5 and values[-1] - values[-2] < 1e-9 * abs(values[-1]):
+        if len(values) > 5 and values[-1] - values[-3] < 1e-9 * abs(values[-1]):
             break
     return made, values
 
@@ -153,6 +153,20 @@ def test_steps_never_lower_the_penalised_likelihood_and_end_where_its_gradient_i
     for (name, _), gradient in zip(free, gradients, strict=True):
         assert gradient.abs().max() < 2e-2, name
     assert float(value.detach()) == pytest.approx(made.value, abs=0.1)  # of the weights before the last step
+
+
+@pytest.mark.parametrize("case", ["sigma of each option", "clipped", "hybrid, two levels"])
+def test_overrelaxed_steps_end_no_lower_after_fewer(case, monkeypatch):
+    counts, parts, others = CASES[case]
+    ends, steps = [], []
+    for growth in (em.GROWTH, 1.0):
+        monkeypatch.setattr(em, "GROWTH", growth)
+        made, values = expectation(linear(counts, parts, **others).double(), RidgeSpec(policy=2.0), batch_for(parts))
+        assert made.gain * batch_for(parts).steps == pytest.approx(max(np.diff(values[-3:])))
+        ends.append(values[-1])
+        steps.append(len(values))
+    assert ends[0] > ends[1] - 0.02  # of several optima
+    assert steps[0] < 0.7 * steps[1]
 
 
 @pytest.mark.parametrize("discovering", [1, 2])

@@ -123,6 +123,27 @@ def test_compiled_passes_are_the_formula_and_its_gradient(group, place, link, le
         assert torch.equal(own, repeated)
 
 
+def of_one_caller(tensor):
+    own = tensor[..., :1, :] if tensor.dim() > 1 and tensor.shape[-2] == CALLERS else tensor
+    return own.detach().requires_grad_(tensor.requires_grad)
+
+
+@pytest.mark.parametrize("lengths", LENGTHS)
+@pytest.mark.parametrize("link", [link for _, _, link in CASES if isinstance(link, Density)])
+def test_a_policy_without_options_has_the_sum_of_its_densities(link, lengths):
+    """And its gradient, where the control is possible."""
+    alone = link.map(of_one_caller)
+    wanted = [tensor for tensor in alone.inputs if tensor.requires_grad]
+    alive = torch.arange(STEPS) < lengths.unsqueeze(-1)
+    truth = torch.where(alive, alone.formula().squeeze(-1), 0.0).sum(1)
+    value = log_likelihood(LinkedTables((), (), (alone,)), lengths)
+    torch.testing.assert_close(value, truth, rtol=1e-12, atol=1e-12)
+    possible = torch.isfinite(truth)
+    pairs = [torch.autograd.grad(each[possible].sum(), wanted) for each in (value, truth)]
+    for found, expected in zip(*pairs, strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-12)
+
+
 @pytest.mark.parametrize("scale", [1.0, 300.0])
 def test_switches_and_categories_are_those_of_torch(scale):
     """Log-likelihoods, and the gradients of logits, however large the logits are."""

@@ -44,7 +44,7 @@ def log_likelihood(tables: Tables, lengths: Tensor, engine: Engine = "fused") ->
     """
     if engine == "enumerate":
         return enumeration.log_likelihood(tables, lengths)
-    if tables.depth and lengths.device.type == "cpu":
+    if lengths.device.type == "cpu":
         return fused.log_likelihood(tables, lengths)
     return logspace.log_likelihood(complete(tables, lengths))
 

@@ -1,7 +1,8 @@
 """The fused engine: one compiled pass from networks' outputs to the log-likelihood and the gradient of every output.
 
 The gradient is the posterior (§4.1), taken through the links of the outputs (:mod:`ddco_pyro.model.links`). Tables that
-are given are links of themselves.
+are given are links of themselves. A policy without options has a level without options, on which only control can be
+chosen.
 
 The pass works in scaled probability space. Underflow there matters only where a trajectory's past makes next to
 impossible what its future demands. The product of past and future, Σ_h α_t(h) β_t(h), is then not 1. The pass
@@ -23,7 +24,7 @@ from torch import Tensor
 from ddco_pyro.inference import kernel, logspace
 from ddco_pyro.inference.kernel import Lots, Shape, Sizes, Structure, Tasks
 from ddco_pyro.model.elementary import LANES, Array
-from ddco_pyro.model.links import Link, links_of
+from ddco_pyro.model.links import Link, LinkedTables, links_of
 from ddco_pyro.model.passes import NORMAL, Pass, view_of
 from ddco_pyro.model.tables import Tables, complete
 
@@ -50,6 +51,16 @@ def _parts(tables: Tables) -> list[Part]:
         firsts = accumulate((link.columns for link in links), initial=0)
         found += [Part(link, group, first) for link, first in zip(links, firsts, strict=False)]
     return found
+
+
+def _with_a_level(tables: Tables) -> Tables:
+    """The tables; with a level where there is none."""
+    if tables.depth:
+        return tables
+    (acts,) = links_of(tables, "control")
+    steps, nothing = acts.shape[:2], torch.zeros((), dtype=torch.float64)
+    choice = nothing.expand(*steps, 1, 1), nothing.expand(*steps, 0, 2), nothing.expand(*steps, 0)
+    return LinkedTables(choice[:1], choice[1:2], (choice[2], acts))
 
 
 class Elimination(NamedTuple):
@@ -137,7 +148,8 @@ class _Refuse(torch.autograd.Function):
 
 
 def log_likelihood(tables: Tables, lengths: Tensor) -> Tensor:
-    """log p(ξ), [N] float64, of tables on the CPU with at least one option level."""
+    """log p(ξ), [N] float64, of tables on the CPU."""
+    tables = _with_a_level(tables)
     parts = _parts(tables)
     inputs = chain.from_iterable(part.link.inputs for part in parts)
     probes = (part.link.probe for part in parts)
@@ -146,10 +158,11 @@ def log_likelihood(tables: Tables, lengths: Tensor) -> Tensor:
 
 
 def posteriors(tables: Tables, lengths: Tensor, marginals: bool = False) -> Elimination:
-    """Log-likelihoods and the posteriors of tables on the CPU with at least one option level, without a gradient.
+    """Log-likelihoods and the posteriors of tables on the CPU, without a gradient.
 
     :param marginals: whether those of the choices are wanted, too.
     """
+    tables = _with_a_level(tables)
     parts = _parts(tables)
     return eliminate(tables, lengths, parts, (), (True,) * len(parts), marginals)
 

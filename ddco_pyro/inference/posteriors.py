@@ -12,11 +12,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ddco_pyro.inference import fused, logspace
+from ddco_pyro.inference import fused
 from ddco_pyro.inference.arguments import refuse_impossible
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.outputs import Outputs
-from ddco_pyro.model.tables import NEVER, Tables, complete
+from ddco_pyro.model.tables import NEVER, Tables
 
 
 class Posterior(NamedTuple):
@@ -95,12 +95,8 @@ def decompose(outputs: Outputs, batch: Batch) -> Decomposition:
     with torch.no_grad():
         exact, actions = outputs.map(Tensor.double), batch.actions.double()
         tables = exact.tables(actions)
-        if tables.depth:
-            elimination = fused.posteriors(tables, batch.lengths)
-            value, actors = elimination.value, elimination.tables.control
-        else:
-            value = logspace.log_likelihood(complete(tables, batch.lengths))
-            actors = (torch.ones_like(tables.control[-1]),)
+        elimination = fused.posteriors(tables, batch.lengths)
+        value, actors = elimination.value, elimination.tables.control[-len(exact.emissions) :]
         alive = (batch.inputs.time < batch.lengths[:, None])[..., None, None]
         dimensions = sum(
             torch.where(alive, weight.unsqueeze(-1) * emission.by_dimension(actions), 0.0).sum((1, 2))

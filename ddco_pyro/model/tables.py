@@ -214,8 +214,7 @@ def _control_selects_control(selection: Tensor) -> Tensor:
 
 def _control_lasts_one_step(termination: Tensor) -> Tensor:
     """[N, T, k, 2] to [N, T, 1 + k, 2]: choice 0 terminates with probability 1."""
-    row = torch.full_like(termination[:, :, :1], NEVER)
-    row[..., 1] = 0.0
+    row = termination.new_tensor([NEVER, 0.0]).expand(*termination.shape[:2], 1, 2)
     return torch.cat([row, termination], dim=2)
 
 

@@ -8,7 +8,9 @@ its gradient g in every output, and the posterior in every table (the E-step). T
 where h is the information that the posterior expects of an output and R a ridge. For the mean of a Gaussian, clipped or
 not, this is the weighted least squares of the M-step (for a clipped one: of the censored moments, by Fisher's
 identity). For switches, categories, terminations and gates it is one Fisher scoring step. σ follows in closed form.
-A step that lowers the penalised log-likelihood is halved.
+
+Steps are overrelaxed (Salakhutdinov and Roweis 2003): as long as each raises the penalised log-likelihood, the next is
+longer. A step that lowers it is halved, and the next one is EM's own.
 """
 
 from __future__ import annotations
@@ -32,6 +34,10 @@ from ddco_pyro.spec import RidgeSpec
 
 LARGEST = 3.0
 """The most that a weight of a logit changes in a step: Fisher scoring overshoots where a logistic curve is flat."""
+GROWTH = 1.3
+"""The ratio of a step's stretch to that of the last one, where that one raised the penalised log-likelihood."""
+FARTHEST = 8.0
+"""The most that a step is stretched."""
 HALVINGS = 10
 """How often a step that lowers the penalised log-likelihood is halved before it is given up."""
 ABOVE_FLOOR = 1e-4
@@ -221,7 +227,9 @@ class Expectation:
     :param score: what is maximised of a piece of the demonstrations.
     :param discovering: d has levels 1 to d alone under a uniform meta-policy.
     :ivar value: the penalised log-likelihood of the weights that the last step began at.
-    :ivar gain: what the step before gained, nats per step.
+    :ivar gain: the larger of what the last two steps gained, nats per step: a stretched step that gains nothing may have
+        gone too far.
+    :ivar stretch: of the last step, 1 for EM's own.
     """
 
     def __init__(
@@ -246,22 +254,24 @@ class Expectation:
         }
         self._before: dict[str, Tensor] | None = None
         self._pieces: list[tuple[Tensor, Batch, dict[tuple[str, ...], Features]]] = []
-        self.value, self.gain = -math.inf, math.inf
+        self.value, self.gain, self.stretch, self._last = -math.inf, math.inf, 1.0, math.inf
 
     def converged(self, roughly: bool = False) -> bool:
-        """Whether the last step gained less than :data:`TOLERANCE`, or roughly: less than :data:`ROUGHLY`."""
+        """Whether each of the last two steps gained less than :data:`TOLERANCE`, or roughly: than :data:`ROUGHLY`."""
         return self.gain < (ROUGHLY if roughly else TOLERANCE)
 
     def states(self) -> dict[str, Tensor]:
         """What a checkpoint keeps: the weights in float64, and those before the last step with their value."""
         before = {f"before.{name}": value for name, value in (self._before or {}).items()}
-        numbers = {"value": self.value, "gain": self.gain}
-        kept = {**self._state(), **before, **{name: torch.tensor(one).double() for name, one in numbers.items()}}
+        numbers = {"value": self.value, "gain": self.gain, "stretch": self.stretch, "last": self._last}
+        exact = {name: torch.tensor(one, dtype=torch.float64) for name, one in numbers.items()}
+        kept = {**self._state(), **before, **exact}
         return {name: one.clone() for name, one in kept.items()}
 
     def load_states(self, states: Mapping[str, Tensor]) -> None:
         """Go on from what :meth:`states` kept."""
-        self.value, self.gain = float(states["value"]), float(states["gain"])
+        numbers = (float(states[name]) for name in ("value", "gain", "stretch", "last"))
+        self.value, self.gain, self.stretch, self._last = numbers
         self._before = {name.removeprefix("before."): one for name, one in states.items() if name.startswith("before.")}
         self._before = self._before or None
         self._restore(states)
@@ -274,10 +284,11 @@ class Expectation:
         """
         value, sums = self._expect(batch)
         penalised = value + self._penalty()
+        stretch = min(GROWTH * self.stretch, FARTHEST)
         for _ in range(HALVINGS):
             if self._before is None or penalised >= self.value - 1e-9 * abs(self.value):
                 break
-            now = self._state()
+            now, stretch = self._state(), 1.0
             self._restore({name: 0.5 * (old + now[name]) for name, old in self._before.items()})
             value, sums = self._expect(batch)
             penalised = value + self._penalty()
@@ -286,8 +297,12 @@ class Expectation:
             self._restore(self._before)
             value, sums = self._expect(batch)
             penalised = value + self._penalty()
-        self.gain, self.value, self._before = (penalised - self.value) / batch.steps, penalised, self._state()
+        gain = (penalised - self.value) / batch.steps
+        self.gain, self._last = max(gain, self._last), gain
+        self.value, self._before = penalised, self._state()
+        self.stretch = stretch if gain >= TOLERANCE else 1.0
         self._maximise(sums)
+        self._extend(self._before)
         for name in sums:
             self._networks[name].store()
             if name in self._stds:
@@ -303,6 +318,14 @@ class Expectation:
             network.weight = state[name]
         for name, std in self._stds.items():
             std.value = state[f"{name}.std"]
+
+    def _extend(self, before: Mapping[str, Tensor]) -> None:
+        """Stretch the step from these weights, in log σ."""
+        for name, network in self._networks.items():
+            network.weight = before[name] + self.stretch * (network.weight - before[name])
+        for name, std in self._stds.items():
+            old = before[f"{name}.std"]
+            std.value = (old * (std.value / old) ** self.stretch).maximum(std.module.floor.double() + ABOVE_FLOOR)
 
     def _penalty(self) -> float:
         """The log-density of the prior that the ridges stand for, up to a constant, of what is trained."""
