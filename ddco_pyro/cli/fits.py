@@ -226,17 +226,21 @@ def select(
     loaded = load_spec(spec, [*overrides, *number], allow_code)
     if (backend is Backend.DASK) != (scheduler is not None):
         raise SpecError("--backend dask and --scheduler tcp://HOST:PORT go together; give both or neither")
-    import ddco_pyro
-    from ddco_pyro import selection
-    from ddco_pyro.cli import console
-    from ddco_pyro.report import write_report
-    from ddco_pyro.selection.choice import table
+    from ddco_pyro.training.jobs import check_jobs, importing
 
-    workers = selection.Workers(jobs, scheduler)
+    check_jobs(jobs)
     folder = out or Path("runs") / f"{spec.stem}-select-{time.strftime('%Y%m%d-%H%M%S')}"
-    _check_folder(folder, spec, loaded)
-    demos = selection.known_demonstrations(loaded)
-    selection.check(loaded, workers, demos)  # before anything is collected, trained or written
+    with importing(1 if scheduler else jobs, "ddco_pyro.selection.folds"):
+        import ddco_pyro
+        from ddco_pyro import selection
+        from ddco_pyro.cli import console
+        from ddco_pyro.report import write_report
+        from ddco_pyro.selection.choice import table
+
+        workers = selection.Workers(jobs, scheduler)
+        _check_folder(folder, spec, loaded)
+        demos = selection.known_demonstrations(loaded)
+        selection.check(loaded, workers, demos)  # before anything is collected, trained or written
     early = ["--stop-early"] if stop_early else []
     again = command("select", folder / "spec.yaml", "--out", folder, "--resume", *early, *_allowed(loaded))
     with _continued(again, folder), console.Progress() as progress:

@@ -227,8 +227,8 @@ class Expectation:
     :param score: what is maximised of a piece of the demonstrations.
     :param discovering: d has levels 1 to d alone under a uniform meta-policy.
     :ivar value: the penalised log-likelihood of the weights that the last step began at.
-    :ivar gain: the larger of what the last two steps gained, nats per step: a stretched step that gains nothing may have
-        gone too far.
+    :ivar gain: the larger gain of the last two steps, nats per step; a stretched one that gains nothing may have gone
+        too far.
     :ivar stretch: of the last step, 1 for EM's own.
     """
 

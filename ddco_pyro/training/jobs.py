@@ -6,6 +6,7 @@ import gc
 import importlib
 import os
 import sys
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -50,6 +51,24 @@ def pool(jobs: int) -> Parallel:
     """Processes for :func:`results`, to be used in a ``with`` statement."""
     # one call at a time: each takes long, and each result is kept at once; no read-only maps of arrays
     return Parallel(n_jobs=jobs, return_as="generator_unordered", batch_size=1, max_nbytes=None)
+
+
+@contextmanager
+def importing(jobs: int, module: str) -> Iterator[None]:
+    """Inside, the processes of :func:`pool` import a module while this one goes on."""
+    number = useful_jobs(jobs, sys.maxsize)
+    imported = pool(number)(delayed(_import)(module) for _ in range(number if number > 1 else 0))
+    try:
+        yield
+    except BaseException:
+        with warnings.catch_warnings(action="ignore"):  # of work that nobody takes
+            imported.close()
+        raise
+    list(imported)
+
+
+def _import(module: str) -> None:
+    importlib.import_module(module)
 
 
 def results(parallel: Parallel, calls: Iterable[Callable[[], Result]], dead: str) -> Iterator[Result]:
