@@ -61,7 +61,7 @@ def importing(jobs: int, module: str) -> Iterator[None]:
     try:
         yield
     except BaseException:
-        with warnings.catch_warnings(action="ignore"):  # of work that nobody takes
+        with warnings.catch_warnings(action="ignore"):  # of results that are not read
             imported.close()
         raise
     list(imported)
