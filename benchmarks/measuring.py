@@ -36,7 +36,7 @@ def side_by_side(
     names: tuple[str, str],
     first: Callable[[], object],
     second: Callable[[], object],
-    rounds: int = 7,
+    rounds: int = 21,
     clock: Callable[[], float] = time.process_time,
     warm: bool = True,
 ) -> Row:

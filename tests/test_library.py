@@ -168,6 +168,24 @@ def test_baselines_in_other_processes_are_the_same_also_after_a_kill(commanded: 
     assert numbers(again.baselines["flat_2"]) == numbers(fits[0].baselines["flat_2"])
 
 
+def test_another_process_fits_a_baseline_whose_restarts_are_short(in_memory: ddco_pyro.Fit, monkeypatch) -> None:
+    """By EM. Long restarts share the processes among themselves instead."""
+    monkeypatch.setattr("ddco_pyro.fitting.fit.LONG", 0)
+    asked: list[str] = []
+    real = ddco_pyro.fitting.fit._in_other_processes
+    monkeypatch.setattr(
+        ddco_pyro.fitting.fit, "_in_other_processes", lambda fits, *rest: (asked.extend(fits), real(fits, *rest))[1]
+    )
+    changes = {"training.restarts": 2, "compare_with": [FLAT, {**FLAT, "policy": {"network": "mlp", "hidden": [4]}}]}
+    for optimizer, beside in (("em", ["flat"]), ("adam", [])):
+        spec = with_overrides(in_memory.spec, {**changes, "training.optimizer": {"name": optimizer}})
+        one, two = (ddco_pyro.fit(spec, two_skills(), jobs=jobs) for jobs in (1, 2))
+        assert numbers(one) == numbers(two)
+        assert numbers(one.baselines["flat"]) == numbers(two.baselines["flat"])
+        assert asked == beside
+        asked.clear()
+
+
 # --- in pieces --------------------------------------------------------------------------------------------------------
 
 

@@ -142,7 +142,8 @@ def _ready(spec: Spec, jobs: int) -> Iterator[None]:
     check_jobs(jobs)
     own = spec.training
     long = own.epochs is None or own.epochs >= LONG
-    alone = own.restarts == 1 and own.device == "cpu" and useful_jobs(jobs, 1 + len(spec.compare_with)) == 2
+    short = own.restarts == 1 or own.optimizer.name == "em"
+    alone = short and own.device == "cpu" and useful_jobs(jobs, 1 + len(spec.compare_with)) == 2
     with early_process("ddco_pyro.fitting.fit", "sklearn.cluster") if long and alone else nullcontext():
         yield
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import math
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -138,8 +139,9 @@ def fit(
         if not known:  # the dimensions of the control decide the baselines too
             models = check_models(spec, Dimensions.of(demos))
         ranks = stack.enter_context(together(processes))
+        short = spec.training.restarts == 1 or all(_over_all(*model) for model in models.values())
         baselines = dict(list(models.items())[1:])
-        return _fit_model(spec, demos, folder, on_event, jobs, ranks, clock, baselines)
+        return _fit_model(spec, demos, folder, on_event, jobs, ranks, clock, baselines, short)
 
 
 def _fit_model(
@@ -151,11 +153,13 @@ def _fit_model(
     ranks: Ranks,
     clock: Clock,
     baselines: Mapping[str, tuple[Spec, Hierarchy]],
+    short: bool = True,
     name: str | None = None,
 ) -> Fit:
     """Train a model and its baselines, evaluate it, and write its folder.
 
     :param baselines: the specs and networks of the baselines by name.
+    :param short: whether baselines may go to other processes; several long restarts share those among themselves.
     :param name: of the model in events.
     """
     if folder:
@@ -166,13 +170,14 @@ def _fit_model(
         baseline: partial(_fit_baseline, its, demos, folder and folder / "baselines" / baseline, folder, baseline)
         for baseline, (its, _) in baselines.items()
     }
-    far = _shared(jobs, [name for name, model in baselines.items() if _worth_a_process(*model, demos)])
+    far = _shared(jobs, [name for name, model in baselines.items() if short and _worth_a_process(*model, demos)])
     began = {name: TrainingBegan(name, its.training.epochs) for name, (its, _) in baselines.items()}
     others = {name: fits[name] for name in far} if ranks.size == 1 else {}
     with _in_other_processes(others, began, jobs, on_event) as begun:
         with clock("training"):
+            free = max(1, useful_jobs(jobs, sys.maxsize) - len(begun))
             trained = train_model(
-                spec, size, split["train"], on_event, checkpoints, split.get("valid"), name, jobs, ranks
+                spec, size, split["train"], on_event, checkpoints, split.get("valid"), name, free, ranks
             )
         hierarchy = trained.hierarchy
         if folder:
@@ -259,7 +264,7 @@ def _fit_baseline(
         record(folder, demos, recorded(above))
         if is_finished(folder):
             return load(folder, allow_code=True)
-    return _fit_model(spec, demos, folder, on_event, jobs, ranks, Clock(), {}, name)
+    return _fit_model(spec, demos, folder, on_event, jobs, ranks, Clock(), {}, name=name)
 
 
 # --- baselines in other processes -------------------------------------------------------------------------------------
@@ -273,16 +278,18 @@ DEAD = (
 )
 
 
-def _worth_a_process(spec: Spec, networks: Hierarchy, demos: Demonstrations) -> bool:
-    """Whether training takes many steps, on a CPU and on demonstrations that are small and in memory.
+def _over_all(spec: Spec, networks: Hierarchy) -> bool:
+    """Whether each step is over all demonstrations: such trainings are short."""
+    return optimizer_of(spec.training.optimizer, networks) in ("em", "lbfgs")
 
-    Several restarts share the processes among themselves instead.
-    """
+
+def _worth_a_process(spec: Spec, networks: Hierarchy, demos: Demonstrations) -> bool:
+    """Whether training takes many steps, on a CPU and on demonstrations that are small and in memory."""
     own, arrays = spec.training, [array for demo in demos for array in demo.observations.values()]
-    whole = optimizer_of(own.optimizer, networks) in ("em", "lbfgs")
-    steps = math.inf if own.epochs is None else own.epochs * (1 if whole else math.ceil(len(demos) / own.batch_size))
+    batches = 1 if _over_all(spec, networks) else math.ceil(len(demos) / own.batch_size)
+    steps = math.inf if own.epochs is None else own.epochs * batches
     sizes = [array.nbytes if isinstance(array, np.ndarray) else math.inf for array in arrays]
-    return own.restarts == 1 and device_of(own).type == "cpu" and sum(sizes) < LITTLE and steps >= LONG
+    return device_of(own).type == "cpu" and sum(sizes) < LITTLE and steps >= LONG
 
 
 def _shared(jobs: int, names: Sequence[str]) -> list[str]:
