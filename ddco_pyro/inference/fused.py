@@ -59,8 +59,8 @@ def _with_a_level(tables: Tables) -> Tables:
         return tables
     (acts,) = links_of(tables, "control")
     steps, nothing = acts.shape[:2], torch.zeros((), dtype=torch.float64)
-    choice = nothing.expand(*steps, 1, 1), nothing.expand(*steps, 0, 2), nothing.expand(*steps, 0)
-    return LinkedTables(choice[:1], choice[1:2], (choice[2], acts))
+    control, ends, options = nothing.expand(*steps, 1, 1), nothing.expand(*steps, 0, 2), nothing.expand(*steps, 0)
+    return LinkedTables((control,), (ends,), (options, acts))
 
 
 class Elimination(NamedTuple):

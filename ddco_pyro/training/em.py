@@ -325,7 +325,8 @@ class Expectation:
             network.weight = before[name] + self.stretch * (network.weight - before[name])
         for name, std in self._stds.items():
             old = before[f"{name}.std"]
-            std.value = (old * (std.value / old) ** self.stretch).maximum(std.module.floor.double() + ABOVE_FLOOR)
+            longer = (old * (std.value / old) ** self.stretch).maximum(std.module.floor.double() + ABOVE_FLOOR)
+            std.value = torch.where(std.value == old, old, longer)
 
     def _penalty(self) -> float:
         """The log-density of the prior that the ridges stand for, up to a constant, of what is trained."""
