@@ -10,6 +10,9 @@ from __future__ import annotations
 import json
 import shutil
 import signal
+import subprocess
+import tempfile
+import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +23,7 @@ import pytest
 import selecting
 import toy_task
 import yaml
-from killing import Kept, Killed, until_done, whole
+from killing import COMMAND, Kept, Killed, answered, until_done, whole
 from random_demonstrations import demonstrations
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
@@ -254,6 +257,23 @@ ALL = ["collect", "import", "fit", "fit to pictures", "select", "segment", "segm
 def test_terminated_and_called_again(cases: dict[str, Case], tmp_path: Path, name: str) -> None:
     """A scheduler's preemption, five times: each ends with a line, without helpers left behind, and goes on."""
     assert check(cases[name], tmp_path, kills=5, seed=11, by=signal.SIGTERM).total > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", range(4))
+def test_a_terminated_fit_in_two_processes_says_that_last(tmp_path: Path, number: int) -> None:
+    """In training, while each process may have one that reads pictures: what the second leaves behind is no news."""
+    changes = ["--processes", "2", "--set", "training.epochs=2000"]
+    with tempfile.TemporaryFile("w+") as err:
+        command = [COMMAND, "fit", str(_pictures(tmp_path)), "--out", "seen", *changes]
+        process = subprocess.Popen(command, cwd=tmp_path, stderr=err, start_new_session=True)
+        while not list(tmp_path.glob("seen/checkpoints/*")):
+            assert process.poll() is None
+            time.sleep(0.05)
+        time.sleep(0.1 * number)
+        process.terminate()
+        process.wait(timeout=60)
+        answered(process, err, signal.SIGTERM)
 
 
 @pytest.mark.slow

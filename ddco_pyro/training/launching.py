@@ -193,7 +193,11 @@ def _started(size: int) -> Iterator[Ranks]:
     store = distributed.TCPStore(HERE, 0, size, is_master=True, wait_for_workers=False)
     context = multiprocessing.get_context("spawn")
     others = [context.Process(target=_follow, args=(Ranks(rank, size), store.port)) for rank in range(1, size)]
-    resource_tracker.ensure_running()  # or the first process starts it, which unblocks the signals
+    sys.warnoptions.append("ignore:resource_tracker:UserWarning")  # it cleans up after processes that are killed here
+    try:
+        resource_tracker.ensure_running()  # or the first process starts it, which unblocks the signals
+    finally:
+        sys.warnoptions.pop()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, ANSWERED_HERE)  # they inherit it
     try:
         for other in others:

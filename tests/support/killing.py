@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 COMMAND = Path(sys.executable).with_name("ddco-pyro")
 
@@ -148,8 +149,7 @@ def until_done(
                     killed[alone] += 1
                     process.send_signal(by) if alone else os.killpg(process.pid, by)
                     process.wait(timeout=HANGS)
-                    err.seek(0)
-                    _answered(process, err.read(), by)
+                    answered(process, err, by)
                     running = by is signal.SIGKILL or process.returncode != 0  # or it had just come to its end
                 now = kept(folder)
                 assert now is None or safe <= now, f"lost or made again: {safe - now}"
@@ -168,18 +168,21 @@ INTERRUPTED = re.compile(r"(ddco-pyro: )?interrupted(; continue with: .*)?|ddco-
 """What a command says last that was terminated; where its helpers are first to go, that."""
 
 
-def _answered(process: subprocess.Popen[bytes], err: str, by: signal.Signals) -> None:
-    """See that a terminated command has said so in a line, and left no process behind."""
+def answered(process: subprocess.Popen[bytes], err: IO[str], by: signal.Signals) -> None:
+    """See that a terminated command has left no process behind, and has said so in a line, the last of all."""
     if by is signal.SIGKILL or process.returncode in (0, -by):  # killed, at its end, or not yet begun
         return
-    assert process.returncode == 1, err
-    assert INTERRUPTED.fullmatch(err.splitlines()[-1]), err
-    assert "Traceback" not in err
     for _ in range(100):
         if not _running(process.pid):
-            return
+            break
         time.sleep(0.1)
-    raise AssertionError("a process is left behind")
+    else:
+        raise AssertionError("a process is left behind")
+    err.seek(0)
+    said = err.read()
+    assert process.returncode == 1, said
+    assert INTERRUPTED.fullmatch(said.splitlines()[-1]), said
+    assert "Traceback" not in said
 
 
 def _running(group: int) -> list[str]:
