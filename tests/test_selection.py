@@ -44,6 +44,18 @@ def test_a_score_is_that_of_a_fit_without_the_fold(finished):
         np.testing.assert_array_equal(scores[row.candidate.number, 2]["log_likelihood"], expected)
 
 
+def test_what_is_refused_while_processes_import_is_one_line(tmp_path):
+    """They begin before the demonstrations are looked at."""
+    spec = data_at(tmp_path) | {"demonstrations": {"path": "nothing.hdf5"}}
+    (tmp_path / "spec.yaml").write_text(yaml.safe_dump(spec))
+    command = [COMMAND, "select", "spec.yaml", "--jobs", "2", "--out", "run"]
+    refused = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert refused.returncode == 2
+    assert refused.stderr.count("\n") == 1
+    assert "nothing.hdf5: there is no such file" in refused.stderr
+    assert not (tmp_path / "run").exists()
+
+
 def test_restarts_are_chosen_inside_the_training_part(tmp_path, monkeypatch):
     spec = spec_at(tmp_path, grid={"training.restarts": [2]}, folds=3)
     seen = []
