@@ -11,7 +11,6 @@ measures this product at every step, and a trajectory whose product is off is do
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Sequence
 from functools import partial
 from itertools import accumulate, chain
@@ -23,15 +22,11 @@ from torch import Tensor
 
 from ddco_pyro.inference import kernel, logspace
 from ddco_pyro.inference.kernel import Lots, Shape, Sizes, Structure, Tasks
-from ddco_pyro.model.elementary import LANES, Array
+from ddco_pyro.model.elementary import Array
 from ddco_pyro.model.links import Link, LinkedTables, links_of
 from ddco_pyro.model.passes import NORMAL, Pass, view_of
 from ddco_pyro.model.tables import Tables, complete
 
-HELD = 4 * 10**6
-"""Most numbers of a buffer that is held from one call to the next, so that its pages need not be mapped again."""
-
-_held = threading.local()
 NOTHING = np.empty(0)
 
 
@@ -189,9 +184,7 @@ def eliminate(
         selection, termination, control, 0 if depth == 1 else states, run.kept, run.shared, max(run.widest, states),
         run.controls, structure.starts[-1].item(), 0 if choices is None else choices.shape[2],
     )  # fmt: skip
-    order = np.argsort(run.lengths, kind="stable")
-    trajectories, each = np.zeros((2, -(-run.number // LANES), LANES), dtype=np.int64)
-    trajectories.reshape(-1)[-run.number :], each.reshape(-1)[-run.number :] = order, run.lengths[order]
+    trajectories, each = kernel.lots_of(run.lengths)
     found = np.empty((run.number, run.shared + 2))
     tasks, constants = np.array(run.tasks, dtype=np.int64), np.concatenate([NOTHING, *run.constants])
     reading = [
@@ -204,11 +197,8 @@ def eliminate(
     ]
 
     def some(first: int, last: int) -> None:
-        rows, columns = sizes.planes(int(each[first:last, -1].max())).T
-        ends = np.cumsum(LANES * rows * columns)
-        buffer = _buffer(int(ends[-1]))
-        addresses = buffer.ctypes.data + 8 * np.append(0, ends[:-1])
-        numbers = np.append(reading, np.stack([addresses, columns], 1))  # a :class:`kernel.Run`
+        _room, planes = kernel.placed(sizes.planes(int(each[first:last, -1].max())))
+        numbers = np.append(reading, planes)  # a :class:`kernel.Run`
         kernel.eliminate(first, last, numbers.ctypes.data)
 
     kernel.on_threads(some, each.sum(1))
@@ -302,15 +292,6 @@ def _readable(tensor: Tensor) -> Tensor:
     """The tensor without a gradient, float32 or float64."""
     plain = tensor.detach()
     return plain if plain.dtype in (torch.float32, torch.float64) else plain.double()
-
-
-def _buffer(size: int) -> Array:
-    if size > HELD:
-        return np.empty(size)
-    held: Array | None = getattr(_held, "buffer", None)
-    if held is None or len(held) < size:
-        held = _held.buffer = np.empty(size)
-    return held
 
 
 def _repeat_in_log_space(tables: Tables, n: int, length: int, parts: list[Part], elimination: Elimination) -> None:

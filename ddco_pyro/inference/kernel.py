@@ -12,6 +12,7 @@ mass, spread by the selections, and the kept mass.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -144,6 +145,37 @@ def on_threads(run: Callable[[int, int], object], lengths: Array) -> None:
     bounds = [number * part // threads for part in range(threads + 1)]
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(run, bounds[:-1], bounds[1:]))
+
+
+HELD = 4 * 10**6
+"""Most numbers of a buffer that is held from one call to the next, so that its pages need not be mapped again."""
+
+_held = threading.local()
+
+
+def placed(planes: Sequence[tuple[int, int]] | Array) -> tuple[Array, Array]:
+    """Room for planes of these rows and columns, one after the other; and the address and columns of each."""
+    rows, columns = np.array(planes).T
+    ends = np.cumsum(LANES * rows * columns)
+    buffer = _buffer(int(ends[-1]))
+    return buffer, np.stack([buffer.ctypes.data + 8 * np.append(0, ends[:-1]), columns], 1)
+
+
+def _buffer(size: int) -> Array:
+    if size > HELD:
+        return np.empty(size)
+    held: Array | None = getattr(_held, "buffer", None)
+    if held is None or len(held) < size:
+        held = _held.buffer = np.empty(size)
+    return held
+
+
+def lots_of(lengths: Array) -> tuple[Array, Array]:
+    """The trajectories of each lot and their lengths, int64 [lots, lanes]. Lengths [N] ascend; 0 is no trajectory."""
+    order = np.argsort(lengths, kind="stable")
+    trajectories, each = np.zeros((2, -(-len(lengths) // LANES), LANES), dtype=np.int64)
+    trajectories.reshape(-1)[-len(lengths) :], each.reshape(-1)[-len(lengths) :] = order, lengths[order]
+    return trajectories, each
 
 
 class Sizes(NamedTuple):
