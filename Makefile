@@ -19,6 +19,9 @@ TORCH_CPU := https://download.pytorch.org/whl/cpu/torch/
 # Measured with that wheel: on disk once it has been used, and to download.
 SIZE := 1.9 GB (0.6 GB to download)
 
+# Where images set it, each command would compile what it imports anew: 4 s more.
+unexport PYTHONDONTWRITEBYTECODE
+
 .NOTPARALLEL:
 .PHONY: demo test test-all bench release-check tools docs lint format clean dev .venv python opengl
 
@@ -30,7 +33,7 @@ demo: opengl $(DEMO)
 test: lint
 	$(BIN)/pytest -n 2 --dist worksteal -q
 
-# Half an hour on two cores: planted recoveries, many kills, more processes, every notebook, dynamax, and the site besides.
+# 45 minutes on two cores: planted recoveries, many kills, more processes, every notebook, dynamax, and the site besides.
 test-all: lint
 	$(BIN)/pytest -n 2 --dist worksteal -q -m ''
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict

@@ -31,7 +31,7 @@ from provenance import is_kept, record, sentence, text
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.events import EpochEnded, Event
-from ddco_pyro.inference import Engine, fused
+from ddco_pyro.inference import Engine, fused, most_likely_path
 from ddco_pyro.inference.engines import log_likelihood
 from ddco_pyro.metrics import write_table
 from ddco_pyro.model.batch import Batch
@@ -63,6 +63,7 @@ AIMS = {
     "Pyro DiscreteHMM 50 × 2000 / pass": ("≥", 20.0),
     "4000 steps / 2000 steps": ("≤", 2.1),
     "20 options / 5 options": ("≤", 4.5),
+    "most likely path, 3 levels / gradient step": ("≤", 1.0),
     "pass, one thread / all threads": ("≥", 1.7),
     "step mlp / networks": ("≤", 1.5),
     **pictures.AIMS,
@@ -211,13 +212,16 @@ def inference() -> Iterator[Row]:
 
 
 def growth() -> Iterator[Row]:
-    """Our pass and a gradient step as the problem grows."""
+    """Our pass and a gradient step as the problem grows; the most likely path beside a gradient step."""
     base, short = kernel(*tables_of(50, 2000)), kernel(*tables_of(50, 200))
     yield side_by_side(("4000 steps", "2000 steps"), kernel(*tables_of(50, 4000)), base)
     yield side_by_side(("20 options", "5 options"), kernel(*tables_of(50, 2000, (20,))), base)
     for levels, choices in ((2, 36), (3, 216)):
         names = f"{levels} levels of 5 options ({choices} joint choices)", "one level (6 choices)"
         yield side_by_side(names, kernel(*tables_of(50, 200, (5,) * levels)), short)
+    deep = problem("linear", 50, 200, (5, 5, 5))
+    path, training = partial(most_likely_path, *tables_of(50, 200, (5, 5, 5))), step(*deep, by_engine(deep[0]))
+    yield side_by_side(("most likely path, 3 levels", "gradient step"), path, training)
     steps = [step(*case, by_engine(case[0])) for n in (9, 3) for case in [problem("linear", 50, 200, controls=n)]]
     yield side_by_side(("step with 9 control dimensions", "3 dimensions"), *steps)
 
