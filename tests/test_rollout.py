@@ -217,10 +217,7 @@ MODELS = {
     "options": two_levels(["options"]),
     "hybrid": two_levels(["options", "control"]),
     "lstm": {"observations": [*OBSERVATIONS, "step"], "baseline": {"kind": "flat", "policy": {"network": "lstm"}}},
-    "windows": {
-        "observations": OBSERVATIONS,
-        "baseline": {"kind": "flat", "policy": {"network": "lstm", "horizon": 2}},
-    },
+    "windows": {"baseline": {"kind": "flat", "policy": {"network": "lstm", "horizon": 2}}},
 }
 
 
@@ -249,9 +246,8 @@ def test_together_as_alone(name, weights, actors, spec):
             alone = run_episode(task, Controller.from_spec(hierarchy, spec), found.seed)
             assert found.outcome == pytest.approx(alone.outcome, abs=1e-5, nan_ok=True)
             np.testing.assert_array_equal(found.choices, alone.choices)
-            np.testing.assert_allclose(
-                found.record.observations["offsets"], alone.record.observations["offsets"], atol=1e-5
-            )
+            offsets = (one.record.observations["offsets"] for one in (found, alone))
+            np.testing.assert_allclose(*offsets, atol=1e-5)
             acted |= {next((d for d, choice in enumerate(row) if choice), len(row)) for row in found.choices.tolist()}
             changes += (np.diff(found.choices, axis=0) != 0).any(1).sum()
     assert acted == actors
@@ -260,12 +256,7 @@ def test_together_as_alone(name, weights, actors, spec):
 
 def test_environments_are_closed_when_one_fails():
     made = []
-
-    def load(seed):
-        made.append(toy_task.Point(seed))
-        return made[-1]
-
-    broken = replace(toy_task.task, load=load, outcome=lambda environment: 1 / 0)
+    broken = replace(kept(made), outcome=lambda environment: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         play(broken, Controller.from_spec(make(MODELS["flat"]), MEAN), SEEDS)
     assert [one.closed for one in made] == [True] * len(SEEDS)
