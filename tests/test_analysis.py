@@ -151,19 +151,13 @@ DEMOS = numbered(
 
 def make(counts: tuple[int, ...], emits: tuple[str, ...]) -> Hierarchy:
     """Random networks that differ between options; σ of each level is its own."""
-    levels = [
-        {"name": f"level-{d}", "count": k, "policy": {"network": "linear"} | ({"emits": list(emits)} if d else {})}
-        for d, k in enumerate(counts)
-    ]
-    model = {"hierarchy": {"levels": levels, "meta_policy": {"network": "linear", "emits": list(emits)}}}
-    spec = parse_spec(
-        {
-            "demonstrations": {"path": "unused.hdf5"},
-            "observations": ["pose"],
-            "control": {"std": {"learn": True}},
-            **(model if counts else {"baseline": {"kind": "flat", "policy": {"network": "linear"}}}),
-        }
-    )
+    lowest = {"network": "linear"}
+    above = lowest | {"emits": list(emits)}
+    levels = [{"name": f"level-{d}", "count": k, "policy": above if d else lowest} for d, k in enumerate(counts)]
+    options = {"hierarchy": {"levels": levels, "meta_policy": above}}
+    model = options if counts else {"baseline": {"kind": "flat", "policy": lowest}}
+    data = {"demonstrations": {"path": "unused.hdf5"}, "observations": ["pose"], "control": {"std": {"learn": True}}}
+    spec = parse_spec(data | model)
     torch.manual_seed(1)
     size = Dimensions.of(DEMOS)
     hierarchy = Hierarchy(spec, size.shapes, size.control_size, size.steps, size.constant)
@@ -295,16 +289,17 @@ def pair(first, second, divergence):
     return Alike(options=(first, second), divergence=divergence)
 
 
-@pytest.mark.parametrize(("divergence", "redundant"), [(0.0999, True), (0.1, False)])
-def test_redundant_below_a_tenth_of_a_nat(divergence, redundant):
+@pytest.mark.parametrize(
+    ("share", "divergence", "found"),
+    [
+        (0.3, 0.0999, [Finding("redundant", 1, 3, 0.0999, other=1)]),
+        (0.3, 0.1, []),
+        (0.001, 0.0, [Finding("unused", 1, 1, 0.001)]),  # and not also redundant
+    ],
+)
+def test_redundant_below_a_tenth_of_a_nat(share, divergence, found):
     alike = [pair(1, 2, 3.0), pair(1, 3, divergence), pair(2, 3, 4.0)]
-    found = diagnose([level(0.0, 0.3, 0.3, 0.4)], [alike])
-    assert found == ([Finding("redundant", 1, 3, divergence, other=1)] if redundant else [])
-
-
-def test_an_unused_option_is_not_also_said_to_be_redundant():
-    found = diagnose([level(0.0, 0.001, 0.5, 0.499)], [[pair(1, 2, 0.0), pair(1, 3, 0.0), pair(2, 3, 1.0)]])
-    assert [one.kind for one in found] == ["unused"]
+    assert diagnose([level(0.0, share, 0.5, 0.5 - share)], [alike]) == found
 
 
 def test_control_by_a_caller_above_does_not_count_for_the_one_below():

@@ -45,15 +45,9 @@ class World:
 @pytest.fixture(scope="module")
 def fitted():
     """Never trained: random networks, and controls of other units."""
-    linear = {"network": "linear"}
-    spec = parse_spec(
-        {
-            "demonstrations": {"path": "unused.hdf5"},
-            "observations": [{"key": "state", "differences": True}],
-            "control": {"std": 0.5},
-            "hierarchy": {"levels": [{"count": 3, "policy": {"network": "mlp"}}], "meta_policy": linear},
-        }
-    )
+    hierarchy = {"levels": [{"count": 3, "policy": {"network": "mlp"}}], "meta_policy": {"network": "linear"}}
+    data = {"demonstrations": {"path": "unused.hdf5"}, "observations": [{"key": "state", "differences": True}]}
+    spec = parse_spec(data | {"control": {"std": 0.5}, "hierarchy": hierarchy})
     torch.manual_seed(0)
     hierarchy = Hierarchy(spec, {"state": (3,)}, 2, 30)
     hierarchy.scaling.scale.copy_(torch.tensor([2.0, 0.5]))

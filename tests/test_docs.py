@@ -103,18 +103,10 @@ TURNS = (
     "of its own accord", "as it was", "as they were",
 )  # fmt: skip
 
-PLACES = {
-    "ddco_pyro": "**/*.py",
-    "ddco_pyro/drawing": "*.j2",
-    "ddco_pyro/data": "*.j2",
-    "docs": "**/*.md",
-    "specs": "*.yaml",
-    ".": "README.md",
-}
 FILES = [
     path
-    for folder, pattern in PLACES.items()
-    for path in sorted((ROOT / folder).glob(pattern))
+    for pattern in ("ddco_pyro/**/*.py", "ddco_pyro/**/*.j2", "docs/**/*.md", "specs/*.yaml", "README.md")
+    for path in sorted(ROOT.glob(pattern))
     if not path.is_relative_to(ROOT / "docs" / "results") and path.name not in ("decisions.md", "glossary.md")
 ]
 

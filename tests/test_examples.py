@@ -24,8 +24,7 @@ hierarchy:
 compare_with: [{kind: flat, policy: {network: linear}}]
 training: {epochs: 12, optimizer: {lr: 0.05}}
 """
-ROOMS = ("encoding", "inference")
-PUBLIC = [name for name in ddco_pyro.__all__ if name not in ROOMS]
+PUBLIC = [name for name in ddco_pyro.__all__ if name not in ("encoding", "inference")]
 INFERENCE = ["log_likelihood", "most_likely_path", "posterior", "sample_paths", "segment"]
 
 

@@ -165,13 +165,9 @@ LINEAR = {
 
 
 def test_planted_skills_are_found(planted, tmp_path, toy_spec):
-    given = {
-        "task": None,
-        "demonstrations": {"path": str(planted), "labels": "skill"},
-        "observations": ["side", "place"],
-    }
-    training = {"training.epochs": 60, "training.optimizer": {"name": "em"}}
-    spec = with_overrides(toy_spec, given | {"compare_with": []} | training | LINEAR)
+    data = {"demonstrations": {"path": str(planted), "labels": "skill"}, "observations": ["side", "place"]}
+    training = {"training.epochs": 60, "training.optimizer": {"name": "em"}, "compare_with": []}
+    spec = with_overrides(toy_spec, {"task": None} | data | training | LINEAR)
     found = fit(spec, out=tmp_path / "run")
     (scores,) = found.metrics.agreement.valid
     assert (scores.nmi, scores.boundary_f1_1) == (pytest.approx(1), 1)
