@@ -227,10 +227,6 @@ def test_folds_are_an_even_partition(data):
     assert found == assign(count, folds, seed)
 
 
-def test_another_seed_divides_otherwise():
-    assert assign(30, 5, 0) != assign(30, 5, 1)
-
-
 @pytest.mark.parametrize(
     ("count", "folds", "message"),
     [
