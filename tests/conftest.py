@@ -8,7 +8,6 @@ from __future__ import annotations
 import io
 import os
 import sys
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -59,25 +58,10 @@ def undrawn():
         yield
 
 
-@contextmanager
-def rendering():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(FigureCanvasAgg, "print_png", PRINT)
-        yield
-
-
-@pytest.fixture(scope="module")
-def drawn(undrawn):
-    """Figures are rendered, in the modules that ask for it."""
-    with rendering():
-        yield
-
-
 @pytest.fixture
-def drawn_here(undrawn):
+def drawn_here(undrawn, monkeypatch):
     """Figures are rendered, in the tests that ask for it."""
-    with rendering():
-        yield
+    monkeypatch.setattr(FigureCanvasAgg, "print_png", PRINT)
 
 
 class Watched:

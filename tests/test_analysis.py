@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 from oracle import brute_force, paths, random_tables
+from random_demonstrations import numbered
 from scipy import stats
 
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.evaluation.options import Finding, diagnose, divergences, option_use
 from ddco_pyro.evaluation.worth import paired
-from ddco_pyro.inference import Posterior, log_likelihood, posterior
+from ddco_pyro.inference import Posterior, posterior
 from ddco_pyro.inference.posteriors import decompose
 from ddco_pyro.metrics import Alike, Use
 from ddco_pyro.model.batch import Batch, encode
@@ -142,39 +142,22 @@ def test_one_demonstration_alone_has_no_error():
 LENGTHS = (3, 2)
 
 
-def make_demonstrations() -> Demonstrations:
-    """Two demonstrations of three control dimensions, the second of them constant."""
-    random = np.random.default_rng(0)
-    return Demonstrations(
-        tuple(
-            Demonstration(
-                f"demo_{number}",
-                {"pose": random.normal(size=(steps, 2))},
-                np.stack([random.normal(5, 3, steps), np.full(steps, 0.5), random.normal(0, 0.1, steps)], axis=1),
-            )
-            for number, steps in enumerate(LENGTHS)
-        )
-    )
-
-
-DEMOS = make_demonstrations()
+RANDOM = np.random.default_rng(0)
+DEMOS = numbered(
+    ({"pose": RANDOM.normal(size=(steps, 2))}, RANDOM.normal([5, 0.5, 0], [3, 0, 0.1], (steps, 3))) for steps in LENGTHS
+)
+"""Of three control dimensions, the second of them constant."""
 
 
 def make(counts: tuple[int, ...], emits: tuple[str, ...]) -> Hierarchy:
     """Random networks that differ between options; σ of each level is its own."""
-    levels = [
-        {"name": f"level-{d}", "count": k, "policy": {"network": "linear"} | ({"emits": list(emits)} if d else {})}
-        for d, k in enumerate(counts)
-    ]
-    model = {"hierarchy": {"levels": levels, "meta_policy": {"network": "linear", "emits": list(emits)}}}
-    spec = parse_spec(
-        {
-            "demonstrations": {"path": "unused.hdf5"},
-            "observations": ["pose"],
-            "control": {"std": {"learn": True}},
-            **(model if counts else {"baseline": {"kind": "flat", "policy": {"network": "linear"}}}),
-        }
-    )
+    lowest = {"network": "linear"}
+    above = lowest | {"emits": list(emits)}
+    levels = [{"name": f"level-{d}", "count": k, "policy": above if d else lowest} for d, k in enumerate(counts)]
+    options = {"hierarchy": {"levels": levels, "meta_policy": above}}
+    model = options if counts else {"baseline": {"kind": "flat", "policy": lowest}}
+    data = {"demonstrations": {"path": "unused.hdf5"}, "observations": ["pose"], "control": {"std": {"learn": True}}}
+    spec = parse_spec(data | model)
     torch.manual_seed(1)
     size = Dimensions.of(DEMOS)
     hierarchy = Hierarchy(spec, size.shapes, size.control_size, size.steps, size.constant)
@@ -186,14 +169,6 @@ def make(counts: tuple[int, ...], emits: tuple[str, ...]) -> Hierarchy:
     return hierarchy.eval()
 
 
-def exact(hierarchy: Hierarchy) -> tuple[Outputs, Batch]:
-    """What the networks say, in float64, and the batch."""
-    batch = encode(DEMOS, hierarchy.encoder, hierarchy.scaling)
-    with torch.no_grad():
-        outputs = hierarchy(batch.inputs)
-    return outputs.map(torch.Tensor.double), batch
-
-
 @pytest.mark.parametrize(
     ("counts", "emits"),
     [((), ("control",)), ((3,), ("options",)), ((2,), ("options", "control")), ((2, 2), ("options", "control"))],
@@ -201,7 +176,9 @@ def exact(hierarchy: Hierarchy) -> tuple[Outputs, Batch]:
 )
 def test_parts_are_those_of_every_path(counts: tuple[int, ...], emits: tuple[str, ...]) -> None:
     hierarchy = make(counts, emits)
-    outputs, batch = exact(hierarchy)
+    batch = encode(DEMOS, hierarchy.encoder, hierarchy.scaling)
+    with torch.no_grad():
+        outputs = hierarchy(batch.inputs).map(torch.Tensor.double)
     found = decompose(outputs, batch)
     assert found.dimensions.shape == (2, 2)
     tables = outputs.tables(batch.actions.double())
@@ -217,6 +194,7 @@ def test_parts_are_those_of_every_path(counts: tuple[int, ...], emits: tuple[str
             options += posterior * (log_prior - math.log(posterior))
         np.testing.assert_allclose(found.dimensions[n], dimensions, rtol=1e-9)
         np.testing.assert_allclose(found.options[n], options, rtol=1e-9, atol=1e-12)
+        assert found.options[n] < 0 if counts else found.options[n] == 0
 
 
 def _actor(choices: tuple[int, ...]) -> tuple[int, int]:
@@ -240,19 +218,6 @@ def _densities(hierarchy: Hierarchy, outputs: Outputs, batch: Batch, n: int) -> 
         if emission is not None
         for option in range(emission.mean.shape[2])
     }
-
-
-@pytest.mark.parametrize("counts", [(), (3,), (2, 2)])
-def test_parts_sum_to_the_log_likelihood(counts: tuple[int, ...]) -> None:
-    hierarchy = make(counts, ("options", "control") if counts else ("control",))
-    outputs, batch = exact(hierarchy)
-    found = decompose(outputs, batch)
-    whole = hierarchy.tabulate(batch)
-    np.testing.assert_allclose(
-        found.dimensions.sum(1) + found.options, log_likelihood(whole, batch.lengths).detach(), rtol=1e-6
-    )
-    assert (found.options <= 0).all()
-    assert bool((found.options == 0).all()) == (not counts)
 
 
 # --- signs of a degenerate solution -----------------------------------------------------------------------------------
@@ -324,16 +289,17 @@ def pair(first, second, divergence):
     return Alike(options=(first, second), divergence=divergence)
 
 
-@pytest.mark.parametrize(("divergence", "redundant"), [(0.0999, True), (0.1, False)])
-def test_redundant_below_a_tenth_of_a_nat(divergence, redundant):
+@pytest.mark.parametrize(
+    ("share", "divergence", "found"),
+    [
+        (0.3, 0.0999, [Finding("redundant", 1, 3, 0.0999, other=1)]),
+        (0.3, 0.1, []),
+        (0.001, 0.0, [Finding("unused", 1, 1, 0.001)]),  # and not also redundant
+    ],
+)
+def test_redundant_below_a_tenth_of_a_nat(share, divergence, found):
     alike = [pair(1, 2, 3.0), pair(1, 3, divergence), pair(2, 3, 4.0)]
-    found = diagnose([level(0.0, 0.3, 0.3, 0.4)], [alike])
-    assert found == ([Finding("redundant", 1, 3, divergence, other=1)] if redundant else [])
-
-
-def test_an_unused_option_is_not_also_said_to_be_redundant():
-    found = diagnose([level(0.0, 0.001, 0.5, 0.499)], [[pair(1, 2, 0.0), pair(1, 3, 0.0), pair(2, 3, 1.0)]])
-    assert [one.kind for one in found] == ["unused"]
+    assert diagnose([level(0.0, share, 0.5, 0.5 - share)], [alike]) == found
 
 
 def test_control_by_a_caller_above_does_not_count_for_the_one_below():

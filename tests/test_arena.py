@@ -1,7 +1,8 @@
-"""The arena without Meta-World: episodes of an exported controller, and what is refused."""
+"""The arena without Meta-World: episodes of an exported controller, what is recorded, and the phases of an expert."""
 
 from __future__ import annotations
 
+import functools
 import json
 
 import apart
@@ -11,6 +12,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from arena_phases import Phases
 from arena_playing import controls, exported, play
 
 from ddco_pyro.errors import BadInput
@@ -43,15 +45,9 @@ class World:
 @pytest.fixture(scope="module")
 def fitted():
     """Never trained: random networks, and controls of other units."""
-    linear = {"network": "linear"}
-    spec = parse_spec(
-        {
-            "demonstrations": {"path": "unused.hdf5"},
-            "observations": [{"key": "state", "differences": True}],
-            "control": {"std": 0.5},
-            "hierarchy": {"levels": [{"count": 3, "policy": {"network": "mlp"}}], "meta_policy": linear},
-        }
-    )
+    hierarchy = {"levels": [{"count": 3, "policy": {"network": "mlp"}}], "meta_policy": {"network": "linear"}}
+    data = {"demonstrations": {"path": "unused.hdf5"}, "observations": [{"key": "state", "differences": True}]}
+    spec = parse_spec(data | {"control": {"std": 0.5}, "hierarchy": hierarchy})
     torch.manual_seed(0)
     hierarchy = Hierarchy(spec, {"state": (3,)}, 2, 30)
     hierarchy.scaling.scale.copy_(torch.tensor([2.0, 0.5]))
@@ -135,3 +131,63 @@ def test_the_same_demonstrations_are_held_out_from_all_cells(tmp_path):
     assert used[5, 0] != used[5, 1]
     with pytest.raises(BadInput, match="has 8 demonstrations to train on, 9 are asked for"):
         arena_cell.chosen(tmp_path / "demos.hdf5", arena_cell.ArenaCell("task", 9, 0))
+
+
+# --- phases -----------------------------------------------------------------------------------------------------------
+
+
+def twice(function):
+    @functools.wraps(function)
+    def wrapped(*arguments):
+        return list(function(*arguments))
+
+    return wrapped
+
+
+class Expert:
+    """Its methods are traced while it acts. Which of four return statements was reached is known from the value."""
+
+    @staticmethod
+    def _desired_pos(x):
+        def shifted(y):
+            return y + 100  # not a return of the outer function
+
+        if x < 0:
+            place = [shifted(0), 0]
+            return place
+        elif x < 1:
+            return [
+                1,
+                x,
+            ]
+        for number in (2, 3):
+            if x < number:
+                return [number, x]
+        return [4, x]
+
+    def get_action(self, x):
+        self._desired_pos(-1)  # the last call counts
+        return self._desired_pos(x)
+
+
+PLACES = {-0.5: 0, 0.5: 1, 1.5: 2, 2.5: 2, 7.0: 3}
+
+
+@pytest.mark.parametrize(("x", "phase"), PLACES.items())
+def test_a_phase_is_the_return_statement_that_was_reached(x, phase):
+    phases, expert = Phases(Expert._desired_pos), Expert()
+    assert len(phases.lines) == 4
+    assert phases.lines == sorted(phases.lines)
+    value, reached = phases.of(expert.get_action, x)
+    assert (value, reached) == (expert.get_action(x), phase)
+
+
+def test_a_decorated_function_is_seen_through():
+    @twice
+    def desired(x):
+        if x:
+            return [1]
+        return [0]
+
+    phases = Phases(desired)
+    assert [phases.of(desired, x) for x in (True, False)] == [([1], 0), ([0], 1)]

@@ -21,7 +21,7 @@ import pytest
 import toy_task
 import typer
 import yaml
-from command_line import COMMAND, HERE, call, start, with_set
+from command_line import COMMAND, HERE, call, with_set
 from killing import HANGS, struck
 
 import ddco_pyro
@@ -266,12 +266,6 @@ def test_debug_shows_the_traceback():
 
 
 # --- in a process of its own ------------------------------------------------------------------------------------------
-
-
-def test_a_command_ends_with_its_status(spec):
-    process = start("check", spec, "--set", "training.epoch=3")
-    out, err = process.communicate(timeout=HANGS)
-    assert (process.returncode, out, err.count("\n")) == (2, "", 1)
 
 
 def test_a_pipe_that_is_closed_ends_it_quietly():

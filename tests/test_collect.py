@@ -60,29 +60,19 @@ def test_the_supervisors_own_rate_is_stored(own_cache):
     successes = int(sum(one["success"] for one in outcomes))
     assert 0 < successes < 12
     interval = stats.binomtest(successes, 12).proportion_ci(method="wilson")
-    assert stored["success"] == {
-        "successes": successes,
-        "trials": 12,
-        "rate": successes / 12,
-        "interval": [interval.low, interval.high],
-    }
+    rate = {"rate": successes / 12, "interval": [interval.low, interval.high]}
+    assert stored["success"] == {"successes": successes, "trials": 12} | rate
     errors = [one["error"] for one in outcomes if not math.isnan(one["error"])]
     assert stored["error"]["trials"] == len(errors)
     assert stored["error"]["mean"] == pytest.approx(np.mean(errors))
 
 
-@pytest.mark.parametrize(
-    "change", [{"count": 6}, {"seed": 21}, {"supervisor": "open_loop"}], ids=["count", "seed", "policy"]
-)
-def test_other_demonstrations_have_another_file(change):
+@pytest.mark.parametrize("key", ["count", "seed", "supervisor", "valid_fraction", "labels"])
+def test_other_demonstrations_have_another_file_but_not_another_split_or_other_labels(key):
+    other = {"count": 6, "seed": 21, "supervisor": "open_loop", "valid_fraction": 0.5, "labels": "phase"}[key]
     one = cache_path(toy_task.task, TASK, SPEC)
-    assert cache_path(toy_task.task, TASK, SPEC.model_copy(update=change)) != one
-    assert cache_path(toy_task.task, TASK, SPEC.model_copy()) == one
-
-
-def test_the_split_and_the_labels_do_not_change_the_file():
-    other = SPEC.model_copy(update={"valid_fraction": 0.5, "labels": "phase"})
-    assert cache_path(toy_task.task, TASK, other) == cache_path(toy_task.task, TASK, SPEC)
+    same = cache_path(toy_task.task, TASK, SPEC.model_copy(update={key: other})) == one
+    assert same == (key in ("valid_fraction", "labels"))
 
 
 def test_changed_sources_have_another_file(tmp_path):
@@ -232,10 +222,7 @@ CONV = {"network": "conv"}
     [
         ({"observations": ["offsets", "pose", "jaw"]}, r"^observations: there is no pose, jaw \(there are: camera, of"),
         ({"control": {"scale": [1.0]}}, r"^control\.scale: has 1 numbers, but the control has 2 dimensions$"),
-        (
-            {"observations": ["visited"], "report": {"trajectory": "visited"}},
-            r"^report\.trajectory: 'visited' has shape \[1\] at each step; name a vector of three numbers or more$",
-        ),
+        ({"observations": ["visited"], "report": {"trajectory": "visited"}}, r"^report\.trajectory: 'visited' has"),
         ({"observations": ["camera"]}, r"^baseline\.policy: reads vectors, but camera are images"),
         (
             {"baseline": None, "hierarchy": {"levels": [LEVEL, LEVEL | {"name": "task", "termination": CONV}]}},

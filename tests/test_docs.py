@@ -1,4 +1,4 @@
-"""What the documentation shows is so: its examples, the commands that it names, the keys that its tables list."""
+"""What the documentation shows is so, its examples, commands and keys; turns of phrase that make readers stumble."""
 
 from __future__ import annotations
 
@@ -93,3 +93,36 @@ def test_the_citation_has_the_version_of_the_package() -> None:
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert citation["version"] == tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
     assert citation["references"][0]["year"] == 2017
+
+
+# --- prose, of library, docs and specs --------------------------------------------------------------------------------
+
+
+TURNS = (
+    "of before", "whoever", "so it is", "told from", "nobody", "but for", "be it that", "tells? apart", "told apart",
+    "of its own accord", "as it was", "as they were",
+)  # fmt: skip
+
+FILES = [
+    path
+    for pattern in ("ddco_pyro/**/*.py", "ddco_pyro/**/*.j2", "docs/**/*.md", "specs/*.yaml", "README.md")
+    for path in sorted(ROOT.glob(pattern))
+    if not path.is_relative_to(ROOT / "docs" / "results") and path.name not in ("decisions.md", "glossary.md")
+]
+
+
+def turns_in(path: Path) -> list[str]:
+    """The turns of phrase in a file, which may run over the end of a line or a string."""
+    text = re.sub(r'"?\n\s*(#\s*|f?")?', " ", path.read_text(encoding="utf-8"))
+    turns = re.compile(rf"\b(?:{'|'.join(TURNS)})\b".replace(" ", r"\s+"), re.IGNORECASE)
+    return [" ".join(match[0].split()) for match in turns.finditer(text)]
+
+
+def test_a_sentence_is_read_once() -> None:
+    assert {str(path.relative_to(ROOT)): turns for path in FILES if (turns := turns_in(path))} == {}
+
+
+def test_turns_are_found_over_the_end_of_a_line(tmp_path: Path) -> None:
+    path = tmp_path / "some.py"
+    path.write_text('"""Runs of\n    before."""\nprint("but "\n      "for", 1)  # nobody\n')
+    assert turns_in(path) == ["of before", "but for", "nobody"]

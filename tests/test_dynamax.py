@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
@@ -19,10 +17,8 @@ inference = pytest.importorskip("dynamax.hidden_markov_model")
 @pytest.mark.parametrize("hybrid", [False, True])
 @pytest.mark.parametrize("options", [1, 5])
 def test_likelihood_and_posterior_are_those_of_dynamax(options: int, hybrid: bool) -> None:
-    tables, lengths = (
-        random_tables((options,), (hybrid,), trajectories=2, steps=200, seed=options),
-        torch.tensor([200] * 2),
-    )
+    tables = random_tables((options,), (hybrid,), trajectories=2, steps=200, seed=options)
+    lengths = torch.tensor([200] * 2)
     chain, found = complete(tables, lengths), posterior(tables, lengths)
     selection, (keep, end) = chain.selection[0].exp(), chain.termination[0].exp().unbind(-1)
     transitions = (end.unsqueeze(-1) * selection + torch.diag_embed(keep))[:, 1:]  # row t leads to step t
@@ -31,9 +27,5 @@ def test_likelihood_and_posterior_are_those_of_dynamax(options: int, hybrid: boo
         np.testing.assert_allclose(value, truth.marginal_loglik, rtol=1e-12)
         np.testing.assert_allclose(found.u[0][n], truth.smoothed_probs, atol=1e-10)
         stayed = torch.diagonal(transitions[n], dim1=-2, dim2=-1)
-        kept = keep[n, 1:] / stayed * torch.einsum("tss->ts", tensor(truth.trans_probs))
+        kept = keep[n, 1:] / stayed * torch.einsum("tss->ts", torch.from_numpy(np.array(truth.trans_probs)))
         np.testing.assert_allclose(found.w[0][n, :-1, 1:], kept[:, 1:], atol=1e-10)  # choice 0 lasts one step
-
-
-def tensor(array: Any) -> torch.Tensor:
-    return torch.from_numpy(np.array(array))

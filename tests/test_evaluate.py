@@ -173,24 +173,19 @@ def test_other_methods_are_rolled_out(copied):
     assert (list(results.methods), results.episodes) == (METHODS[1:], 2)
 
 
-def interrupted(run, after, **options):
-    """Roll out as above, and be interrupted in the middle of a method."""
-    told = []
-
-    def on_event(event):
-        told.append(event)
-        if len(told) == after:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        roll_out(run, EPISODES, 2, on_event, jobs=1, **options)
-
-
 @pytest.fixture(scope="module")
 def cut(toy_run, tmp_path_factory):
     """The folder of rollouts that were interrupted in the third method."""
     folder = shutil.copytree(toy_run.folder, tmp_path_factory.mktemp("cut") / "run")
-    interrupted(ddco_pyro.load(folder), after=2 * EPISODES + 3)
+    told = []
+
+    def on_event(event):
+        told.append(event)
+        if len(told) == 2 * EPISODES + 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        roll_out(ddco_pyro.load(folder), EPISODES, 2, on_event, jobs=1)
     return folder
 
 

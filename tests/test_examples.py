@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from random_demonstrations import numbered
 
 import ddco_pyro
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 
 MINE = """
 demonstrations: {path: mine.hdf5}
@@ -24,8 +24,7 @@ hierarchy:
 compare_with: [{kind: flat, policy: {network: linear}}]
 training: {epochs: 12, optimizer: {lr: 0.05}}
 """
-ROOMS = ("encoding", "inference")
-PUBLIC = [name for name in ddco_pyro.__all__ if name not in ROOMS]
+PUBLIC = [name for name in ddco_pyro.__all__ if name not in ("encoding", "inference")]
 INFERENCE = ["log_likelihood", "most_likely_path", "posterior", "sample_paths", "segment"]
 
 
@@ -35,10 +34,8 @@ def names(tmp_path_factory):
     before = Path.cwd()
     os.chdir(tmp_path_factory.mktemp("examples"))
     Path("mine.yaml").write_text(MINE)
-    random = np.random.default_rng(0)
-    places = [random.normal(size=(10, 2)) for _ in range(6)]
     turn = np.repeat([[-2.0], [2.0]], 5, 0)
-    demos = Demonstrations(tuple(Demonstration(f"demo_{n}", {"place": x}, turn * x) for n, x in enumerate(places)))
+    demos = numbered(({"place": place}, turn * place) for place in np.random.default_rng(0).normal(size=(6, 10, 2)))
     demos.write("mine.hdf5")
     yield {"ddco_pyro": ddco_pyro, "np": np, "demos": demos, "fit": ddco_pyro.fit("mine.yaml", demos, out="runs/mine")}
     os.chdir(before)

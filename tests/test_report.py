@@ -1,15 +1,16 @@
 import html
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
-import h5py
 import numpy as np
 import pytest
 import toy_task
 from made_metrics import compared, made_metrics
-from moving_demonstrations import made, reaches, recorded
+from random_demonstrations import numbered
 from time_lines import tracks
 
+from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.drawing import words
 from ddco_pyro.drawing.shown import movement, position_key
 from ddco_pyro.fitting.fit import fit
@@ -27,20 +28,29 @@ from ddco_pyro.training.data import demonstrations, parts
 LINEAR = {"network": "linear"}
 
 
-def run(folder, demos, **changes):
+def made(number=8, size=3):
+    """Demonstrations of something that moves."""
+    rng, rows = np.random.default_rng(0), []
+    for steps in range(12, 12 + number):
+        place = np.cumsum(rng.normal(size=(steps, size)), axis=0)
+        phase = (np.arange(steps) >= steps // 2).astype(int)
+        actions = np.where(phase[:, None], 1.0, -1.0) * place[:, :2] + 0.1 * rng.normal(size=(steps, 2))
+        rows.append(({"place": place}, actions, {"phase": phase}))
+    return numbered(rows)
+
+
+def run(folder, demos, name="run", labels="phase", **changes):
     demos.write(folder / "demos.hdf5")
-    labels = {"labels": "phase"} if changes.pop("labelled", True) else {}
     level = {"count": 2, "policy": LINEAR, "termination": LINEAR}
     data = {
-        "demonstrations": {"path": str(folder / "demos.hdf5"), "valid_fraction": 0.3, **labels},
+        "demonstrations": {"path": str(folder / "demos.hdf5"), "valid_fraction": 0.3, "labels": labels},
         "observations": ["place"],
         "hierarchy": {"levels": [level], "meta_policy": LINEAR},
         "training": {"epochs": 12, "optimizer": {"lr": 0.05}},
         "compare_with": [{"kind": "flat", "policy": LINEAR}],
     }
-    spec = parse_spec({key: value for key, value in (data | changes).items() if value is not None})
-    found = fit(spec, out=folder / changes.get("name", "run"))
-    return found, demonstrations(spec)
+    spec = parse_spec(data | changes)
+    return fit(spec, out=folder / name), demonstrations(spec)
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +67,7 @@ def deep(tmp_path_factory):
     found, demos = run(
         tmp_path_factory.mktemp("deep"),
         made(size=2),
-        labelled=False,
+        labels=None,
         hierarchy={"levels": [lower, upper], "meta_policy": {**LINEAR, "emits": ["options", "control"]}},
         training={"epochs": 12, "restarts": 2},
         compare_with=[{"kind": "flat", "policy": LINEAR}, {"kind": "per_timestep"}],
@@ -168,26 +178,11 @@ def test_films_past_the_limit_are_links(deep, monkeypatch):
 
 
 def test_names_are_escaped(tmp_path):
-    folder = tmp_path / "<b>&run"
-    folder.mkdir()
-    path = tmp_path / "demos.hdf5"
-    made(5).write(path)
-    with h5py.File(path, "a") as file:
-        for group in list(file["data"]):
-            file["data"].move(group, f"<i>{group}")
-            file[f"data/<i>{group}/obs"].move("place", "$x_{<img>$")
-    spec = parse_spec(
-        {
-            "demonstrations": {"path": str(path), "labels": "phase"},
-            "observations": ["$x_{<img>$"],
-            "hierarchy": {"levels": [{"policy": LINEAR, "count": 2}], "meta_policy": LINEAR},
-            "training": {"epochs": 1, "initialize": "random"},
-        }
-    )
-    page = write_report(fit(spec, out=folder), demonstrations(spec)).read_text()
-    assert "<b>" not in page
-    assert "<i>" not in page
-    assert "<img>" not in page
+    key, training = "$x_{<img>$", {"epochs": 1, "initialize": "random"}
+    odd = [replace(one, name=f"<i>{one.name}", observations={key: one.observations["place"]}) for one in made(5)]
+    changes = {"observations": [key], "training": training, "compare_with": []}
+    page = write_report(*run(tmp_path, Demonstrations(tuple(odd)), "<b>&run", **changes)).read_text()
+    assert not re.search("<(b|i|img)>", page)
     assert "&lt;b&gt;&amp;run" in page
     assert "from clusters" not in page
 
@@ -203,13 +198,10 @@ def test_activity_is_what_the_fit_says_in_one_go(labelled, monkeypatch):
 # --- what figures are drawn from --------------------------------------------------------------------------------------
 
 
-def test_bins_are_steps_where_demonstrations_are_equally_long():
+def test_bins_are_steps_of_equally_long_demonstrations_and_normalised_time_otherwise():
     found = bins(np.array([4, 4]))
     np.testing.assert_array_equal(found.index, [[0, 1, 2, 3]] * 2)
     np.testing.assert_array_equal(found.edges, [-0.5, 0.5, 1.5, 2.5, 3.5])
-
-
-def test_bins_are_normalised_time_otherwise():
     found = bins(np.array([2, 4]))
     np.testing.assert_array_equal(found.index, [[0, 1, -1, -1], [0, 0, 1, 1]])
     assert len(bins(np.array([2000, 1999])).edges) == 61
@@ -240,21 +232,29 @@ def test_rows_are_sorted_by_length_then_by_the_first_change():
     assert [paths[row] for row in found] == ["1----", "1222-", "1121-", "1111-", "12111", "11222", "11111"]
 
 
+def observing(observations):
+    """Demonstrations of which nothing but these observations matters."""
+    return numbered((observed, np.sin(np.arange(len(observed["goal"])))[:, None]) for observed in observations)
+
+
 def test_what_moves_is_drawn_whatever_comes_first():
-    """Before it in the alphabet: what is constant within each demonstration, in all of them, or only measured badly."""
-    rng, hands = np.random.default_rng(1), reaches()
-    steps = [np.ones((len(hand), 1)) for hand in hands]
-    demos = recorded(
-        base=[step * np.array([0.1, 0.2, 0.3]) for step in steps],
-        goal=[step * rng.normal(size=3) for step in steps],
-        guess=[step * rng.normal(size=3) + 1e-3 * rng.normal(size=(len(step), 3)) for step in steps],
-        hand=hands,
+    """Before a smooth reach in the alphabet: what is constant within each demonstration, in all, or measured badly."""
+    rng, time = np.random.default_rng(1), np.linspace(0, 1, 40)[:, None]
+    eased, step = 10 * time**3 - 15 * time**4 + 6 * time**5, np.ones((40, 1))
+    demos = observing(
+        {
+            "base": step * np.array([0.1, 0.2, 0.3]),
+            "goal": step * rng.normal(size=3),
+            "guess": step * rng.normal(size=3) + 1e-3 * rng.normal(size=(40, 3)),
+            "hand": rng.normal(size=3) + eased * 2 * rng.normal(size=3),
+        }
+        for _ in range(6)
     )
     assert position_key(demos) == "hand"
 
 
 def test_nothing_is_drawn_where_nothing_moves():
-    assert position_key(recorded(goal=[np.full((5, 3), 0.1), np.full((1, 3), 0.7)])) is None
+    assert position_key(observing([{"goal": np.full((5, 3), 0.1)}, {"goal": np.full((1, 3), 0.7)}])) is None
 
 
 def test_movement_by_hand():

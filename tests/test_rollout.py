@@ -114,12 +114,6 @@ def test_the_environment_is_closed_even_when_the_policy_fails():
     assert made[0].closed
 
 
-def test_a_controllers_choices_are_recorded(toy_run):
-    episode = run_episode(task, toy_run.controller(), 0)
-    assert episode.choices.shape == (len(episode.record), 1)
-    assert set(episode.choices.ravel()) <= {1, 2}
-
-
 def test_parallel_episodes_are_the_serial_ones_in_order():
     seeds = [5, 1, 9, 2]
     parallel = list(run_episodes("toy_task:task", "supervisor", seeds, film=2, jobs=2))
@@ -217,16 +211,8 @@ MODELS = {
     "options": two_levels(["options"]),
     "hybrid": two_levels(["options", "control"]),
     "lstm": {"observations": [*OBSERVATIONS, "step"], "baseline": {"kind": "flat", "policy": {"network": "lstm"}}},
-    "windows": {
-        "observations": OBSERVATIONS,
-        "baseline": {"kind": "flat", "policy": {"network": "lstm", "horizon": 2}},
-    },
+    "windows": {"baseline": {"kind": "flat", "policy": {"network": "lstm", "horizon": 2}}},
 }
-
-
-def ragged(task):
-    """The task with episodes of different lengths."""
-    return replace(task, load=lambda seed: toy_task.Point(seed, steps=seed))
 
 
 @pytest.mark.parametrize("spec", [MEAN, MARGINAL, SAMPLED], ids=["most likely", "marginal", "sampled"])
@@ -239,19 +225,19 @@ def ragged(task):
     ],
 )
 def test_together_as_alone(name, weights, actors, spec):
-    """With models in which options change within an episode and, in the hybrid, an option of each level and the
-    meta-policy act.
+    """With episodes of different lengths, and models in which options change within an episode and, in the hybrid, an
+    option of each level and the meta-policy act.
     """
-    task, acted, changes = ragged(toy_task.task), set(), 0
+    ragged, acted, changes = replace(task, load=lambda seed: toy_task.Point(seed, steps=seed)), set(), 0
     for seed in weights:
         hierarchy = make(MODELS[name], seed, gain=3.0)
-        for found in play(task, Controller.from_spec(hierarchy, spec), SEEDS, keep=("offsets",)):
-            alone = run_episode(task, Controller.from_spec(hierarchy, spec), found.seed)
+        for found in play(ragged, Controller.from_spec(hierarchy, spec), SEEDS, keep=("offsets",)):
+            alone = run_episode(ragged, Controller.from_spec(hierarchy, spec), found.seed)
             assert found.outcome == pytest.approx(alone.outcome, abs=1e-5, nan_ok=True)
+            assert len(alone.choices) == len(alone.record)
             np.testing.assert_array_equal(found.choices, alone.choices)
-            np.testing.assert_allclose(
-                found.record.observations["offsets"], alone.record.observations["offsets"], atol=1e-5
-            )
+            offsets = (one.record.observations["offsets"] for one in (found, alone))
+            np.testing.assert_allclose(*offsets, atol=1e-5)
             acted |= {next((d for d, choice in enumerate(row) if choice), len(row)) for row in found.choices.tolist()}
             changes += (np.diff(found.choices, axis=0) != 0).any(1).sum()
     assert acted == actors
@@ -260,12 +246,7 @@ def test_together_as_alone(name, weights, actors, spec):
 
 def test_environments_are_closed_when_one_fails():
     made = []
-
-    def load(seed):
-        made.append(toy_task.Point(seed))
-        return made[-1]
-
-    broken = replace(toy_task.task, load=load, outcome=lambda environment: 1 / 0)
+    broken = replace(kept(made), outcome=lambda environment: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         play(broken, Controller.from_spec(make(MODELS["flat"]), MEAN), SEEDS)
     assert [one.closed for one in made] == [True] * len(SEEDS)

@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -19,11 +20,12 @@ import pyarrow.parquet as parquet
 import pytest
 import yaml
 from command_line import call
+from random_demonstrations import numbered
 from sklearn.metrics import normalized_mutual_info_score
 from time_lines import embedded, tracks, unpacked
 
 import ddco_pyro
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.importing import import_demonstrations
 from ddco_pyro.data.sources import open_source
 from ddco_pyro.drawing.colours import option_colour
@@ -67,6 +69,13 @@ def look(run: Path, demos: Path) -> Segmented:
         return segments(ddco_pyro.load(run), source)
 
 
+def refused(message, *arguments):
+    """``segment`` refuses these arguments in one line that says this."""
+    ended = call("segment", *arguments)
+    assert (ended.status, ended.out, ended.err.count("\n")) == (2, "", 1)
+    assert message in ended.err
+
+
 @pytest.mark.parametrize("at_once", [8192, 1])
 def test_they_are_the_fits_own(toy_run, toy_spec, file, at_once, monkeypatch):
     monkeypatch.setattr("ddco_pyro.model.hierarchy.STEPS_AT_ONCE", at_once)
@@ -96,9 +105,7 @@ def test_they_are_the_fits_own(toy_run, toy_spec, file, at_once, monkeypatch):
 def test_what_to_write_has_to_be_said(toy_run, file, monkeypatch, options, message):
     monkeypatch.chdir(file.parent)
     before = file.read_bytes()
-    ended = call("segment", toy_run.folder, file, *options)
-    assert (ended.status, ended.out, ended.err.count("\n")) == (2, "", 1)
-    assert message in ended.err
+    refused(message, toy_run.folder, file, *options)
     assert [path.name for path in file.parent.iterdir()] == ["demos.hdf5"]
     assert file.read_bytes() == before
 
@@ -130,9 +137,8 @@ def test_labels_from_elsewhere_are_never_replaced(toy_run, file):
     with h5py.File(file, "r+") as opened:
         opened["data/demo_3/labels/option"] = np.zeros(len(opened["data/demo_3/actions"]), int)
     before = file.read_bytes()
-    ended = call("segment", toy_run.folder, file, "--in-place")
-    assert ended.status == 2
-    assert "demo_3: labels/option exists and was not written by ddco-pyro segment" in ended.err
+    message = "demo_3: labels/option exists and was not written by ddco-pyro segment"
+    refused(message, toy_run.folder, file, "--in-place")
     assert file.read_bytes() == before
 
 
@@ -164,16 +170,11 @@ def test_the_page_shows_every_segment(toy_run, written):
     text, found = places["--html"].read_text(), look(toy_run.folder, file)
     drawn, data = tracks(text), embedded(text)
     assert list(drawn) == [one.name for one in found.segments]
-    (posterior,) = toy_run.posterior(demonstrations(toy_run.spec)).u
-    (path,) = toy_run.segment(demonstrations(toy_run.spec))
-    for row, (one, track) in enumerate(zip(found.segments, data["tracks"], strict=True)):
-        runs = drawn[one.name][2]["option"]
-        assert runs == one.levels["option"].runs()
-        steps = np.repeat([value for value, _, _ in runs], [end - start for _, start, end in runs])
-        np.testing.assert_array_equal(steps, path[row, : len(one)])
+    for one, track in zip(found.segments, data["tracks"], strict=True):
+        level = one.levels["option"]
+        assert drawn[one.name][2]["option"] == level.runs()
         lane = track["lanes"][[lane["name"] for lane in data["lanes"]].index("option")]
-        heights = np.array(unpacked(lane["p"])) / 255
-        np.testing.assert_allclose(heights, posterior[row, np.arange(len(one)), steps], atol=0.5001 / 255)
+        np.testing.assert_allclose(np.array(unpacked(lane["p"])) / 255, level.probability, atol=0.5001 / 255)
     assert data["lanes"][0]["names"] == list(toy_run.names["option"])
     assert "http" not in text
     assert not re.search(r"<(link|iframe|img)|src=|@import|url\(\"?http", text)
@@ -216,9 +217,8 @@ def test_numbers_follow_the_cursor(toy_run, written):
         known = {**demo.observations, "control": demo.actions}
         for name, row, span in zip(numbers["names"], decoded, numbers["span"], strict=True):
             key, _, place = name.removesuffix("]").partition("[")
-            np.testing.assert_allclose(
-                row, known[key].reshape(len(demo), -1)[:, int(place or 0)], atol=span / 255 + 1e-5
-            )
+            expected = known[key].reshape(len(demo), -1)[:, int(place or 0)]
+            np.testing.assert_allclose(row, expected, atol=span / 255 + 1e-5)
 
 
 def test_intervals_are_those_of_the_posterior_draws(toy_run, file):
@@ -340,43 +340,26 @@ def test_the_page_escapes_what_it_shows(toy_run, tmp_path, toy_spec):
 # --- what cannot be segmented -----------------------------------------------------------------------------------------
 
 
-def reshape(group):
-    steps = len(group["actions"])
-    del group["obs/offsets"]
-    group["obs/offsets"] = np.zeros((steps, 3))
-
-
-def rename(group):
-    group.move("obs/offsets", "obs/offset")
-
-
-def narrow(group):
-    steps = len(group["actions"])
-    del group["actions"]
-    group["actions"] = np.zeros((steps, 1))
-
-
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("key", "other", "width", "message"),
     [
-        (reshape, "demo_0: obs/offsets has shape (3,) at each step, the run was fitted to (4,)"),
-        (rename, "demo_0: there is no observation 'offsets' (did you mean 'offset'?), which the run was fitted to"),
-        (narrow, "demo_0: actions has shape (1,) at each step, the run was fitted to (2,)"),
+        ("obs/offsets", "obs/offsets", 3, "obs/offsets has shape (3,) at each step, the run was fitted to (4,)"),
+        ("obs/offsets", "obs/offset", 4, "there is no observation 'offsets' (did you mean 'offset'?), which the run"),
+        ("actions", "actions", 1, "actions has shape (1,) at each step, the run was fitted to (2,)"),
     ],
 )
-def test_other_demonstrations_are_refused(toy_run, file, change, message):
+def test_other_demonstrations_are_refused(toy_run, file, key, other, width, message):
     with h5py.File(file, "r+") as opened:
         for group in opened["data"].values():
-            change(group)
-    ended = call("segment", toy_run.folder, file, "--in-place")
-    assert (ended.status, ended.err.count("\n")) == (2, 1)
-    assert message in ended.err
+            steps = len(group["actions"])
+            del group[key]
+            group[other] = np.zeros((steps, width))
+    refused(f"demo_0: {message}", toy_run.folder, file, "--in-place")
 
 
 def test_a_policy_without_options_is_refused(toy_run, file):
-    ended = call("segment", toy_run.folder / "baselines" / "flat", file, "--in-place")
-    assert ended.status == 2
-    assert "is a flat policy without options; name a run with a hierarchy" in ended.err
+    message = "is a flat policy without options; name a run with a hierarchy"
+    refused(message, toy_run.folder / "baselines" / "flat", file, "--in-place")
 
 
 # --- subtasks of LeRobot datasets -------------------------------------------------------------------------------------
@@ -431,10 +414,9 @@ def test_subtasks_are_written_as_lerobot_writes_them(tmp_path):
     ours, theirs = rows_of(tmp_path / "out"), parquet.read_table(LANGUAGE / "data.parquet")
     assert ours.column_names == theirs.column_names
     assert ours.to_pylist() == theirs.to_pylist()
-    features = [
-        json.loads(path.read_text())["features"] for path in (tmp_path / "out/meta/info.json", LANGUAGE / "info.json")
-    ]
-    assert features[0] == features[1]
+    infos = tmp_path / "out" / "meta" / "info.json", LANGUAGE / "info.json"
+    ours, theirs = (json.loads(path.read_text())["features"] for path in infos)
+    assert ours == theirs
     frames = parquet.ParquetFile(next((tmp_path / "out" / "data").rglob("*.parquet")))
     assert [frames.metadata.row_group(group).num_rows for group in range(frames.num_row_groups)] == [5, 6, 7, 8]
 
@@ -452,9 +434,7 @@ def test_subtasks_begin_at_the_very_times_of_frames(lerobot_run, tmp_path):
         assert all(row == entries[0] for row in entries)
         options = one.levels["skill"].options.tolist()
         active = [[said for said in entries[0] if said["timestamp"] <= time][-1] for time in times]
-        assert [said["content"] for said in active] == [
-            f"skill {option}" if option else "control" for option in options
-        ]
+        assert [said["content"] for said in active] == [("control", "skill 1", "skill 2")[one] for one in options]
         assert {said["timestamp"] for said in entries[0]} <= set(times)
 
 
@@ -471,20 +451,15 @@ def test_the_older_form_of_subtasks(lerobot_run, tmp_path):
     names = parquet.read_table(out / "meta" / "subtasks.parquet").to_pylist()
     assert [row["subtask"] for row in names] == ["control", "phase 1", "phase 2"]
     with open_source(out) as source:  # and it can be read here again
-        np.testing.assert_array_equal(
-            source.recording("demo_2").labels["subtask"].array(), found.segments[2].levels["phase"].options
-        )
+        again = source.recording("demo_2").labels["subtask"].array()
+        np.testing.assert_array_equal(again, found.segments[2].levels["phase"].options)
 
 
 @pytest.mark.parametrize(
     ("form", "features", "more"),
     [
-        (
-            "0.6",
-            {"language_persistent": "language", "language_events": "language"},
-            {Path("meta/lerobot_annotations.json")},
-        ),
-        ("0.4", {"subtask_index": "int64"}, {Path("meta/subtasks.parquet")}),
+        ("0.6", {"language_persistent": "language", "language_events": "language"}, "lerobot_annotations.json"),
+        ("0.4", {"subtask_index": "int64"}, "subtasks.parquet"),
     ],
 )
 def test_a_copy_with_subtasks(lerobot_run, tmp_path, form, features, more):
@@ -496,7 +471,7 @@ def test_a_copy_with_subtasks(lerobot_run, tmp_path, form, features, more):
     for name, dtype in features.items():
         assert info["features"].pop(name) == {"dtype": dtype, "shape": [1], "names": None}
     assert info == before
-    assert files(out) == files(LEROBOT) | more
+    assert files(out) == files(LEROBOT) | {Path("meta") / more}
     assert rows_of(out).drop_columns(list(features)).to_pylist() == rows_of(LEROBOT).to_pylist()
     with open_source(out) as source:
         assert source.names == ("demo_0", "demo_1", "demo_2", "demo_3")
@@ -525,9 +500,7 @@ def test_a_copy_with_subtasks(lerobot_run, tmp_path, form, features, more):
 )
 def test_what_cannot_be_written_of_a_lerobot_dataset(lerobot_run, tmp_path, arguments, message):
     named = [one.replace("OUT", str(tmp_path / "out")) for one in arguments]
-    ended = call("segment", lerobot_run.folder, LEROBOT, *named)
-    assert (ended.status, ended.err.count("\n")) == (2, 1)
-    assert message in ended.err
+    refused(message, lerobot_run.folder, LEROBOT, *named)
     assert not list(tmp_path.iterdir())
 
 
@@ -541,14 +514,13 @@ def planted(number=10, seed=0, noise=0.3):
     """Three kinds of steps in an order of their own, at three places in units that differ; the gripper (control 1)
     is closed in the second kind alone. ``place`` says where in one unit, control 0 in another.
     """
-    random = np.random.default_rng(seed)
-    demos = []
-    for index in range(number):
+    random, rows = np.random.default_rng(seed), []
+    for _ in range(number):
         kind = np.repeat(random.permutation(3), random.integers(6, 12, 3))
         seen = CENTRES[kind] + noise * random.normal(size=(len(kind), 2))
         controls = np.stack([seen[:, 0] / 50, np.where(kind == 1, 1.0, 0.0)], axis=1)
-        demos.append(Demonstration(f"demo_{index}", {"place": 1000 * seen}, controls, {"kind": kind}))
-    return Demonstrations(tuple(demos))
+        rows.append(({"place": 1000 * seen}, controls, {"kind": kind}))
+    return numbered(rows)
 
 
 def scores(name, valid, **settings):
@@ -565,9 +537,9 @@ def test_kinds_that_lie_apart_are_found_in_demonstrations_not_seen(name):
 
 def test_time_tells_apart_what_a_step_alone_does_not():
     """With much noise a hidden Markov model and change points use the steps around; the gripper is left out."""
+    whole = planted(30, noise=1.0), planted(10, seed=1, noise=1.0)
     train, noisy = (
-        Demonstrations(tuple(Demonstration(d.name, d.observations, d.actions[:, :1], d.labels) for d in demos))
-        for demos in (planted(30, noise=1.0), planted(10, seed=1, noise=1.0))
+        Demonstrations(tuple(replace(demo, actions=demo.actions[:, :1]) for demo in demos)) for demos in whole
     )
     truth = [demo.labels["kind"] for demo in noisy]
     nmi = {name: agreement(segment(name, train, noisy, 3, 0), truth).nmi for name in BASELINES}
@@ -580,17 +552,13 @@ def test_equal_lengths():
     assert len(sizes) == 4
     assert sizes.max() - sizes.min() <= 1
     assert (np.diff(found) >= 0).all()
-    short = Demonstrations((Demonstration("demo_0", {"place": np.zeros((2, 2))}, np.zeros((2, 2))),))
+    short = numbered([({"place": np.zeros((2, 2))}, np.zeros((2, 2)))])
     assert segment("equal", planted(), short, 4, 0)[0].tolist() == [0, 2]
 
 
 def test_gripper_changes():
     closed = [[0, 0, 1, 1, 1, 0, 1], [1, 1, 0, 0, 0, 0, 0]]
-    demos = [
-        Demonstration(f"demo_{n}", {"place": np.zeros((7, 1))}, np.stack([np.linspace(-1, 1, 7), one], 1))
-        for n, one in enumerate(closed)
-    ]
-    valid = Demonstrations(tuple(demos))
+    valid = numbered(({"place": np.zeros((7, 1))}, np.stack([np.linspace(-1, 1, 7), one], 1)) for one in closed)
     found = segment("gripper", planted(), valid, 2, 0)
     assert [one.tolist() for one in found] == [[0, 0, 1, 1, 1, 2, 3], [0, 0, 1, 1, 1, 1, 1]]
     assert segment("gripper", valid, valid, 2, 0, gripper=0)[0].tolist() == [0, 0, 0, 0, 1, 1, 1]
@@ -602,15 +570,11 @@ def test_gripper_changes():
 def test_it_is_what_the_seed_says_and_looks_at_observations_alone_that_are_named(name):
     train, valid = planted(), planted(3, seed=1)
     random = np.random.default_rng(3)
-    more = [
-        Demonstrations(
-            tuple(
-                Demonstration(d.name, {**d.observations, "noise": random.normal(size=(len(d), 4))}, d.actions)
-                for d in one
-            )
-        )
-        for one in (train, valid)
-    ]
+
+    def noisy(demo):
+        return replace(demo, observations={**demo.observations, "noise": random.normal(size=(len(demo), 4))})
+
+    more = [Demonstrations(tuple(noisy(demo) for demo in demos)) for demos in (train, valid)]
     named = segment(name, *more, 3, 5, observations=[ObservationSpec(key="place")])
     for one, other in zip(segment(name, train, valid, 3, 5), named, strict=True):
         np.testing.assert_array_equal(one, other)
@@ -619,8 +583,8 @@ def test_it_is_what_the_seed_says_and_looks_at_observations_alone_that_are_named
 @pytest.mark.parametrize("name", BASELINES)
 def test_fewer_different_steps_than_kinds(name):
     """Constant controls, two different steps, demonstrations of one step."""
-    demos = [Demonstration(f"demo_{n}", {"x": np.full((1 + n, 1), n % 2)}, np.ones((1 + n, 2))) for n in range(3)]
-    found = segment(name, Demonstrations(tuple(demos)), Demonstrations(tuple(demos)), 5, 0)
+    demos = numbered(({"x": np.full((1 + n, 1), n % 2)}, np.ones((1 + n, 2))) for n in range(3))
+    found = segment(name, demos, demos, 5, 0)
     assert [len(one) for one in found] == [1, 2, 3]
 
 

@@ -17,6 +17,7 @@ import ddco_pyro
 from ddco_pyro.errors import Failed
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.selection import SelectionFailed, Workers, final_spec, folds, select
+from ddco_pyro.spec import with_overrides
 from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.restarts import train_model
 
@@ -27,7 +28,7 @@ ONE = Workers(1)
 def finished(tmp_path_factory):
     """A selection over two candidates and four folds: its spec, folder, result, and what was told."""
     folder = tmp_path_factory.mktemp("selection")
-    spec, told = spec_at(folder), Told()
+    spec, told = with_overrides(spec_at(folder), {"training.restarts": 2}), Told()
     return spec, folder / "run", select(spec, folder / "run", told, ONE), told
 
 
@@ -54,20 +55,6 @@ def test_what_is_refused_while_processes_import_is_one_line(tmp_path):
     assert refused.stderr.count("\n") == 1
     assert "nothing.hdf5: there is no such file" in refused.stderr
     assert not (tmp_path / "run").exists()
-
-
-def test_restarts_are_chosen_inside_the_training_part(tmp_path, monkeypatch):
-    spec = spec_at(tmp_path, grid={"training.restarts": [2]}, folds=3)
-    seen = []
-
-    def spied(spec, dimensions, demos, held_out):
-        seen.append(set(demos.names))
-        return train_model(spec, dimensions, demos, held_out=held_out)
-
-    monkeypatch.setattr(folds, "train_model", spied)
-    made = select(spec, tmp_path / "run", Told(), ONE)
-    assert [seen[fold] & set(made.folds.held_out[fold]) for fold in range(3)] == [set()] * 3
-    assert [len(names) for names in seen] == [8, 8, 8]
 
 
 def test_every_candidate_has_the_same_folds(finished):
@@ -193,9 +180,6 @@ def test_giving_up_does_not_depend_on_interruptions(tmp_path, monkeypatch):
     select(spec, tmp_path / "whole", Told(), ONE, stop_early=True)
     first, second = ((tmp_path / name / "selection.json").read_bytes() for name in ("early", "whole"))
     assert first == second
-
-
-# --- before any work --------------------------------------------------------------------------------------------------
 
 
 # --- in processes -----------------------------------------------------------------------------------------------------

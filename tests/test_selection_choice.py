@@ -199,10 +199,7 @@ def test_demonstrations_are_read_with_what_any_candidate_sees(tmp_path):
     [
         ({}, ["selection.grid: is empty; name what to try, such as selection.grid: {hierarchy.levels.0.count: .*}"]),
         ({"task": ["needle"]}, ["selection.grid.task: candidates are compared on the same data; remove it"]),
-        (
-            {"demonstrations.count": [3], "training.epochs": [1]},
-            ["selection.grid.demonstrations.count: candidates are compared on the same data; remove it"],
-        ),
+        ({"demonstrations.count": [3], "training.epochs": [1]}, ["selection.grid.demonstrations.count: candidates .*"]),
         (
             {"observations": [["place"], ["palce"], ["tern"]]},
             [r"selection.grid: observations=\['palce'\]: .*no palce.*", r"selection.grid: .*no tern.*"],
@@ -228,10 +225,6 @@ def test_folds_are_an_even_partition(data):
     assert sorted(row for rows in found for row in rows) == list(range(count))
     assert {len(rows) for rows in found} <= {count // folds, -(-count // folds)}
     assert found == assign(count, folds, seed)
-
-
-def test_another_seed_divides_otherwise():
-    assert assign(30, 5, 0) != assign(30, 5, 1)
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,6 @@ class Toy(Cell):
     seed: int
 
     def results(self, settings, folder):
-
         done = settings.runs / "done"
         done.parent.mkdir(parents=True, exist_ok=True)
         with done.open("a") as file:

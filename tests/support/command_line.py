@@ -1,11 +1,9 @@
-"""The command line as tests call it: in this process, or in one of its own."""
+"""The command line as tests call it."""
 
 from __future__ import annotations
 
 import contextlib
 import io
-import os
-import subprocess
 import sys
 from pathlib import Path
 from typing import NamedTuple
@@ -38,13 +36,6 @@ def call(*arguments):
     ):
         main()
     return Ended(ended.value.code, out.getvalue(), err.getvalue())
-
-
-def start(*arguments):
-    """The command line in a process of its own, in the folder of the toy task."""
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-    return subprocess.Popen([COMMAND, *map(str, arguments)], cwd=HERE, env=environment, **pipes)
 
 
 def with_set(*overrides):

@@ -1,8 +1,9 @@
-"""Small random demonstrations with a vector, a camera and labels, for tests of files."""
+"""Small random demonstrations with a vector, a camera and labels, for tests of files; others by their number."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 
@@ -28,12 +29,12 @@ def demonstrations(number: int = 12, masks: dict[str, tuple[str, ...]] | None = 
     return Demonstrations(records, masks or {}, {"task": "needle", "version": 3})
 
 
+def numbered(rows: Iterable[tuple[Any, ...]]) -> Demonstrations:
+    """``demo_0``, ``demo_1``, … of these: observations, controls and perhaps labels."""
+    return Demonstrations(tuple(Demonstration(f"demo_{n}", *row) for n, row in enumerate(rows)))
+
+
 def of_states(lengths: Iterable[int], seed: int = 0) -> Demonstrations:
     """Demonstrations of so many steps each, with a state of three numbers and a control of two."""
     random = np.random.default_rng(seed)
-    return Demonstrations(
-        tuple(
-            Demonstration(f"demo_{n}", {"state": random.normal(size=(steps, 3))}, random.normal(size=(steps, 2)))
-            for n, steps in enumerate(lengths)
-        )
-    )
+    return numbered(({"state": random.normal(size=(steps, 3))}, random.normal(size=(steps, 2))) for steps in lengths)

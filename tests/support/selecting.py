@@ -6,8 +6,8 @@ import json
 from dataclasses import astuple
 
 import numpy as np
+from random_demonstrations import numbered
 
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.events import CandidateGivenUp, FoldScored, SelectionBegan
 from ddco_pyro.selection.folds import Score
 from ddco_pyro.selection.grid import Candidate
@@ -27,14 +27,13 @@ class Told:
 
 def two_skills(count=12, steps=8, seed=0):
     """Demonstrations in which the sign of the control turns half way."""
-    random = np.random.default_rng(seed)
-    records = []
+    random, rows = np.random.default_rng(seed), []
     for number in range(count):
         place = random.normal(size=(steps + number % 3, 2))
         turn = np.where(np.arange(len(place)) < steps // 2, 1.0, -1.0)[:, None]
         control = turn * place + 0.1 * random.normal(size=place.shape)
-        records.append(Demonstration(f"demo_{number}", {"place": place, "turn": turn}, control))
-    return Demonstrations(tuple(records))
+        rows.append(({"place": place, "turn": turn}, control))
+    return numbered(rows)
 
 
 DATA = {

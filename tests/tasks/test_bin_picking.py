@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from ddco_tasks import psm
-from ddco_tasks.bin_picking import camera, candidates, geometry, objects, supervisor, task
+from ddco_tasks.bin_picking import alone, camera, candidates, geometry, objects, supervisor, task
 from ddco_tasks.bin_picking import environment as bin_picking
 from ddco_tasks.bin_picking.environment import Environment
 from ddco_tasks.bin_picking.instrument import BACKLASH, Instrument, slack_after
@@ -87,16 +87,18 @@ def test_places() -> None:
     assert geometry.place_of(np.array([0.032, 0.0, 0.0])) == "outside"
 
 
-@pytest.mark.parametrize("kind", objects.KINDS)
+@pytest.mark.parametrize("kind", [*objects.KINDS, *objects.UNSEEN])
 def test_objects_are_as_thick_and_long_as_the_paper_says(kind: str) -> None:
+    """Those that no demonstration has shown may be shorter, and their heads thicker."""
+    shortest, thickest = (0.015, 5.9) if kind in objects.UNSEEN else (0.02, 3.0)
     parts = objects.parts(kind)
     thickness = [2e3 * part.radius for part in parts]
-    assert min(thickness) >= 1.0
-    assert max(thickness) <= 3.0
+    assert 1.0 <= min(thickness) <= thickness[0] <= 3.0
+    assert max(thickness) <= thickest
     for one, after in itertools.pairwise(parts):
         np.testing.assert_allclose(one.end, after.start, atol=1e-12)  # a chain
     length = sum(np.linalg.norm(part.end - part.start) for part in parts)
-    assert 0.02 < length < 0.03
+    assert shortest < length <= 0.03
 
 
 # The instrument.
@@ -210,6 +212,22 @@ def test_friction_holds_what_the_jaws_close_on_until_they_open(environment: Envi
     assert physics.held() == frozenset()
     attempt = environment.task.trials.attempts[-1]
     assert (attempt.lifted, attempt.returned) == ({number}, True)
+
+
+@pytest.mark.parametrize("kind", objects.UNSEEN)
+def test_objects_that_no_demonstration_has_shown_are_held_and_only_the_thread_hangs_down(kind: str) -> None:
+    environment = alone[kind].load(0)
+    environment.reset()
+    physics = environment.physics
+    lay(environment, 0, (0.0, 0.012, 0.0035))
+    for height, jaw in ((0.020, 1), (0.003, 1), (0.003, 0), (0.030, 0), (0.030, 0)):
+        go(environment, (0.0, 0.012, height), jaw, np.pi / 2)
+    assert physics.held() == {0}
+    own = physics.model.geom_bodyid >= physics.model.name2id("object_0", "body")
+    assert (np.ptp(physics.data.geom_xpos[own, 2]) > 0.008) == (kind == "thread")  # m, between middles of its parts
+    go(environment, (0.0, 0.012, 0.030), 1, np.pi / 2)
+    assert physics.held() == frozenset()
+    environment.close()
 
 
 @pytest.mark.parametrize(("number", "turn"), [(0, 0.0), (1, np.pi / 4), (2, np.pi / 2)])

@@ -95,35 +95,20 @@ def test_criteria_are_sums_over_bins() -> None:
     assert found["recall where several are"] == (2, 3)
 
 
-NONE, FIRST, BOTH = frozenset[int](), frozenset({0}), frozenset({0, 1})
-STEPS = slice(0, 10)
-ATTEMPTS = {
-    "into its cup": Attempt(2, FIRST, FIRST, ("accept",), 10),
-    "nothing taken": Attempt(2, NONE, NONE, ("bin",), 10),
-    "several taken": Attempt(2, BOTH, BOTH, ("bin", "bin"), 10),
-    "slipped": Attempt(2, BOTH, FIRST, ("accept",), 10),
-    "into the wrong cup": Attempt(2, FIRST, FIRST, ("reject",), 10),
-    "one let go over the bin": Attempt(2, FIRST, FIRST, ("bin",), 10),
-    "none or several to a cup": Attempt(2, BOTH, BOTH, ("accept", "accept"), 10),
-    "not let go": Attempt(2, FIRST, FIRST, (), 20),
-}
-
-
 def test_recoveries_are_of_what_is_held_where_it_is_shown() -> None:
     """What is lost after it was shown alone is nobody's to take back; trials without a decision do not count."""
-    back, cup, lost = ATTEMPTS["nothing taken"], ATTEMPTS["into its cup"], Attempt(2, FIRST, NONE, ("accept",), 10)
-    shown = [(NONE, back), (NONE, lost), (BOTH, ATTEMPTS["several taken"]), (BOTH, cup), (FIRST, cup), (FIRST, lost)]
-    others = [
-        (FIRST, ATTEMPTS["one let go over the bin"]),
-        (FIRST, None),
-        (None, back),
-        (FIRST, ATTEMPTS["not let go"]),
-    ]
-    loads = [None if held is None else Load(held, shown=True, seen=bool(held)) for held, _ in shown + others]
-    found = counted(
-        [Trial(STEPS, FIRST, attempt, load) for load, (_, attempt) in zip(loads, shown + others, strict=True)]
-    )
-    falling = counted([Trial(STEPS, FIRST, lost, Load(NONE, shown=True, seen=True))])
+    none, first, both = frozenset[int](), frozenset({0}), frozenset({0, 1})
+    back, several = Attempt(2, none, none, ("bin",), 10), Attempt(2, both, both, ("bin", "bin"), 10)
+    cup, lost = Attempt(2, first, first, ("accept",), 10), Attempt(2, first, none, ("accept",), 10)
+    dropped, kept = Attempt(2, first, first, ("bin",), 10), Attempt(2, first, first, (), 20)
+    shown = [(none, back), (none, lost), (both, several), (both, cup), (first, cup), (first, lost)]
+    others = [(first, dropped), (first, None), (None, back), (first, kept)]
+    trials = []
+    for held, attempt in shown + others:
+        load = None if held is None else Load(held, shown=True, seen=bool(held))
+        trials.append(Trial(slice(0, 10), first, attempt, load))
+    found = counted(trials)
+    falling = counted([Trial(slice(0, 10), first, lost, Load(none, shown=True, seen=True))])
     assert found == {
         "nothing": 2, "nothing back": 1, "unseen": 2, "unseen back": 1, "several": 2, "several back": 1, "one": 3,
         "one back": 1, "one lost": 1, "due back": 4, "back": 2,

@@ -16,8 +16,6 @@ from ddco_pyro.simulation.task import find_task
 from ddco_pyro.spec.base import TASKS
 
 NAMES = sorted(point.name for point in entry_points(group=TASKS))
-
-
 QUICK = ("needle", "pushing_goal")
 """The others differ from them in what is observed or in when they end; a bin takes long."""
 each = pytest.mark.parametrize(

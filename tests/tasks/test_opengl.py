@@ -70,15 +70,11 @@ def test_without_a_driver_one_line_names_the_packages() -> None:
         assert found.stderr.splitlines()[-1].endswith(advice("EGL has no device that starts"))
 
 
-def test_where_the_tasks_can_draw_nothing_is_said() -> None:
-    found = ended(sys.executable, "tasks/opengl.py")
+@pytest.mark.parametrize("own", [{}, NO_DRIVER | {"MUJOCO_GL": "osmesa"}, NO_DRIVER | {"DISPLAY": ":0"}], ids=str)
+def test_where_the_tasks_can_draw_nothing_is_said(own: dict[str, str]) -> None:
+    """Another renderer, or a display, is taken to work."""
+    found = ended(sys.executable, "tasks/opengl.py", **own)
     assert (found.returncode, found.stdout, found.stderr) == (0, "", "")
-
-
-def test_another_renderer_or_a_display_is_taken_to_work() -> None:
-    for own in ({"MUJOCO_GL": "osmesa"}, {"DISPLAY": ":0"}):
-        found = ended(sys.executable, "tasks/opengl.py", **NO_DRIVER, **own)
-        assert (found.returncode, found.stderr) == (0, "")
 
 
 def test_the_demo_looks_for_opengl_before_it_installs_anything(tmp_path: Path) -> None:

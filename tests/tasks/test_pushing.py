@@ -210,29 +210,22 @@ def test_episodes_start_apart_from_the_box_and_its_goal() -> None:
 # Variants.
 
 
-def idle(variant: pushing.Task, steps: int) -> tuple[int, dict[str, float]]:
-    """Steps and outcome of an episode, or its first ``steps``, in which the arm does nothing."""
+@pytest.mark.parametrize(
+    ("variant", "steps", "missed"),
+    [(task, 2000, np.nan), (limited, 2000, 2000 // 250), (single, 250, 1.0)],
+    ids=["task", "limited", "single"],
+)
+def test_an_arm_that_does_nothing_misses_its_goals(variant: pushing.Task, steps: int, missed: float) -> None:
     environment = variant.load(2)
     environment.reset()
-    number = 1
-    while not environment.step(np.zeros(3)).last() and number < steps:
-        number += 1
+    taken = 1
+    while not environment.step(np.zeros(3)).last() and taken < 3000:
+        taken += 1
     measures = variant.outcome(environment)
     environment.close()
-    return number, measures
-
-
-def test_lengths_and_limits_of_the_variants() -> None:
-    taken, measures = idle(task, 3000)
-    assert taken == task.steps == 2000
+    assert taken == variant.steps == steps
     assert (measures["success"], measures["goals"]) == (0.0, 0.0)
-    assert np.isnan(measures["missed"])
-    taken, measures = idle(limited, 3000)
-    assert taken == limited.steps == 2000
-    assert measures["missed"] == 2000 // 250
-    taken, measures = idle(single, 3000)
-    assert taken == single.steps == 250
-    assert (measures["success"], measures["missed"]) == (0.0, 1.0)
+    assert measures["missed"] == pytest.approx(missed, nan_ok=True)
 
 
 def test_an_episode_about_one_goal_ends_where_it_is_reached() -> None:

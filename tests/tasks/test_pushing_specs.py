@@ -1,20 +1,24 @@
-"""Every spec of the pushing task can be checked and fitted, and its policy acts in the task."""
+"""Every spec of the pushing task can be checked and fitted, and its policy acts in the task; pictures and features."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import yaml
 from ddco_tasks.pushing import environment as pushing
+from pushing_pictures import SIZE, encoded
+from random_demonstrations import numbered
 
 import ddco_pyro
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.simulation.episodes import play, run_episode
-from ddco_pyro.spec import Spec, load_spec, parse_spec
+from ddco_pyro.spec import load_spec, parse_spec
 from ddco_pyro.training.data import dimensions
 from ddco_pyro.training.networks import check_networks
 
@@ -37,18 +41,14 @@ def demonstrations(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def short(path: Path, demonstrations: Path) -> Spec:
-    """The spec, on these demonstrations, for six epochs in all."""
-    return load_spec(path, [f"demonstrations.path={demonstrations}", "training.epochs=6"])
-
-
 @pytest.mark.parametrize(
     "path",
     [pytest.param(path, marks=[] if path.stem in QUICK else pytest.mark.slow) for path in SPECS],
     ids=lambda path: path.stem,
 )
 def test_specs_fit_and_act(path: Path, demonstrations: Path, tmp_path: Path) -> None:
-    found = fit(short(path, demonstrations), out=tmp_path / "run")
+    short = load_spec(path, [f"demonstrations.path={demonstrations}", "training.epochs=6"])
+    found = fit(short, out=tmp_path / "run")
     assert found.metrics.engine_check.value < 1e-6
     brief = replace(pushing.limited, load=lambda seed: pushing.load_single(seed), cameras=CAMERAS)
     controller = Controller.from_spec(found.hierarchy, found.spec.rollout)
@@ -71,31 +71,22 @@ def test_specs_are_checked_against_the_task(path: Path) -> None:
 # --- pictures alone say what the control depends on -------------------------------------------------------------------
 
 
-CONVOLUTION = {
-    "network": "conv",
-    "layers": [{"filters": 8, "kernel": 5, "stride": 4, "padding": 2}],
-    "pool": "spatial_softmax",
-    "hidden": [32],
-}
+CLONING = """
+demonstrations: {path: unused.hdf5}
+observations: [{key: camera, frames: 2}]
+control: {std: 1.0}
+baseline:
+  kind: flat
+  policy:
+    {network: conv, layers: [{filters: 8, kernel: 5, stride: 4, padding: 2}], pool: spatial_softmax, hidden: [32]}
+training: {epochs: 40, patience: null, batch_size: 2, optimizer: {lr: 0.005}}
+"""
 TRAINED, HELD_OUT = 16, 8
-
-
-def spec() -> Spec:
-    """Behaviour cloning from pictures, standardised controls, σ = 1."""
-    return parse_spec(
-        {
-            "demonstrations": {"path": "unused.hdf5"},
-            "observations": [{"key": "camera", "frames": 2}],
-            "control": {"std": 1.0},
-            "baseline": {"kind": "flat", "policy": CONVOLUTION},
-            "training": {"epochs": 40, "patience": None, "batch_size": 2, "optimizer": {"lr": 0.005}},
-        }
-    )
 
 
 def explained(demos: Demonstrations) -> float:
     """The share of the held-out controls' variance that a policy trained on the others explains, from likelihoods."""
-    fit = ddco_pyro.fit(spec(), demos)
+    fit = ddco_pyro.fit(parse_spec(yaml.safe_load(CLONING)), demos)
     held_out = demos.select(demos.masks["valid"])
     controls = np.concatenate([demo.actions for demo in held_out])
     scale = fit.hierarchy.scaling
@@ -123,3 +114,28 @@ def test_pictures_tell_the_control_and_shuffled_ones_do_not() -> None:
     ]
     assert explained(Demonstrations(tuple(records), masks)) > 0.3
     assert explained(Demonstrations(tuple(shuffled), masks)) < 0.05
+
+
+def test_features_have_versions_of_pictures_that_are_moved() -> None:
+    """Each demonstration by moves of its own, all of its pictures alike; what is read here is the picture itself."""
+    pictures = np.random.default_rng(0).integers(0, 256, (10, 4, *SIZE, 3), dtype=np.uint8)
+    demos = numbered(({"camera": own}, np.zeros((4, 2))) for own in pictures)
+    reader = SimpleNamespace(encode=lambda seen: seen.reshape(len(seen), -1).astype(np.float32))
+    kept, by = encoded(reader, demos, versions=6, seed=3), set()
+    assert kept.names == demos.names
+    for demo, whole in zip(kept, pictures, strict=True):
+        np.testing.assert_array_equal(demo.observations["camera_features"], whole.reshape(4, -1))
+        inside = whole[:, 3:-3, 3:-3]
+        height, width = inside.shape[1:3]
+        for version in demo.observations["camera_features_moved"].swapaxes(0, 1):
+            seen = version.reshape(4, *SIZE, 3)
+            places = [
+                (row, column)
+                for row in range(7)
+                for column in range(7)
+                if (seen[:, row : row + height, column : column + width] == inside).all()
+            ]
+            assert len(places) == 1
+            by.update(places)
+    assert len(by) > 20  # of 49
+    assert list(encoded(reader, demos)[0].observations) == ["camera_features"]

@@ -67,13 +67,11 @@ def test_planned_approaches_are_clear_and_lead_behind_the_box() -> None:
     for scene in scenes():
         if not pushing_geometry.is_clear(scene.angles, scene.box, pushing_planner.MARGIN):
             continue
-        planner = pushing_planner.Planner()
-        path = planner._approach(scene)
+        path = pushing_planner.Planner()._approach(scene)
         np.testing.assert_allclose(path[0], scene.angles)
         assert pushing_planner.may_push(path[-1], scene)
         assert all(pushing_geometry.is_clear(angles, scene.box, 0.5 * pushing_planner.MARGIN) for angles in path)
-        again = pushing_planner.Planner()._approach(scene)
-        np.testing.assert_array_equal(path, again)
+        np.testing.assert_array_equal(path, pushing_planner.Planner()._approach(scene))
 
 
 def test_planned_pushes_stay_low_and_end_at_the_goal() -> None:
