@@ -195,6 +195,3 @@ def test_runs_that_score_other_dimensions_are_not_compared(whole: Fit, tmp_path:
     with pytest.raises(CompareError, match=message):
         compare([one.folder for one in runs])
     assert len(compare([whole.folder, whole.folder / "baselines" / "flat"]).rows) == 2
-
-
-# --- what is said -----------------------------------------------------------------------------------------------------

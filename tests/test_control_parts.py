@@ -145,6 +145,7 @@ def test_parts_by_name_come_first_and_the_rest_follows():
     ("control", "message"),
     [
         ({"kind": "binary"}, "control.kind: control dimension 0 takes more than two values; it is no switch"),
+        ({"kind": "hurdle"}, "control dimension 0 is at no value inside its range in 5 % of the steps"),
         ({"parts": [{"name": "a", "dims": [9]}]}, "control.parts.0.dims: there is no control dimension 9"),
         (
             {"parts": [{"name": "a", "dims": [1], "kind": "clipped", "bounds": [-1, 1]}]},
@@ -329,7 +330,6 @@ def switches(jaw):
 
 def test_a_switch_is_never_half_open_and_switches_as_often(switched, tmp_path):
     """Rolled out in the plane that the demonstrations were made in."""
-
     parts = control_parts(learned("auto").control, Dimensions.of(switched).control)
     assert {part.kind: part.dims for part in parts} == {"gaussian": (0, 1), "binary": (2,)}
     model = make_trainer(learned("auto"), switched, tmp_path / "fit").run()

@@ -5,16 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from hierarchies import SHAPES, make_batch, make_hierarchy
+from exportable import make
+from hierarchies import make_batch, make_hierarchy
 from oracle import brute_force
 from torch.distributions import Normal
 
 from ddco_pyro.inference import log_likelihood
 from ddco_pyro.model.batch import STEPS_AT_ONCE, Batch
-from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.links import TERMINATION_BOUND
 from ddco_pyro.model.networks import Inputs
-from ddco_pyro.spec import parse_spec
 
 
 @pytest.mark.parametrize("emits", [("options",), ("options", "control")])
@@ -25,10 +24,8 @@ def test_gradient_is_the_papers_gradient_equation(emits):
         Inputs({"state": batch.inputs.vector.double()}, {}, batch.inputs.time), batch.actions.double(), batch.lengths
     )
     parameters = list(hierarchy.parameters())
-    found = torch.autograd.grad(
-        log_likelihood(hierarchy.tabulate(batch), batch.lengths).sum(), parameters, retain_graph=True
-    )
     tables = hierarchy.tabulate(batch)
+    found = torch.autograd.grad(log_likelihood(tables, batch.lengths).sum(), parameters, retain_graph=True)
     surrogate = torch.zeros((), dtype=torch.float64)
     for n, length in enumerate(batch.lengths.tolist()):
         truth = brute_force(tables, n, length)
@@ -94,17 +91,11 @@ def test_policy_and_termination_read_the_trunk_of_their_option():
         weight, bias = head.layers[0].weight, head.layers[0].bias
         expected = torch.stack([features[:, :, k] @ weight[k] + bias[k] for k in range(3)], dim=2)
         torch.testing.assert_close(found, expected)
-    assert [name for name, _ in hierarchy.named_networks()] == [
-        *(f"hierarchy.levels.0.{part}" for part in ("trunk", "policy", "termination")),
-        "hierarchy.meta_policy",
-    ]
-    sizes = [100, 200]
-    bytes_of = [
-        make_hierarchy((3,), network="linear", trunk={"network": "lstm", "hidden": size}).step_bytes for size in sizes
-    ]
-    assert bytes_of[1] == pytest.approx(
-        2 * bytes_of[0], rel=0.1
-    )  # the gates of each step, not weights, which are squares
+    narrow, wide = (
+        make_hierarchy((3,), network="linear", trunk={"network": "lstm", "hidden": size}).step_bytes
+        for size in (100, 200)
+    )
+    assert wide == pytest.approx(2 * narrow, rel=0.1)  # the gates of each step, not weights, which are squares
     assert hierarchy.step_bytes > make_hierarchy((3,), network="linear").step_bytes
 
 
@@ -128,21 +119,7 @@ def test_a_learned_deviation_keeps_its_floor_and_is_shared_by_the_level():
 
 def test_what_goes_through_together_is_counted_in_bytes(monkeypatch):
     """Networks of n times the hidden units take about n times the memory, and pieces are smaller in proportion."""
-    narrow, wide = (
-        Hierarchy(
-            parse_spec(
-                {
-                    "demonstrations": {"path": "unused.hdf5"},
-                    "observations": ["state"],
-                    "baseline": {"kind": "flat", "policy": {"network": "mlp", "hidden": [units]}},
-                }
-            ),
-            SHAPES,
-            2,
-            steps=4,
-        )
-        for units in (100, 1000)
-    )
+    narrow, wide = (make({"network": "mlp", "hidden": [units]}, ()).hierarchy for units in (100, 1000))
     assert wide.step_bytes == pytest.approx(10 * narrow.step_bytes, rel=0.05)
     assert narrow.step_bytes >= 3 * 100 * 4  # what a hidden layer gives, once kept and twice in passing
     assert narrow.steps_at_once == wide.steps_at_once == STEPS_AT_ONCE

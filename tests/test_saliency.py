@@ -19,6 +19,7 @@ from ddco_pyro.spec import parse_spec
 SHAPES = {"camera": (10, 8, 3), "pose": (2,)}
 CONV = {"network": "conv", "filters": 3, "kernel": 3, "pool": "spatial_softmax", "hidden": [6]}
 LSTM = {"network": "lstm", "over": CONV, "hidden": 4}
+HEADS = {"policy": {"network": "linear"}, "termination": {"network": "linear"}}
 STEPS = 4
 
 
@@ -28,14 +29,7 @@ def make(trunk, emits):
             "demonstrations": {"path": "unused.hdf5"},
             "observations": [{"key": "camera", "frames": 2}, "pose"],
             "hierarchy": {
-                "levels": [
-                    {
-                        "count": 2,
-                        "trunk": trunk,
-                        "policy": {"network": "linear"},
-                        "termination": {"network": "linear"},
-                    }
-                ],
+                "levels": [{"count": 2, "trunk": trunk, **HEADS}],
                 "meta_policy": {**trunk, "emits": emits},
             },
         }
@@ -149,7 +143,7 @@ def spec_of(level, trunk):
 def fitted(request, tmp_path_factory):
     level = {} if request.param == "whole" else {request.param: BRANCHES}
     if request.param != "policy":
-        level |= {"policy": {"network": "linear"}, "termination": {"network": "linear"}}
+        level |= HEADS
     out = tmp_path_factory.mktemp("runs") / request.param
     return ddco_pyro.fit(spec_of(level, BRANCHES if request.param == "whole" else None), demonstrations(), out=out)
 
