@@ -12,7 +12,7 @@ import onnx
 import pytest
 import torch
 from command_line import call
-from exportable import FITS, RECURRENT, SHAPES, make
+from exportable import FITS, RECURRENT, SHAPES, make, observe
 from user_networks import Remembering
 
 import ddco_pyro
@@ -61,8 +61,7 @@ def compare(exported, original, steps):
         exported.reset(seed)
         original.reset(seed)
         for _ in range(steps):
-            seen = {key: random.normal(size=shape) for key, shape in SHAPES.items()}
-            seen["camera"] = random.integers(0, 256, SHAPES["camera"], dtype=np.uint8)
+            seen = observe(random)
             difference = np.abs(exported.act(seen) - original.act(seen))
             assert (difference < TOLERANCE * np.array([10.0, 1.0])).all()
             assert exported.choices == original.choices

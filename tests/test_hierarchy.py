@@ -12,7 +12,6 @@ from torch.distributions import Normal
 
 from ddco_pyro.inference import log_likelihood
 from ddco_pyro.model.batch import STEPS_AT_ONCE, Batch
-from ddco_pyro.model.links import TERMINATION_BOUND
 from ddco_pyro.model.networks import Inputs
 
 
@@ -65,17 +64,6 @@ def test_tables_are_normalised(counts, emits):
         assert bool((selection[..., 0].exp() > 0).all()) == ("control" in emits)
         assert bool((selection[..., 1:].exp() > 0).all()) == ("options" in emits)
     assert tables.control[-1].isfinite().all() == ("control" in emits)
-
-
-def test_terminations_keep_their_bound():
-    hierarchy, batch = make_hierarchy((2,)), make_batch()
-    level = hierarchy.levels[0]
-    with torch.no_grad():
-        level.termination.layers[-1].bias[:] = torch.tensor([1e6, -1e6]).reshape(2, 1, 1)
-    psi = hierarchy(batch.inputs).termination[0].exp()[..., 1]
-    bound = torch.tensor(TERMINATION_BOUND)
-    np.testing.assert_allclose(psi[..., 0].detach(), bound.sigmoid(), rtol=1e-5)
-    np.testing.assert_allclose(psi[..., 1].detach(), (-bound).sigmoid(), rtol=1e-3)
 
 
 def test_policy_and_termination_read_the_trunk_of_their_option():

@@ -7,29 +7,20 @@ import pytest
 import torch
 from command_line import call
 from odd_files.atoms import ROWS, at_bounds, no_ops
+from planted import make_spec
 
 import ddco_pyro
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.controls import control_dimensions, control_parts, described
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.exporting import TOLERANCE, export, runner
-from ddco_pyro.spec import ControlSpec, load_spec, parse_spec, with_overrides
+from ddco_pyro.spec import ControlSpec, load_spec, with_overrides
 
 
 def spec_of(options=3, epochs=6, path="unused.hdf5", **control):
-    linear = {"network": "linear"}
-    return parse_spec(
-        {
-            "demonstrations": {"path": str(path), "valid_fraction": 0.34},
-            "observations": ["state"],
-            "control": {"std": {"learn": True, "per_option": True}, **control},
-            "hierarchy": {
-                "levels": [{"count": options, "policy": linear, "termination": linear}],
-                "meta_policy": linear,
-            },
-            "training": {"epochs": epochs, "optimizer": {"lr": 0.03}, "initialize": "vq_controls"},
-        }
-    )
+    control = {"std": {"learn": True, "per_option": True}, **control}
+    spec = make_spec((options,), control=control, epochs=epochs, initialize="vq_controls")
+    return with_overrides(spec, {"demonstrations": {"path": str(path), "valid_fraction": 0.34}})
 
 
 # --- without skill ----------------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from types import MappingProxyType
 
+import numpy as np
 import torch
 from hierarchies import varied
 
@@ -70,6 +71,12 @@ def make(
     hierarchy.scaling.scale.copy_(torch.tensor([10.0, 0.3]))
     hierarchy.scaling.shift.copy_(torch.tensor([-4.0, 1.0]))
     return Fit(spec, varied(hierarchy).eval())
+
+
+def observe(random):
+    """A random observation."""
+    seen = {key: random.normal(size=shape) for key, shape in SHAPES.items()}
+    return seen | {"camera": random.integers(0, 256, SHAPES["camera"], dtype=np.uint8)}
 
 
 CONVOLUTIONS = {
