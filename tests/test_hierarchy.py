@@ -5,14 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from exportable import make
-from hierarchies import make_batch, make_hierarchy
+from hierarchies import SHAPES, make_batch, make_hierarchy
 from oracle import brute_force
 from torch.distributions import Normal
 
 from ddco_pyro.inference import log_likelihood
 from ddco_pyro.model.batch import STEPS_AT_ONCE, Batch
+from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs
+from ddco_pyro.spec import parse_spec
 
 
 @pytest.mark.parametrize("emits", [("options",), ("options", "control")])
@@ -107,7 +108,21 @@ def test_a_learned_deviation_keeps_its_floor_and_is_shared_by_the_level():
 
 def test_what_goes_through_together_is_counted_in_bytes(monkeypatch):
     """Networks of n times the hidden units take about n times the memory, and pieces are smaller in proportion."""
-    narrow, wide = (make({"network": "mlp", "hidden": [units]}, ()).hierarchy for units in (100, 1000))
+    narrow, wide = (
+        Hierarchy(
+            parse_spec(
+                {
+                    "demonstrations": {"path": "unused.hdf5"},
+                    "observations": ["state"],
+                    "baseline": {"kind": "flat", "policy": {"network": "mlp", "hidden": [units]}},
+                }
+            ),
+            SHAPES,
+            2,
+            steps=4,
+        )
+        for units in (100, 1000)
+    )
     assert wide.step_bytes == pytest.approx(10 * narrow.step_bytes, rel=0.05)
     assert narrow.step_bytes >= 3 * 100 * 4  # what a hidden layer gives, once kept and twice in passing
     assert narrow.steps_at_once == wide.steps_at_once == STEPS_AT_ONCE

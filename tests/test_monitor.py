@@ -18,7 +18,6 @@ from ddco_pyro.model.batch import encode
 from ddco_pyro.model.encoder import ObservationEncoder
 from ddco_pyro.spec import ObservationSpec
 
-
 WINDOWS = {"network": "lstm", "horizon": 4}
 
 
@@ -64,6 +63,7 @@ def test_the_control_comes_with_every_observation_but_the_first():
 
 PLANTED = [(1, 6), (2, 3), (3, 4)]
 """Phases, each with its number of steps."""
+
 
 @pytest.fixture(scope="module")
 def phases():

@@ -50,7 +50,10 @@ PLACES = [
     (f"demonstrations.task={TASK}", "demonstrations.task"),
     (f"hierarchy.levels.0.policy.network={NETWORK}", "hierarchy.levels.0.policy.network"),
     (f"hierarchy.meta_policy.network={NETWORK}", "hierarchy.meta_policy.network"),
-    (f"hierarchy.meta_policy={{network: branches, of: {{offsets: {OWN}}}}}", "hierarchy.meta_policy.of.offsets.network"),
+    (
+        f"hierarchy.meta_policy={{network: branches, of: {{offsets: {OWN}}}}}",
+        "hierarchy.meta_policy.of.offsets.network",
+    ),
     (f"compare_with=[flat, {{kind: flat, policy: {OWN}}}]", "compare_with.1.policy.network"),
     (f"selection.grid.task=[toy, '{TASK}']", "selection.grid.task"),
     (
