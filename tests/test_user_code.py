@@ -60,7 +60,7 @@ PLACES = [
         f"selection.grid.hierarchy.levels.0.policy.network=[mlp, '{NETWORK}']",
         "selection.grid.hierarchy.levels.0.policy.network",
     ),
-    (f"selection.grid.hierarchy.levels=[{{count: 1, policy: {OWN}}}]", "selection.grid.hierarchy.levels"),
+    (f"selection.grid.hierarchy.levels=[[{{count: 1, policy: {OWN}}}]]", "selection.grid.hierarchy.levels"),
 ]
 WORK = ["check", "collect", "fit", "select"]
 
