@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from exportable import SHAPES, make
 
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.model.batch import encode
-from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.spec import parse_spec
 
 LONGEST = 6  # steps that networks for each step of time are made for
 LENGTHS = (6, 4, 9)
@@ -30,39 +29,20 @@ def recorded(camera):
     for number, steps in enumerate(LENGTHS):
         seen = {"state": random.normal(5, 2, (steps, 3)), "goal": random.normal(-1, 3, (steps, 2, 2))}
         if camera:
-            seen["camera"] = random.integers(0, 256, (steps, 10, 12, 3), dtype=np.uint8)
+            seen["camera"] = random.integers(0, 256, (steps, *SHAPES["camera"]), dtype=np.uint8)
         records.append(Demonstration(f"demo_{number}", seen, random.normal(40, 9, (steps, 2))))
     return Demonstrations(tuple(records))
-
-
-def make(network, counts, demos):
-    emits = {"emits": ["options", "control"]} if len(counts) > 1 else {}
-    levels = [
-        {"name": f"level-{d}", "count": k, "policy": network | (emits if d else {}), "termination": network}
-        for d, k in enumerate(counts)
-    ]
-    hierarchy = {"hierarchy": {"levels": levels, "meta_policy": network | emits}}
-    seen = [{"key": "state", "differences": True}, *sorted(set(demos.observation_shapes) - {"state"})]
-    spec = parse_spec(
-        {
-            "demonstrations": {"path": "unused.hdf5"},
-            "observations": seen,
-            **(hierarchy if counts else {"baseline": {"kind": "flat", "policy": network}}),
-        }
-    )
-    torch.manual_seed(0)
-    found = Hierarchy(spec, demos.observation_shapes, 2, LONGEST)
-    found.encoder.fit(demos)
-    found.scaling.fit(demos)
-    return found.eval()
 
 
 @pytest.fixture(scope="module", params=[(network, model) for network in NETWORKS for model in MODELS], ids="-".join)
 def trained(request):
     """A model, demonstrations, and the outputs of its networks for all of them in one padded batch."""
-    network, model = request.param
-    demos = recorded(network == "conv")
-    hierarchy = make(NETWORKS[network], MODELS[model], demos)
+    network, counts = NETWORKS[request.param[0]], MODELS[request.param[1]]
+    camera = request.param[0] == "conv"
+    emits = ("options", "control") if len(counts) > 1 else ("options",)
+    demos, hierarchy = recorded(camera), make(network, counts, emits, camera, LONGEST, endings=network).hierarchy
+    hierarchy.encoder.fit(demos)
+    hierarchy.scaling.fit(demos)
     with torch.no_grad():
         return hierarchy, demos, hierarchy(encode(demos, hierarchy.encoder, hierarchy.scaling).inputs)
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from command_line import call
+from planted import make_spec
 
 import ddco_pyro
 from ddco_pyro.acting.controller import Controller
@@ -19,7 +20,7 @@ from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.selection import folds as dividing
-from ddco_pyro.spec import Spec, parse_spec
+from ddco_pyro.spec import Spec, with_overrides
 
 STILL = {1: 0.1, 3: -7.0}
 """Dimension to value; 0.1 is no float32."""
@@ -39,7 +40,7 @@ def controls(random: np.random.Generator, steps: int) -> np.ndarray:
 def make_demonstrations(number: int = 8) -> Demonstrations:
     random = np.random.default_rng(0)
     records = [
-        Demonstration(f"demo_{n}", {"pose": random.normal(size=(9, 3))}, controls(random, 9)) for n in range(number)
+        Demonstration(f"demo_{n}", {"state": random.normal(size=(9, 3))}, controls(random, 9)) for n in range(number)
     ]
     return Demonstrations(tuple(records), {"valid": (f"demo_{number - 1}", f"demo_{number - 2}")})
 
@@ -51,20 +52,9 @@ def with_controls(demos: Demonstrations, change: dict[str, np.ndarray] | None = 
 
 
 def spec_for(path: Path, **changes: object) -> Spec:
-    return parse_spec(
-        {
-            "demonstrations": {"path": str(path)},
-            "observations": ["pose"],
-            "control": {"std": {"learn": True}},
-            "hierarchy": {
-                "levels": [{"name": "option", "count": 2, "policy": {"hidden": [4]}}],
-                "meta_policy": {"hidden": [4], "emits": ["options", "control"]},
-            },
-            "training": {"initialize": "vq_controls", "epochs": 3, "batch_size": 2},
-            "compare_with": ["flat"],
-            **changes,
-        }
-    )
+    spec = make_spec((2,), control={"std": {"learn": True}}, initialize="vq_controls", epochs=3, batch_size=2)
+    own = {"hierarchy.meta_policy.emits": ["options", "control"], "compare_with": ["flat"]}
+    return with_overrides(spec, {**own, "demonstrations": {"path": str(path)}, **changes})
 
 
 @pytest.fixture(scope="module")
@@ -123,7 +113,7 @@ def test_what_they_are_comes_back_from_the_run(whole: Fit) -> None:
 
 def observations(number: int = 6) -> list[dict[str, np.ndarray]]:
     random = np.random.default_rng(5)
-    return [{"pose": random.normal(size=3)} for _ in range(number)]
+    return [{"state": random.normal(size=3)} for _ in range(number)]
 
 
 def check_control(found: np.ndarray, expected: np.ndarray) -> None:
@@ -195,6 +185,3 @@ def test_runs_that_score_other_dimensions_are_not_compared(whole: Fit, tmp_path:
     with pytest.raises(CompareError, match=message):
         compare([one.folder for one in runs])
     assert len(compare([whole.folder, whole.folder / "baselines" / "flat"]).rows) == 2
-
-
-# --- what is said -----------------------------------------------------------------------------------------------------

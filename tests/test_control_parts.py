@@ -8,7 +8,6 @@ import h5py
 import numpy as np
 import pytest
 import torch
-import yaml
 from command_line import call
 from planted import make_spec, make_trainer, make_truth, plant, recovered
 
@@ -17,7 +16,7 @@ from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.controls import ControlPart, control_dimensions, control_parts, described
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
 from ddco_pyro.exporting import TOLERANCE, export, runner
-from ddco_pyro.spec import ControlSpec, SpecError, dump_spec, parse_spec, with_overrides
+from ddco_pyro.spec import ControlSpec, SpecError, dump_spec, with_overrides
 from ddco_pyro.training.networks import Dimensions
 
 STEPS = 30
@@ -53,18 +52,9 @@ def demonstrations(actions=mixed, number=6):
 
 
 def spec_of(**control):
-    return parse_spec(
-        {
-            "demonstrations": {"path": "unused.hdf5", "valid_fraction": 0.34},
-            "observations": ["state"],
-            "control": {"std": {"learn": True}, **control},
-            "hierarchy": {
-                "levels": [{"count": 2, "policy": {"network": "linear"}}],
-                "meta_policy": {"network": "linear", "emits": ["options", "control"]},
-            },
-            "training": {"epochs": 6},
-        }
-    )
+    spec = make_spec((2,), control={"std": {"learn": True}, **control}, epochs=6)
+    emits = {"hierarchy.meta_policy.emits": ["options", "control"]}
+    return with_overrides(spec, {"demonstrations.valid_fraction": 0.34, **emits})
 
 
 def kinds(actions, **control):
@@ -145,6 +135,7 @@ def test_parts_by_name_come_first_and_the_rest_follows():
     ("control", "message"),
     [
         ({"kind": "binary"}, "control.kind: control dimension 0 takes more than two values; it is no switch"),
+        ({"kind": "hurdle"}, "control dimension 0 is at no value inside its range in 5 % of the steps"),
         ({"parts": [{"name": "a", "dims": [9]}]}, "control.parts.0.dims: there is no control dimension 9"),
         (
             {"parts": [{"name": "a", "dims": [1], "kind": "clipped", "bounds": [-1, 1]}]},
@@ -247,8 +238,7 @@ def test_discrete_actions_from_file_to_controller(tmp_path: Path, rows):
 
 def in_file(spec, path, **changes):
     """The spec with the demonstrations of a file."""
-    data = yaml.safe_load(dump_spec(spec))
-    return parse_spec({**data, "demonstrations": {"path": str(path), "valid_fraction": 0.34}, **changes})
+    return with_overrides(spec, {"demonstrations.path": str(path), **changes})
 
 
 def test_a_value_that_a_switch_does_not_have_is_one_line(fitted):
@@ -329,7 +319,6 @@ def switches(jaw):
 
 def test_a_switch_is_never_half_open_and_switches_as_often(switched, tmp_path):
     """Rolled out in the plane that the demonstrations were made in."""
-
     parts = control_parts(learned("auto").control, Dimensions.of(switched).control)
     assert {part.kind: part.dims for part in parts} == {"gaussian": (0, 1), "binary": (2,)}
     model = make_trainer(learned("auto"), switched, tmp_path / "fit").run()

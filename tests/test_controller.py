@@ -3,42 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
+from hierarchies import make_hierarchy
 from oracle import brute_force
 from scipy import stats
 
 from ddco_pyro.acting.controller import Controller
-from ddco_pyro.acting.window import ObservationError
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.model.batch import encode
-from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.spec import parse_spec
 
 STATE = {"state": np.array([0.5, -1.0, 2.0])}
 STD = 0.3
 ALWAYS, SELDOM = 100.0, -100.0  # logits, which the hierarchy bounds
 P_VALUE = 1e-3
-
-
-def make(counts=(3,), emits=("options",), network="linear", observation="state", seed=0):
-    """A hierarchy over 3 features and 2 control dimensions, whose callers above the lowest level all emit ``emits``."""
-    levels = [
-        {"name": f"level-{d}", "count": k, "policy": {"network": network} | ({"emits": list(emits)} if d else {})}
-        for d, k in enumerate(counts)
-    ]
-    spec = parse_spec(
-        {
-            "demonstrations": {"path": "unused.hdf5"},
-            "observations": [observation],
-            "control": {"std": STD},
-            "hierarchy": {"levels": levels, "meta_policy": {"network": network, "emits": list(emits)}},
-        }
-    )
-    torch.manual_seed(seed)
-    return Hierarchy(spec, {"state": (3,)}, 2, steps=4)
+make = partial(make_hierarchy, network="linear", std=STD)
 
 
 def fix(network, values):
@@ -72,8 +54,9 @@ def play(controller, steps):
 
 def without_controls(hierarchy, states):
     """What enumeration of all paths says of the latents where no control is seen."""
+    demos = Demonstrations((Demonstration("demo_0", {"state": states}, np.zeros((len(states), 2))),))
     with torch.no_grad():
-        tables = hierarchy.tabulate(encode(demonstrations([states]), hierarchy.encoder, hierarchy.scaling))
+        tables = hierarchy.tabulate(encode(demos, hierarchy.encoder, hierarchy.scaling))
     unseen = tuple(torch.where(density.isfinite(), 0.0, density) for density in tables.control)
     return brute_force(replace(tables, control=unseen), 0, len(states))
 
@@ -117,7 +100,7 @@ def test_most_likely_takes_the_mode_of_every_choice():
 
 @pytest.mark.parametrize("seed", range(4))
 def test_marginal_takes_the_choice_that_is_likeliest_given_all_observations(seed):
-    hierarchy = make((4,), ("options", "control"), "linear", seed=seed)
+    hierarchy = make((4,), ("options", "control"), seed=seed)
     states = 2 * torch.randn(4, 3, generator=torch.Generator().manual_seed(seed)).numpy()
     controller = Controller(hierarchy, options="marginal")
     for steps in range(1, 5):
@@ -144,7 +127,7 @@ def test_marginal_adds_up_over_steps_how_likely_it_is_that_an_option_has_ended()
 )
 def test_choices_follow_the_models_latents(counts, emits, network):
     """Over many episodes of three different states, p(h_t) is that of the AHMM without any control seen."""
-    hierarchy = make(counts, emits, network, seed=3)
+    hierarchy = make(counts, emits, network=network, seed=3)
     states = torch.randn(3, 3, generator=torch.Generator().manual_seed(1)).numpy()
     truth = without_controls(hierarchy, states)
     controller, episodes = Controller(hierarchy), 200
@@ -236,29 +219,6 @@ def test_acting_leaves_the_global_randomness_alone():
 # --- observations -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("observation", "message"),
-    [
-        ({"pose": np.zeros(3), "jaw": np.zeros(1)}, r"^the observation has no 'state' \(it has: jaw, pose\)$"),
-        ({"state": np.zeros(4)}, r"^observation 'state' has shape \(4,\), the demonstrations had \(3,\)$"),
-        ({"state": np.zeros((1, 3))}, r"^observation 'state' has shape \(1, 3\), the demonstrations had \(3,\)$"),
-        ({"state": np.array([0, np.nan, 0])}, r"^observation 'state' is not finite$"),
-    ],
-)
-def test_an_observation_that_cannot_be_used_is_refused(observation, message):
-    with pytest.raises(ObservationError, match=message):
-        Controller(make()).act(observation)
-
-
 def test_what_the_networks_do_not_see_is_ignored():
     one, other = Controller(make()), Controller(make())
     np.testing.assert_array_equal(one.act(STATE), other.act(STATE | {"noise": np.array([np.nan])}))
-
-
-def demonstrations(states, actions=None):
-    actions = np.zeros((*np.shape(states)[:2], 2)) if actions is None else actions
-    records = [
-        Demonstration(f"demo_{n}", {"state": state}, action)
-        for n, (state, action) in enumerate(zip(states, actions, strict=True))
-    ]
-    return Demonstrations(tuple(records))

@@ -12,7 +12,7 @@ import onnx
 import pytest
 import torch
 from command_line import call
-from exportable import FITS, RECURRENT, SHAPES, make
+from exportable import FITS, RECURRENT, SHAPES, make, observe
 from user_networks import Remembering
 
 import ddco_pyro
@@ -61,8 +61,7 @@ def compare(exported, original, steps):
         exported.reset(seed)
         original.reset(seed)
         for _ in range(steps):
-            seen = {key: random.normal(size=shape) for key, shape in SHAPES.items()}
-            seen["camera"] = random.integers(0, 256, SHAPES["camera"], dtype=np.uint8)
+            seen = observe(random)
             difference = np.abs(exported.act(seen) - original.act(seen))
             assert (difference < TOLERANCE * np.array([10.0, 1.0])).all()
             assert exported.choices == original.choices
@@ -120,10 +119,7 @@ def test_each_form_runs_without_this_library(exported, form):
     ("observation", "message"),
     [
         ({"visited": np.zeros(1)}, r"the observation has no 'offsets' \(it has: visited\)"),
-        (
-            {"offsets": np.zeros(3), "visited": np.zeros(1)},
-            r"'offsets' has shape \(3,\), the demonst",
-        ),
+        ({"offsets": np.zeros(3), "visited": np.zeros(1)}, r"'offsets' has shape \(3,\), the demonst"),
         ({"offsets": np.full(4, np.nan), "visited": np.zeros(1)}, "'offsets' is not finite"),
         ({"offsets": np.array(list("abcd")), "visited": np.zeros(1)}, "'offsets' is <U1, it has to be numbers"),
     ],
@@ -174,26 +170,25 @@ def damaged(monkeypatch):
     return damaging
 
 
+MANY = make("linear", (200,), options="most_likely")
+LONG = make("per_timestep", (), steps=30)
+
+
 @pytest.mark.parametrize(
-    ("tensor", "by"), [("caller_0.0.bias", 1e-3), ("caller_1.0.bias", np.nan), ("end_0.0.bias", 1e-3)]
+    ("fit", "tensor", "by", "message"),
+    [
+        pytest.param(MANY, "caller_0.0.bias", 1e-3, ".*; with networks", id="policies"),
+        pytest.param(MANY, "caller_1.0.bias", np.nan, ".*; with networks", id="selections"),
+        pytest.param(MANY, "end_0.0.bias", 1e-3, ".*; with networks", id="terminations"),
+        pytest.param(LONG, "caller_0.1.bias", 1e-3, r"1\.0e-03, of 1\.0e-06 that", id="steps"),
+    ],
 )
 @pytest.mark.usefixtures("numpy_alone")
-def test_every_network_of_every_option_is_compared(tensor, by, tmp_path, damaged):
-    """Policies, selections and terminations, though of 200 options most are active in no step."""
+def test_every_network_of_every_option_and_step_is_compared(fit, tensor, by, message, tmp_path, damaged):
+    """Though of 200 options most are active in no step, and of 30 steps' networks the last alone differs."""
     damaged(lambda folder: damage_numpy(folder, tensor, by))
-    with pytest.raises(Failed, match=r"^nothing was written: as numpy it differs from the run by .*; with networks"):
-        export(make("linear", (200,), options="most_likely"), tmp_path / "out")
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.usefixtures("numpy_alone")
-def test_networks_of_every_step_are_compared(tmp_path, damaged):
-    """The last of 30 steps' networks differs."""
-    damaged(lambda folder: damage_numpy(folder, "caller_0.1.bias"))
-    with pytest.raises(
-        Failed, match=r"^nothing was written: as numpy it differs from the run by 1\.0e-03, of 1\.0e-06 that"
-    ):
-        export(make("per_timestep", (), steps=30), tmp_path / "out")
+    with pytest.raises(Failed, match=rf"^nothing was written: as numpy it differs from the run by {message}"):
+        export(fit, tmp_path / "out")
 
 
 @pytest.mark.usefixtures("numpy_alone")
@@ -244,14 +239,14 @@ def test_what_else_is_in_a_folder_is_not_lost(tmp_path):
 
 
 class Inner(torch.nn.Module):
-    """A user's network that is a built-in one."""
+    """A user's network that is a built-in one, and has float32 written into it."""
 
     def __init__(self, network):
         super().__init__()
         self.network = network
 
     def forward(self, inputs):
-        return self.network(inputs)[0]
+        return self.network(inputs.map(torch.Tensor.float, inputs.time))[0]
 
 
 def test_networks_that_numpy_cannot_evaluate_are_compared_as_a_program(tmp_path):
@@ -278,18 +273,10 @@ def test_a_users_state_is_carried_by_programs(place, tmp_path):
 
 
 class Adding(torch.nn.Module):
-    """Adds up what it sees: over a whole demonstration it says something else than step by step."""
+    """Adds up what it sees: it acts otherwise than it was trained, step by step otherwise than at once."""
 
     def forward(self, inputs):
         return inputs.vector.cumsum(1)[..., None, :3]
-
-
-def test_a_network_that_acts_otherwise_than_it_was_trained_is_not_exported(tmp_path):
-    fit = make("linear")
-    fit.hierarchy.meta_policy.network = UserNetwork(Adding(), 3, 1)
-    with pytest.raises(Failed, match=r"^nothing was written: as torch it differs from the run by "):
-        export(fit, tmp_path / "out")
-    assert list(tmp_path.iterdir()) == []
 
 
 class Branching(torch.nn.Module):
@@ -301,10 +288,14 @@ class Branching(torch.nn.Module):
         return -inputs.vector[..., None, :3]
 
 
-def test_networks_that_no_program_can_be_made_of_leave_nothing_behind(tmp_path):
+@pytest.mark.parametrize(
+    ("network", "message"),
+    [(Adding, "as torch it differs from the run by "), (Branching, r"the networks cannot be exported: \w+: .*$")],
+)
+def test_networks_that_act_otherwise_or_make_no_program_leave_nothing_behind(network, message, tmp_path):
     fit = make("linear")
-    fit.hierarchy.meta_policy.network = UserNetwork(Branching(), 3, 1)
-    with pytest.raises(Failed, match=r"^nothing was written: the networks cannot be exported: \w+: .*$"):
+    fit.hierarchy.meta_policy.network = UserNetwork(network(), 3, 1)
+    with pytest.raises(Failed, match=rf"^nothing was written: {message}"):
         export(fit, tmp_path / "out")
     assert list(tmp_path.iterdir()) == []
 
@@ -329,18 +320,22 @@ def steep(gain: float) -> Fit:
     return fit
 
 
-def perceptron(units: int) -> Fit:
-    """A policy with so many hidden units, which acts with its mean."""
+def flat(key: str, shape: tuple[int, ...], policy: dict[str, object]) -> Fit:
+    """A policy of one observation, which acts with its mean."""
     spec = parse_spec(
         {
             "demonstrations": {"path": "unused.hdf5"},
-            "observations": ["state"],
-            "baseline": {"kind": "flat", "policy": {"network": "mlp", "hidden": [units]}},
+            "observations": [key],
+            "baseline": {"kind": "flat", "policy": policy},
             "rollout": {"control": "mean"},
         }
     )
     torch.manual_seed(2)
-    return Fit(spec, Hierarchy(spec, {"state": (5,)}, 2, 7).eval())
+    return Fit(spec, Hierarchy(spec, {key: shape}, 2, 7).eval())
+
+
+def perceptron(units: int) -> Fit:
+    return flat("state", (5,), {"network": "mlp", "hidden": [units]})
 
 
 STEEP = 40.0
@@ -402,33 +397,15 @@ def test_networks_for_float32_alone_have_the_least_tolerance():
     episodes = record(fit.controller(), fit.hierarchy)
     assert tolerance(fit.hierarchy, episodes) > 1e-6
     network = fit.hierarchy.meta_policy.network
-    fit.hierarchy.meta_policy.network = UserNetwork(Single(network), network.features, 1)
+    fit.hierarchy.meta_policy.network = UserNetwork(Inner(network), network.features, 1)
     assert tolerance(fit.hierarchy, episodes) == 1e-6
-
-
-class Single(torch.nn.Module):
-    """A user's network that has float32 written into it."""
-
-    def __init__(self, network):
-        super().__init__()
-        self.network = network
-
-    def forward(self, inputs):
-        return self.network(inputs.map(torch.Tensor.float, inputs.time))[0]
 
 
 @pytest.mark.usefixtures("numpy_alone")
 def test_large_pictures_are_compared_with_few_bytes(tmp_path):
     """60 pictures of 240 kB, in which places are told apart still: each has as many colours as its squares."""
     network = {"network": "conv", "layers": [{"filters": 4, "kernel": 5, "stride": 8}]}
-    spec = parse_spec(
-        {
-            "demonstrations": {"path": "unused.hdf5"},
-            "observations": ["camera"],
-            "baseline": {"kind": "flat", "policy": network},
-        }
-    )
-    module._write(Fit(spec, Hierarchy(spec, {"camera": (250, 331, 3)}, 2, 7).eval()), tmp_path, onnx=False)
+    module._write(flat("camera", (250, 331, 3), network), tmp_path, onnx=False)
     assert (tmp_path / "check.npz").stat().st_size < 1.5e6
     with np.load(tmp_path / "check.npz") as file:
         pictures = file["observation_1_camera"]

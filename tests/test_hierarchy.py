@@ -12,7 +12,6 @@ from torch.distributions import Normal
 from ddco_pyro.inference import log_likelihood
 from ddco_pyro.model.batch import STEPS_AT_ONCE, Batch
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.model.links import TERMINATION_BOUND
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.spec import parse_spec
 
@@ -25,10 +24,8 @@ def test_gradient_is_the_papers_gradient_equation(emits):
         Inputs({"state": batch.inputs.vector.double()}, {}, batch.inputs.time), batch.actions.double(), batch.lengths
     )
     parameters = list(hierarchy.parameters())
-    found = torch.autograd.grad(
-        log_likelihood(hierarchy.tabulate(batch), batch.lengths).sum(), parameters, retain_graph=True
-    )
     tables = hierarchy.tabulate(batch)
+    found = torch.autograd.grad(log_likelihood(tables, batch.lengths).sum(), parameters, retain_graph=True)
     surrogate = torch.zeros((), dtype=torch.float64)
     for n, length in enumerate(batch.lengths.tolist()):
         truth = brute_force(tables, n, length)
@@ -70,17 +67,6 @@ def test_tables_are_normalised(counts, emits):
     assert tables.control[-1].isfinite().all() == ("control" in emits)
 
 
-def test_terminations_keep_their_bound():
-    hierarchy, batch = make_hierarchy((2,)), make_batch()
-    level = hierarchy.levels[0]
-    with torch.no_grad():
-        level.termination.layers[-1].bias[:] = torch.tensor([1e6, -1e6]).reshape(2, 1, 1)
-    psi = hierarchy(batch.inputs).termination[0].exp()[..., 1]
-    bound = torch.tensor(TERMINATION_BOUND)
-    np.testing.assert_allclose(psi[..., 0].detach(), bound.sigmoid(), rtol=1e-5)
-    np.testing.assert_allclose(psi[..., 1].detach(), (-bound).sigmoid(), rtol=1e-3)
-
-
 def test_policy_and_termination_read_the_trunk_of_their_option():
     hierarchy = make_hierarchy((3,), network="linear", trunk={"network": "lstm", "over": {"hidden": [5]}, "hidden": 4})
     batch, level = make_batch(), hierarchy.levels[0]
@@ -94,17 +80,11 @@ def test_policy_and_termination_read_the_trunk_of_their_option():
         weight, bias = head.layers[0].weight, head.layers[0].bias
         expected = torch.stack([features[:, :, k] @ weight[k] + bias[k] for k in range(3)], dim=2)
         torch.testing.assert_close(found, expected)
-    assert [name for name, _ in hierarchy.named_networks()] == [
-        *(f"hierarchy.levels.0.{part}" for part in ("trunk", "policy", "termination")),
-        "hierarchy.meta_policy",
-    ]
-    sizes = [100, 200]
-    bytes_of = [
-        make_hierarchy((3,), network="linear", trunk={"network": "lstm", "hidden": size}).step_bytes for size in sizes
-    ]
-    assert bytes_of[1] == pytest.approx(
-        2 * bytes_of[0], rel=0.1
-    )  # the gates of each step, not weights, which are squares
+    narrow, wide = (
+        make_hierarchy((3,), network="linear", trunk={"network": "lstm", "hidden": size}).step_bytes
+        for size in (100, 200)
+    )
+    assert wide == pytest.approx(2 * narrow, rel=0.1)  # the gates of each step, not weights, which are squares
     assert hierarchy.step_bytes > make_hierarchy((3,), network="linear").step_bytes
 
 

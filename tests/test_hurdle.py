@@ -7,29 +7,20 @@ import pytest
 import torch
 from command_line import call
 from odd_files.atoms import ROWS, at_bounds, no_ops
+from planted import make_spec
 
 import ddco_pyro
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.controls import control_dimensions, control_parts, described
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.exporting import TOLERANCE, export, runner
-from ddco_pyro.spec import ControlSpec, SpecError, load_spec, parse_spec, with_overrides
+from ddco_pyro.spec import ControlSpec, load_spec, with_overrides
 
 
 def spec_of(options=3, epochs=6, path="unused.hdf5", **control):
-    linear = {"network": "linear"}
-    return parse_spec(
-        {
-            "demonstrations": {"path": str(path), "valid_fraction": 0.34},
-            "observations": ["state"],
-            "control": {"std": {"learn": True, "per_option": True}, **control},
-            "hierarchy": {
-                "levels": [{"count": options, "policy": linear, "termination": linear}],
-                "meta_policy": linear,
-            },
-            "training": {"epochs": epochs, "optimizer": {"lr": 0.03}, "initialize": "vq_controls"},
-        }
-    )
+    control = {"std": {"learn": True, "per_option": True}, **control}
+    spec = make_spec((options,), control=control, epochs=epochs, initialize="vq_controls")
+    return with_overrides(spec, {"demonstrations": {"path": str(path), "valid_fraction": 0.34}})
 
 
 # --- without skill ----------------------------------------------------------------------------------------------------
@@ -89,11 +80,6 @@ def test_a_declared_value_may_be_an_extreme():
     assert [part.kind for part in control_parts(ControlSpec(), control_dimensions([controls]))] == ["clipped"]
 
 
-def test_a_dimension_without_such_a_value_is_no_hurdle():
-    with pytest.raises(SpecError, match="control dimension 0 is at no value inside its range in 5 % of the steps"):
-        control_parts(ControlSpec(kind="hurdle"), control_dimensions([np.linspace(-1, 1, 50)[:, None]]))
-
-
 # --- from file to controller ------------------------------------------------------------------------------------------
 
 STILL = float(np.float32(0.3))
@@ -134,12 +120,6 @@ def test_what_was_decided_comes_back_from_the_run(fitted):
         "3": ["binary", 0.0, 1.0],
     }
     assert again.metrics.engine_check.value < 1e-6
-
-
-def test_what_dimensions_add_is_the_likelihood(fitted):
-    each = fitted.metrics.log_likelihood_by_dimension.valid
-    total = fitted.metrics.log_likelihood_per_step.valid
-    assert sum(each.by_dimension) + each.options == pytest.approx(total, rel=1e-6)
 
 
 def test_scaling_keeps_exactly_the_value_apart(fitted):

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 import yaml
 from command_line import call
-from random_demonstrations import demonstrations
 from selecting import DATA, data_at, two_skills
 
 import ddco_pyro
@@ -295,31 +294,16 @@ def test_check_reads_no_observations(commanded: Path, reads: Counter) -> None:
 MOST_BUILDS = 4
 
 
-def make_spec(*baselines):
-    return parse_spec(
-        yaml.safe_load(
-            f"""
-            demonstrations: {{path: unused.hdf5, valid_fraction: 0.2}}
-            observations: [pose]
-            hierarchy:
-              levels: [{{count: 2, policy: {{network: mlp, hidden: [8]}}, termination: {{network: linear}}}}]
-              meta_policy: {{network: linear}}
-            training: {{epochs: 1, layerwise: false, initialize: random}}
-            compare_with: [{", ".join(baselines)}]
-            """
-        )
-    )
-
-
 @pytest.mark.parametrize("baselines", [(), ("flat", "mixture")])
-def test_a_model_is_built_a_few_times(monkeypatch, baselines):
+def test_a_model_is_built_a_few_times(in_memory: ddco_pyro.Fit, monkeypatch, baselines) -> None:
     builds, init = [], Hierarchy.__init__
+    short = {"training.epochs": 1, "training.layerwise": False, "training.initialize": "random"}
+    spec = with_overrides(in_memory.spec, {**short, "compare_with": list(baselines)})
 
     def counted(self, *arguments, **named):
         builds.append(arguments)
         init(self, *arguments, **named)
 
     monkeypatch.setattr(Hierarchy, "__init__", counted)
-    ddco_pyro.fit(make_spec(*baselines), demonstrations(6))
-    print(f"{len(builds)} builds of {1 + len(baselines)} models")
+    ddco_pyro.fit(spec, two_skills())
     assert len(builds) <= MOST_BUILDS * (1 + len(baselines))

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-import yaml
 from hierarchies import make_hierarchy
+from planted import make_spec
+from random_demonstrations import of_states
 
 import ddco_pyro
 from ddco_pyro.acting.monitor import Monitor, run_lengths
@@ -15,13 +16,7 @@ from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.inference import log_likelihood, posterior
 from ddco_pyro.model.batch import encode
 from ddco_pyro.model.encoder import ObservationEncoder
-from ddco_pyro.spec import ObservationSpec, parse_spec
-
-
-def demonstration(steps):
-    rng = np.random.default_rng(0)
-    return Demonstration("demo_0", {"state": rng.normal(size=(steps, 3))}, rng.normal(size=(steps, 2)))
-
+from ddco_pyro.spec import ObservationSpec
 
 WINDOWS = {"network": "lstm", "horizon": 4}
 
@@ -31,10 +26,15 @@ WINDOWS = {"network": "lstm", "horizon": 4}
     [((3,), "mlp"), ((2, 2), "mlp"), ((2, 2), "lstm"), pytest.param((2, 2), WINDOWS, id="windows")],
 )
 def test_what_it_says_at_the_end_is_what_the_demonstration_says(counts, network):
-    """Before the last control is known, the belief is the posterior of the demonstration without that control."""
-    hierarchy, demo = make_hierarchy(counts, ("options", "control"), network), demonstration(6)
+    """Before the last control is known, the belief is the posterior of the demonstration without that control.
+
+    An episode that was broken off before is forgotten.
+    """
+    hierarchy, demo = make_hierarchy(counts, ("options", "control"), network), of_states([6])[0]
     monitor = Monitor(hierarchy)
-    for t in range(6):
+    for t in [0, 1, 2, *range(6)]:
+        if t == 0:
+            monitor.reset()
         belief = monitor.step({"state": demo.observations["state"][t]}, demo.actions[t - 1] if t else None)
     with torch.no_grad():
         batch = encode(Demonstrations([demo]), hierarchy.encoder, hierarchy.scaling)
@@ -47,16 +47,6 @@ def test_what_it_says_at_the_end_is_what_the_demonstration_says(counts, network)
     for d, level in enumerate(belief.levels):
         torch.testing.assert_close(level[0].sum(-1), expected.u[d][0, -1], atol=1e-6, rtol=0)
         torch.testing.assert_close(level[0, :, 1], expected.v[d][0, -1], atol=1e-6, rtol=0)
-
-
-@pytest.mark.parametrize("network", ["mlp", "lstm"])
-def test_reset_forgets(network):
-    hierarchy, demo = make_hierarchy((3,), network=network), demonstration(3)
-    monitor = Monitor(hierarchy)
-    first = monitor.step({"state": demo.observations["state"][0]})
-    monitor.step({"state": demo.observations["state"][1]}, demo.actions[0])
-    monitor.reset()
-    torch.testing.assert_close(monitor.step({"state": demo.observations["state"][0]}).levels, first.levels)
 
 
 def test_the_control_comes_with_every_observation_but_the_first():
@@ -73,16 +63,6 @@ def test_the_control_comes_with_every_observation_but_the_first():
 
 PLANTED = [(1, 6), (2, 3), (3, 4)]
 """Phases, each with its number of steps."""
-SPEC = """
-demonstrations: {path: unused.hdf5}
-observations: [state]
-control: {std: 0.3}
-hierarchy:
-  levels: [{name: skill, count: 3, policy: {network: linear}, termination: {network: linear}}]
-  meta_policy: {network: linear}
-compare_with: []
-training: {epochs: 200, optimizer: {name: em}}
-"""
 
 
 @pytest.fixture(scope="module")
@@ -96,13 +76,14 @@ def phases():
         action = means[phase - 1] + 0.1 * rng.normal(size=(len(phase), 2))
         demos.append(Demonstration(f"demo_{number}", {"state": state}, action))
     demos = Demonstrations(tuple(demos))
-    return ddco_pyro.fit(parse_spec(yaml.safe_load(SPEC)), demos), demos, phase
+    spec = make_spec((3,), control={"std": 0.3}, epochs=200, optimizer={"name": "em"})
+    return ddco_pyro.fit(spec, demos), demos, phase
 
 
 def test_progress_is_the_planted_part_of_each_phase(phases):
     fit, demos, phase = phases
     (found,) = fit.segment(demos)
-    order = list(dict.fromkeys(fit.names["skill"][option] for option in found[0]))
+    order = list(dict.fromkeys(fit.names["level-1"][option] for option in found[0]))
     monitor, demo = fit.monitor(demos), demos[0]
     expected = [
         ((k + (step + 1) / steps) / 3, (step + 1) / steps)
@@ -111,7 +92,7 @@ def test_progress_is_the_planted_part_of_each_phase(phases):
     ]
     for t, (whole, fraction) in enumerate(expected):
         monitor.step({"state": demo.observations["state"][t]}, demo.actions[t - 1] if t else None)
-        progress = monitor.progress({"skill": order})["skill"]
+        progress = monitor.progress({"level-1": order})["level-1"]
         assert progress.name == order[phase[t] - 1]
         assert (progress.fraction, progress.whole) == (pytest.approx(fraction), pytest.approx(whole))
     monitor.reset()
@@ -122,12 +103,12 @@ def test_the_expected_length_grows_with_what_a_run_has_outlasted(phases):
     """Runs of 4 or 8 steps: 6 expected, and 8 once a fifth step has come; past the longest, all of it."""
     fit, demos, _ = phases
     lengths = [np.array([4, 4, 8, 8])] * 4
-    monitor = Monitor(fit.hierarchy, fit.names, {"skill": lengths})
+    monitor = Monitor(fit.hierarchy, fit.names, {"level-1": lengths})
     fractions = []
     for t in range(10):
         state = demos[0].observations["state"][0]
         monitor.step({"state": state}, demos[0].actions[0] if t else None)
-        fractions.append(monitor.progress()["skill"].fraction)
+        fractions.append(monitor.progress()["level-1"].fraction)
     assert fractions == pytest.approx([a / 6 for a in range(1, 5)] + [a / 8 for a in range(5, 9)] + [1.0, 1.0])
 
 
@@ -135,7 +116,7 @@ def test_without_demonstrations_no_fraction_is_known(phases):
     fit, demos, _ = phases
     monitor = fit.monitor()
     monitor.step({"state": demos[0].observations["state"][0]})
-    assert monitor.progress({"skill": fit.names["skill"]})["skill"][2:] == (1, None, None)
+    assert monitor.progress({"level-1": fit.names["level-1"]})["level-1"][2:] == (1, None, None)
 
 
 def test_runs_end_where_the_choice_changes_and_with_the_demonstration():
@@ -170,9 +151,10 @@ def test_steps_are_those_of_the_whole_demonstration(differences):
 @pytest.mark.parametrize(
     ("observation", "message"),
     [
-        ({"other": np.zeros(2)}, r"has no 'state' \(it has: other\)"),
-        ({"state": np.zeros(3)}, r"'state' has shape \(3,\), the demonstrations had \(2,\)"),
-        ({"state": np.array([0.0, np.nan])}, "'state' is not finite"),
+        ({"pose": np.zeros(2), "jaw": np.zeros(1)}, r"^the observation has no 'state' \(it has: jaw, pose\)$"),
+        ({"state": np.zeros(3)}, r"^observation 'state' has shape \(3,\), the demonstrations had \(2,\)$"),
+        ({"state": np.zeros((1, 2))}, r"^observation 'state' has shape \(1, 2\), the demonstrations had \(2,\)$"),
+        ({"state": np.array([0.0, np.nan])}, r"^observation 'state' is not finite$"),
     ],
 )
 def test_what_cannot_be_used_is_refused_and_leaves_the_window_as_it_was(observation, message):

@@ -12,7 +12,7 @@ from oracle import paths, random_tables
 from pyro.infer import TraceEnum_ELBO, infer_discrete
 from scipy import stats
 
-from ddco_pyro.inference import most_likely_path, posterior, sample_paths
+from ddco_pyro.inference import most_likely_path, posterior, sample_paths, segment
 from ddco_pyro.inference.enumeration import known_controls
 from ddco_pyro.model.ahmm import ahmm
 from ddco_pyro.model.tables import NEVER, Tables, complete
@@ -23,6 +23,11 @@ CASES = [
     ((2, 2), (True, False), 3),
     ((2, 1), (False, True), 3),
     ((2, 1, 2), (True, True, True), 2),
+    ((3,), (True,), 4),
+    ((2, 2), (False, False), 3),
+    ((2, 2), (True, True), 3),
+    ((1, 2, 1), (False, True, False), 2),
+    ((2, 1, 2), (False, False, False), 2),
 ]
 
 
@@ -44,6 +49,7 @@ def test_the_most_likely_path_has_the_largest_probability(counts, hybrid, steps)
         best = max(every, key=lambda one: one[2])
         assert as_tuples(found, n, length) == best[:2]
         assert all((level[n, length:] == -1).all() for level in (*found.choices, *found.terminations))
+    assert all(map(torch.equal, segment(tables, lengths), found.choices))
 
 
 def test_of_equally_likely_paths_the_one_that_keeps_the_lowest_choices():

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import exportable
 import numpy as np
 import pytest
 import torch
+from exportable import SHAPES, observe
 
 import ddco_pyro
 from ddco_pyro.acting.controller import Controller
@@ -12,44 +14,22 @@ from ddco_pyro.acting.saliency import Looking, Saliency
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.drawing.colours import HEIGHT, with_heat
 from ddco_pyro.evaluation.branch_use import branch_use
-from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.report import write_report
 from ddco_pyro.spec import parse_spec
 
-SHAPES = {"camera": (10, 8, 3), "pose": (2,)}
 CONV = {"network": "conv", "filters": 3, "kernel": 3, "pool": "spatial_softmax", "hidden": [6]}
 LSTM = {"network": "lstm", "over": CONV, "hidden": 4}
+HEADS = {"policy": {"network": "linear"}, "termination": {"network": "linear"}}
 STEPS = 4
 
 
 def make(trunk, emits):
-    spec = parse_spec(
-        {
-            "demonstrations": {"path": "unused.hdf5"},
-            "observations": [{"key": "camera", "frames": 2}, "pose"],
-            "hierarchy": {
-                "levels": [
-                    {
-                        "count": 2,
-                        "trunk": trunk,
-                        "policy": {"network": "linear"},
-                        "termination": {"network": "linear"},
-                    }
-                ],
-                "meta_policy": {**trunk, "emits": emits},
-            },
-        }
-    )
-    torch.manual_seed(0)
-    return Hierarchy(spec, SHAPES, 3, steps=STEPS).eval()
+    return exportable.make("linear", (2,), emits, {"frames": 2}, STEPS, trunk=trunk, meta_policy=trunk).hierarchy
 
 
 def episode(seed=0):
     random = np.random.default_rng(seed)
-    return [
-        {"camera": random.integers(0, 256, SHAPES["camera"], dtype=np.uint8), "pose": random.normal(size=2)}
-        for _ in range(STEPS)
-    ]
+    return [observe(random) for _ in range(STEPS)]
 
 
 def control(hierarchy, observations, changed, choice):
@@ -74,10 +54,10 @@ def test_saliency_is_the_size_of_small_differences(trunk, choice):
     look = saliency.step(seen[-1], (choice,))["camera"]
     np.testing.assert_array_equal(look.picture, seen[-1]["camera"])
     exact = hierarchy.double()
-    for row, column in [(0, 0), (4, 5), (9, 7), (5, 2)]:
+    for row, column in [(0, 0), (4, 5), (8, 11), (5, 2)]:
         squared = 0.0
         for colour in range(6):
-            change = np.zeros((10, 8, 6))
+            change = np.zeros((9, 12, 6))
             change[row, column, colour] = 1e-4
             ends = [control(exact, seen, sign * change, choice) for sign in (1, -1)]
             squared += np.square((ends[0] - ends[1]) / 2e-4).sum()
@@ -86,7 +66,7 @@ def test_saliency_is_the_size_of_small_differences(trunk, choice):
 
 
 def test_what_a_policy_does_not_read_has_none():
-    hierarchy = make({"network": "mlp", "inputs": ["pose"]}, ["options"])
+    hierarchy = make({"network": "mlp", "inputs": ["goal"]}, ["options"])
     assert not Saliency(hierarchy).step(episode()[0], (1,))["camera"].saliency.any()
 
 
@@ -98,7 +78,7 @@ def test_a_controller_that_is_looked_at_acts_as_it_does():
     for observation in episode(1):
         np.testing.assert_array_equal(looking.act(observation), alone.act(observation))
         assert looking.choices == alone.choices
-    assert [frame.shape for frame in looking.frames] == [(HEIGHT, 192, 3)] * STEPS
+    assert [frame.shape for frame in looking.frames] == [(HEIGHT, HEIGHT * 4 // 3, 3)] * STEPS
 
 
 def test_colours_are_where_the_values_are():
@@ -149,7 +129,7 @@ def spec_of(level, trunk):
 def fitted(request, tmp_path_factory):
     level = {} if request.param == "whole" else {request.param: BRANCHES}
     if request.param != "policy":
-        level |= {"policy": {"network": "linear"}, "termination": {"network": "linear"}}
+        level |= HEADS
     out = tmp_path_factory.mktemp("runs") / request.param
     return ddco_pyro.fit(spec_of(level, BRANCHES if request.param == "whole" else None), demonstrations(), out=out)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from types import MappingProxyType
 
+import numpy as np
 import torch
 from hierarchies import varied
 
@@ -72,6 +73,12 @@ def make(
     return Fit(spec, varied(hierarchy).eval())
 
 
+def observe(random):
+    """A random observation."""
+    seen = {key: random.normal(size=shape) for key, shape in SHAPES.items()}
+    return seen | {"camera": random.integers(0, 256, SHAPES["camera"], dtype=np.uint8)}
+
+
 CONVOLUTIONS = {
     "network": "conv",
     "inputs": ["camera", "state"],
@@ -91,43 +98,28 @@ BRANCHES = {
     },
     "hidden": [7],
 }
+SMALL = {"camera": {"resize": [7, 6], "grey": True, "frames": 2}, "built_in": ("step",)}
+BOTH = ("options", "control")
 FITS = {
     "linear": make("linear", options="most_likely"),
     "mlp": make("mlp", control="sample", options="sample"),
     "per_timestep": make("per_timestep", steps=30),
     "bins": make("mlp", bins=4),
     "conv": make("conv", camera={"crop": [1, 2, 7, 9], "resize": [6, 8], "frames": 3}, options="sample"),
-    "hybrid": make("mlp", (2, 3), ("options", "control"), control="sample"),
-    "σ of the state": make(
-        "mlp", (2, 3), ("options", "control"), std={"learn": True, "per_state": True}, control="sample"
-    ),
-    "three levels": make("mlp", (2, 3, 2), ("options", "control")),
-    "mixture": make("mlp", (3,), ("options", "control"), endings="always", control="sample", options="sample"),
+    "hybrid": make("mlp", (2, 3), BOTH, control="sample"),
+    "σ of the state": make("mlp", (2, 3), BOTH, std={"learn": True, "per_state": True}, control="sample"),
+    "three levels": make("mlp", (2, 3, 2), BOTH),
+    "mixture": make("mlp", (3,), BOTH, endings="always", control="sample", options="sample"),
     "memoryless below": make("mlp", (2, 3), endings="always", options="marginal"),
-    "marginal": make("mlp", (2, 3, 2), ("options", "control"), options="marginal"),
+    "marginal": make("mlp", (2, 3, 2), BOTH, options="marginal"),
     "flat": make("mlp", (), built_in=("step",)),
-    "lstm": make(RECURRENT, (2, 2), ("options", "control"), endings=RECURRENT, control="sample"),
+    "lstm": make(RECURRENT, (2, 2), BOTH, endings=RECURRENT, control="sample"),
     "lstm over pictures": make(
         {"network": "lstm", "over": CONVOLUTIONS}, camera=True, endings=CONVOLUTIONS, steps=30, options="sample"
     ),
-    "trunk": make(
-        "linear",
-        (2, 3),
-        ("options", "control"),
-        {"resize": [7, 6], "grey": True, "frames": 2},
-        trunk=BRANCHES,
-        meta_policy=BRANCHES,
-        built_in=("step",),
-    ),
+    "trunk": make("linear", (2, 3), BOTH, trunk=BRANCHES, meta_policy=BRANCHES, **SMALL),
     "read by all": make(
-        "linear",
-        (2, 3),
-        ("options", "control"),
-        {"resize": [7, 6], "grey": True, "frames": 2},
-        trunk={"network": "mlp", "hidden": [5]},
-        whole=BRANCHES,
-        built_in=("step",),
-        options="sample",
+        "linear", (2, 3), BOTH, trunk={"network": "mlp", "hidden": [5]}, whole=BRANCHES, options="sample", **SMALL
     ),
     "pictures alone": make(LEAKY, camera=True, endings=LEAKY, vectors=False, options="sample"),
     "several convolutions": make(

@@ -59,9 +59,9 @@ class Line(dm_env.Environment):
     def moved(self) -> None:
         """Change ``direction``, 1 or -1, and what else the last move changes."""
 
-    @abstractmethod
     def seen(self) -> list[float]:
         """What is observed where the intention is hidden."""
+        return [self.position]
 
     def odds(self) -> float:
         """How often the supervisor's direction is 1 where it sees what is seen now."""
@@ -97,9 +97,6 @@ class ThereAndBack(Line):
     @property
     def arrived(self) -> bool:
         return self.been_there and self.position < 0
-
-    def seen(self) -> list[float]:
-        return [self.position]
 
     def odds(self) -> float:
         return 1.0 if self.position < 0 else 0.0 if self.position > 1 else 0.5
@@ -167,9 +164,6 @@ class TwoGoals(Line):
     @property
     def arrived(self) -> bool:
         return self.visited == {-1, 0, 1}
-
-    def seen(self) -> list[float]:
-        return [self.position]
 
     def odds(self) -> float:
         outwards = 2 / 3 if abs(self.position) < 0.75 else 0.5 if abs(self.position) < 1 else 0.0

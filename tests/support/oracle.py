@@ -46,7 +46,6 @@ class Truth:
     """Sums over every path of one trajectory; ``u``, ``v``, ``w``: [level][t][choice]."""
 
     log_likelihood: float
-    best: tuple[tuple[int, ...], ...]
     u: list[np.ndarray] = field(default_factory=list)
     v: list[np.ndarray] = field(default_factory=list)
     w: list[np.ndarray] = field(default_factory=list)
@@ -56,11 +55,9 @@ def brute_force(tables: Tables, n: int, length: int) -> Truth:
     """p(ξ_n) and the marginals of §4.1 by summing over all (b, h) paths."""
     sizes = [table.shape[-1] for table in tables.selection]
     u, v, w = ([[[0.0] * size for _ in range(length)] for size in sizes] for _ in range(3))
-    total, likeliest, best = 0.0, 0.0, ()
+    total = 0.0
     for path, ends, probability in paths(tables, n, length, sizes):
         total += probability
-        if probability > likeliest:
-            likeliest, best = probability, path
         for t in range(length):
             for d, h in enumerate(path[t]):
                 u[d][t][h] += probability
@@ -68,7 +65,7 @@ def brute_force(tables: Tables, n: int, length: int) -> Truth:
                     v[d][t][h] += probability
                 if t + 1 < length and not ends[t + 1][d]:
                     w[d][t][h] += probability
-    return Truth(math.log(total), best, *([np.array(table) / total for table in part] for part in (u, v, w)))
+    return Truth(math.log(total), *([np.array(table) / total for table in part] for part in (u, v, w)))
 
 
 Path = tuple[tuple[int, ...], ...]
