@@ -45,18 +45,17 @@ def hierarchy(network: str, dtype: torch.dtype = torch.float64) -> Hierarchy:
     own = dict(NETWORKS[network])
     whole = own.pop("whole", None)
     reads: dict[str, Any] = {"network": "mlp", "inputs": [] if whole else ["state"]}
-    level = {"policy": {"network": "linear"}, "termination": {"network": "linear"}, **own}
+    lower = {"name": "lower", "count": 3, "policy": {"network": "linear"}, **own}
     if "trunk" not in own:
-        level["termination"] = reads
+        lower["termination"] = reads
     upper = {"name": "upper", "count": 2, "policy": reads, "termination": reads}
     meta = reads if whole else {"network": "lstm", "over": reads, "hidden": 3}
-    levels = [{"name": "lower", "count": 3, **level}, upper]
     spec = parse_spec(
         {
             "demonstrations": {"path": "unused.hdf5"},
             "observations": list(SHAPES),
             "control": {"std": {"learn": True}},
-            "hierarchy": {"trunk": whole, "levels": levels, "meta_policy": meta},
+            "hierarchy": {"trunk": whole, "levels": [lower, upper], "meta_policy": meta},
         }
     )
     torch.manual_seed(0)
