@@ -14,14 +14,14 @@ import torch
 import yaml
 from command_line import call
 from elsewhere import THERE, Device, Elsewhere
-from planted import numbered
+from planted import numbered, small_spec
 
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.pictures import padded
 from ddco_pyro.exporting import export
 from ddco_pyro.model.networks.conv import _field_means
-from ddco_pyro.spec import Spec, parse_spec
+from ddco_pyro.spec import Spec
 from ddco_pyro.training import devices
 from ddco_pyro.training.networks import Dimensions, build_hierarchy
 from ddco_pyro.training.restarts import OtherDevice
@@ -69,14 +69,12 @@ def demos() -> Demonstrations:
 
 def spec_of(level: dict[str, Any], **training: Any) -> Spec:
     own = {"epochs": 3, "batch_size": 3, "clip_gradient": 1.0, "average": 0.5, "layerwise": False}
-    return parse_spec(
-        {
-            "demonstrations": {"path": "unused.hdf5", "valid_fraction": 0.2},
-            "observations": ["pose", {"key": "camera", "augment": {"shift": 1}}],
-            "control": {"std": {"learn": True}},
-            "hierarchy": {"levels": [{"count": 2, **level}], "meta_policy": LINEAR},
-            "training": own | training,
-        }
+    return small_spec(
+        demonstrations={"path": "unused.hdf5", "valid_fraction": 0.2},
+        observations=["pose", {"key": "camera", "augment": {"shift": 1}}],
+        control={"std": {"learn": True}},
+        hierarchy={"levels": [{"count": 2, **level}], "meta_policy": LINEAR},
+        training=own | training,
     )
 
 

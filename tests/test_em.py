@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from hierarchies import SHAPES, make_batch
-from planted import LINEAR, make_trainer, spec_of
+from planted import LINEAR, make_trainer, small_spec
 from random_demonstrations import demonstrations
 from scipy import optimize, stats
 from sklearn.linear_model import LogisticRegression
@@ -67,7 +67,7 @@ def linear(counts, parts=None, emits=("options",), memoryless=(), **control):
         ]
         whole["hierarchy"] = {"levels": levels, "meta_policy": caller}
     torch.manual_seed(0)
-    return Hierarchy(spec_of(counts, **whole), SHAPES, 2, steps=9, parts=parts)
+    return Hierarchy(small_spec(counts, **whole), SHAPES, 2, steps=9, parts=parts)
 
 
 def score(tables, piece, rows=None):
@@ -283,8 +283,8 @@ def test_a_dead_option_keeps_finite_weights():
     assert all(bool(torch.isfinite(one).all()) for one in model.parameters())
 
 
-def small_spec(**training):
-    return spec_of(
+def em_spec(**training):
+    return small_spec(
         demonstrations={"path": "unused.hdf5", "valid_fraction": 0.2},
         observations=["pose"],
         control={"std": {**LEARNED, "per_option": True}},
@@ -294,7 +294,7 @@ def small_spec(**training):
 
 
 def test_a_fit_by_em_says_so_and_trains_what_is_not_linear_by_gradients():
-    fit = ddco_pyro.fit(small_spec(), demonstrations(12))
+    fit = ddco_pyro.fit(em_spec(), demonstrations(12))
     trained = fit.metrics.trainings
     assert {name: one.by_em for name, one in trained.items()} == {"ddco": True, "mixture": True, "flat": False}
     assert trained["ddco"].spent.gradient_steps == trained["ddco"].spent.epochs
@@ -306,7 +306,7 @@ def test_a_fit_by_em_says_so_and_trains_what_is_not_linear_by_gradients():
 
 def flat_spec(kind="flat", **control):
     baseline = {"kind": kind, "policy": {"network": "mlp", "hidden": [4] if kind == "flat" else []}}
-    own = small_spec().model_dump(exclude_unset=True)
+    own = em_spec().model_dump(exclude_unset=True)
     return parse_spec({**own, "hierarchy": None, "compare_with": [], "baseline": baseline, "control": control})
 
 
@@ -332,7 +332,7 @@ def test_a_flat_policy_for_each_time_step_is_least_squares_at_that_step():
 
 @pytest.mark.parametrize("initialize", ["vq", "cuts", "mixture", "flat"])
 def test_a_fit_that_is_interrupted_has_the_same_bits(tmp_path, initialize):
-    spec = flat_spec(std=LEARNED) if initialize == "flat" else small_spec(initialize=initialize)
+    spec = flat_spec(std=LEARNED) if initialize == "flat" else em_spec(initialize=initialize)
     spec = with_overrides(spec, {"training.epochs": 15})
     whole, cut = (make_trainer(spec, demonstrations(12), tmp_path / name).data for name in ("whole", "cut"))
     expected = train(whole, Restart(Progress(0)))
@@ -351,10 +351,10 @@ def test_a_fit_that_is_interrupted_has_the_same_bits(tmp_path, initialize):
 def test_a_spec_that_em_would_not_follow_is_refused():
     seen = [{"key": "pose", "augment": {"versions": "others"}}]
     with pytest.raises(SpecError, match=r"observations\.0\.augment\.versions: em sees"):
-        with_overrides(small_spec(), {"observations": seen})
+        with_overrides(em_spec(), {"observations": seen})
     for key, value in (("training.average", 0.9), ("training.clip_gradient", 1.0), ("training.optimizer.warmup", 2)):
         with pytest.raises(SpecError, match=f"{key}: em"):
-            with_overrides(small_spec(), {key: value})
+            with_overrides(em_spec(), {key: value})
 
 
 def test_linear_networks_are_trained_by_em_unless_the_spec_asks_for_gradient_steps():
@@ -362,7 +362,7 @@ def test_linear_networks_are_trained_by_em_unless_the_spec_asks_for_gradient_ste
     own = {"levels": [level], "meta_policy": LINEAR}
 
     def chosen(counts=(2,), **sections):
-        return spec_of(counts, **sections).training.optimizer.name
+        return small_spec(counts, **sections).training.optimizer.name
 
     assert chosen() == chosen(()) == chosen(training={"optimizer": {"ridge": {"policy": 2}}}) == "em"
     for asked in ({"optimizer": {"lr": 0.1}}, {"optimizer": {"name": "adam"}}, {"average": 0.9}, {"clip_gradient": 1}):
@@ -383,7 +383,7 @@ def test_tuning_demonstrations_decide_nothing_before_the_last_stage():
     """One tuning demonstration likes the beginning of a stage better than its end, where few train; segments then get
     lost.
     """
-    spec, demos = small_spec(initialize="vq_controls", epochs=None, patience=3), demonstrations(9)
+    spec, demos = em_spec(initialize="vq_controls", epochs=None, patience=3), demonstrations(9)
     train_with, histories = demos.select(demos.names[:6]), []
     for tuned_by in demos.names[6:]:
         trainer = Trainer(spec, Dimensions.of(train_with), train_with, demos.select([tuned_by]))

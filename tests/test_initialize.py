@@ -8,7 +8,7 @@ from collections import Counter
 import numpy as np
 import pytest
 import torch
-from planted import LINEAR, make_trainer, numbered, spec_of
+from planted import LINEAR, make_trainer, numbered, small_spec
 from sklearn.metrics import adjusted_rand_score
 
 from ddco_pyro.model.batch import Batch
@@ -114,7 +114,7 @@ def test_what_policies_of_options_do_not_read_does_not_begin_them(read, found):
     each = [{key: parts[key][number] for key in parts} for number in range(len(LENGTHS))]
     demos = numbered((one, np.arange(len(one["quiet"]))[:, None]) for one in each)
     training = {"initialize": "vq", "tune_fraction": 0.3, "optimizer": {"name": "adam"}}
-    spec = spec_of(policy=LINEAR | {"inputs": read}, observations=["quiet", "loud"], training=training)
+    spec = small_spec(policy=LINEAR | {"inputs": read}, observations=["quiet", "loud"], training=training)
     material = make_trainer(spec, demos, None).data
     objective = Objective(material, Progress(0), plan(spec, 1)[0])
     known = [int(name.removeprefix("demo_")) for name in material.names]
@@ -221,7 +221,7 @@ def test_further_restarts_have_other_clusters_than_the_best_of_ten():
     heaps = 3.0 * np.stack(np.meshgrid(range(3), range(3)), -1).reshape(9, 2)
     places = heaps[random.integers(0, 9, 240)] + 0.1 * random.normal(size=(240, 2))
     demos = numbered(({"state": rows}, 0.1 * random.normal(size=(40, 1))) for rows in np.split(places, 6))
-    spec = spec_of((9,), training={"restarts": 6, "optimizer": {"name": "adam"}})
+    spec = small_spec((9,), training={"restarts": 6, "optimizer": {"name": "adam"}})
     data = make_trainer(spec, demos, None).data
 
     def clusters(restart):

@@ -12,7 +12,7 @@ import pytest
 import torch
 from command_line import call
 from oracle import paths
-from planted import CONTROL, make_spec, make_trainer, make_truth, numbered, plant, spec_of, tabulated
+from planted import CONTROL, make_spec, make_trainer, make_truth, numbered, plant, small_spec, tabulated
 from sklearn.metrics import normalized_mutual_info_score
 
 import ddco_pyro
@@ -309,7 +309,7 @@ def test_each_level_is_measured_with_its_own_labels(tmp_path, monkeypatch, label
     monkeypatch.chdir(tmp_path)
     demonstrations().write(tmp_path / "demos.hdf5")
     files = {"path": "demos.hdf5", "labels": labels, "valid_fraction": 0.34}
-    spec = spec_of((3, 2), demonstrations=files, training={"epochs": 3, "layerwise": False})
+    spec = small_spec((3, 2), demonstrations=files, training={"epochs": 3, "layerwise": False})
     fit = ddco_pyro.fit(spec, out=tmp_path / "run")
     metrics = fit.metrics.agreement
     assert metrics.labels == names

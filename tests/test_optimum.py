@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from planted import numbered, spec_of
+from planted import numbered, small_spec
 from scipy import stats
 
 from ddco_pyro.fitting.fit import fit
@@ -34,7 +34,7 @@ def drawn(number=16):
 @pytest.fixture(scope="module")
 def flat():
     """A flat linear policy with a fixed deviation, and the demonstrations that it was fitted to."""
-    spec = spec_of(
+    spec = small_spec(
         (),
         demonstrations={"path": "unused.hdf5", "valid_fraction": 0},
         observations=[{"key": "pose", "differences": True}, "goal"],
@@ -97,7 +97,7 @@ def skills(number=16, steps=12):
 @pytest.fixture(scope="module")
 def options():
     """Runs of a hierarchy with linear options, after one epoch and at the end, and their training demonstrations."""
-    spec = spec_of(
+    spec = small_spec(
         demonstrations={"path": "unused.hdf5", "valid_fraction": 0},
         observations=["place", "turn"],
         control={"std": 0.3},

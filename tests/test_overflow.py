@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from command_line import call
-from planted import spec_of
+from planted import small_spec
 from random_demonstrations import of_states
 
 from ddco_pyro.fitting.evaluation import NotFinite, evaluate
@@ -109,14 +109,14 @@ class Undefined(torch.nn.Module):
 
 
 def test_networks_that_give_no_numbers_are_named_before_training() -> None:
-    spec = spec_of(policy={"network": f"{__name__}:Undefined"})
+    spec = small_spec(policy={"network": f"{__name__}:Undefined"})
     with pytest.raises(TrainingError, match="before any training a network gives values that are NaN or infinite; loo"):
         fit(spec, of_states([5] * 5))
 
 
 def test_a_likelihood_that_is_none_is_not_reported(tmp_path: Path) -> None:
     demos = of_states([5] * 5)
-    found = fit(spec_of(training={"epochs": 1}), demos, out=tmp_path / "run")
+    found = fit(small_spec(training={"epochs": 1}), demos, out=tmp_path / "run")
     with torch.no_grad():
         next(found.hierarchy.levels[0].policy.parameters())[:] = torch.inf
     with pytest.raises(NotFinite, match=r"run: the log-likelihood of demo_0 under the fitted model is (nan|-inf); "):

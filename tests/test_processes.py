@@ -21,7 +21,7 @@ import pytest
 import torch
 from command_line import Ended, call
 from killing import struck
-from planted import spec_of
+from planted import small_spec
 from random_demonstrations import of_states
 
 from ddco_pyro.data.files import only_one
@@ -47,7 +47,7 @@ TRAINING = {"shards": 4, "batch_size": 5, "epochs": 16, "restarts": 2, "halving"
 
 def make_spec(path="unused.hdf5", **training):
     control, training = {"std": 0.5, "scale": "none"}, {**TRAINING, **training}
-    return spec_of(policy=DROPPING, demonstrations={"path": str(path)}, control=control, training=training)
+    return small_spec(policy=DROPPING, demonstrations={"path": str(path)}, control=control, training=training)
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 import user_networks
-from planted import make_spec, make_trainer, spec_of
+from planted import make_spec, make_trainer, small_spec
 from random_demonstrations import of_states
 from sklearn.metrics import normalized_mutual_info_score
 
@@ -226,7 +226,7 @@ def diverging(passes, **training):
     """Restarts of which those that begin with a positive weight have that many passes before they give NaN."""
     policy = {"network": "user_networks:Diverging", "options": {"passes": passes}}
     own = {"restarts": 6, "halving": 3, "epochs": 12, "patience": None, "tune_fraction": 0.2, **training}
-    return spec_of((), policy, control={"std": 1.0, "scale": "none"}, training=own)
+    return small_spec((), policy, control={"std": 1.0, "scale": "none"}, training=own)
 
 
 def diverged(trainer):

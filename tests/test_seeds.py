@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 from command_line import call, with_set
-from planted import LINEAR, numbered, spec_of
+from planted import LINEAR, numbered, small_spec
 from scipy import stats
 
 import ddco_pyro
@@ -165,7 +165,7 @@ def test_what_cannot_be_repeated_is_refused_before_any_work(written, tmp_path, c
 
 
 def few_spec():
-    return spec_of(
+    return small_spec(
         demonstrations={"path": "unused.hdf5", "leave_one_out": True, "labels": "skill"},
         control={"std": {"learn": True, "floor": 0.01, "per_option": True}},
         compare_with=[{"kind": "flat", "policy": LINEAR}],

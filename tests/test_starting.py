@@ -63,11 +63,9 @@ def short_of_the_truth(fit: ddco_pyro.Fit) -> float:
 
 @pytest.mark.slow
 @pytest.mark.xfail(strict=True, reason="of 156 steps, ridges of 1 take 0.2 nats per step")
-def test_what_it_writes_is_as_likely_by_em_as_the_truth(path: Path, tmp_path: Path) -> None:
+def test_what_it_writes_is_as_likely_by_em_as_the_truth(path: Path) -> None:
     two_skills(path)
-    spec = tmp_path / "spec.yaml"
-    assert call("init", path, "--out", spec).status == 0
-    assert short_of_the_truth(ddco_pyro.fit(load_spec(spec, ["compare_with=[]"]))) < 0.1
+    assert short_of_the_truth(ddco_pyro.fit(load_spec(started(path), ["compare_with=[]"]))) < 0.1
 
 
 @pytest.mark.slow
@@ -95,8 +93,7 @@ def test_what_it_writes_finds_what_was_planted_as_it_is(path: Path, tmp_path: Pa
 def test_what_it_writes_lets_every_method_converge(tmp_path: Path) -> None:
     """Two-valued and constant controls are what took longest."""
     planted().write(tmp_path / "gripper.hdf5")
-    assert call("init", tmp_path / "gripper.hdf5", "--out", tmp_path / "spec.yaml").status == 0
-    ended = call("fit", tmp_path / "spec.yaml", "--out", tmp_path / "run")
+    ended = call("fit", started(tmp_path / "gripper.hdf5"), "--out", tmp_path / "run")
     assert ended.status == 0, ended.err
     metrics = ddco_pyro.load(tmp_path / "run").metrics
     trainings = metrics.trainings.values()
@@ -159,14 +156,14 @@ def test_pictures_alone_are_seen_by_one_network(tmp_path: Path) -> None:
         seen = {name: random.integers(0, 256, (5, *size, 3), dtype=np.uint8) for name, size in CAMERAS.items()}
         records.append((seen, random.normal(size=(5, 2))))
     numbered(records).write(tmp_path / "seen.hdf5")
-    assert call("init", tmp_path / "seen.hdf5", "--out", tmp_path / "spec.yaml").status == 0
-    spec = load_spec(tmp_path / "spec.yaml")
+    written = started(tmp_path / "seen.hdf5")
+    spec = load_spec(written)
     assert [(one.key, one.resize, one.augment and one.augment.shift) for one in spec.observations] == [
         ("2nd eye", None, None),
         ("eye", (32, 64), 3),
     ]
     assert set(spec.hierarchy.trunk.of) == set(CAMERAS)
-    fit = ddco_pyro.fit(load_spec(tmp_path / "spec.yaml", ["training.epochs=2"]))
+    fit = ddco_pyro.fit(load_spec(written, ["training.epochs=2"]))
     assert list(fit.baselines) == ["mixture", "flat_equal"]
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from hierarchies import make_batch, make_hierarchy, varied
-from planted import LINEAR, numbered, spec_of
+from planted import LINEAR, numbered, small_spec
 from scipy import stats
 
 import ddco_pyro
@@ -71,7 +71,7 @@ def test_at_first_it_is_the_same_everywhere(network):
 def test_dimensions_with_other_sigmas_stand_beside():
     """One of the state, one of each option, one fixed."""
     parts = [{"name": "a", "dims": [2], "std": OF_STATE}, {"name": "b", "dims": [0], "std": OF_OPTION}]
-    spec = spec_of(control={"std": 0.3, "parts": parts})
+    spec = small_spec(control={"std": 0.3, "parts": parts})
     hierarchy, batch = varied(Hierarchy(spec, {"state": (3,)}, 3, 4)), make_batch()
     with torch.no_grad():
         hierarchy.levels[0].policy.std.raw_own[1] += 1
@@ -109,7 +109,7 @@ def flat_spec(**changes):
         "control": {"std": {**OF_STATE, "floor": 0.02}, "scale": "none", "kind": "gaussian"},
         "training": {"epochs": 150, "optimizer": {"lr": 0.03}, "batch_size": 24},
     }
-    return spec_of((), **sections | changes)
+    return small_spec((), **sections | changes)
 
 
 @pytest.fixture(scope="module")
@@ -172,7 +172,7 @@ def test_without_skill_options_lead_by_their_sigma_alone():
 
 def test_flat_equal_counts_the_numbers_for_sigma():
     compare_with, control = ["flat_equal", {"kind": "flat_equal", "std": OF_STATE}], {"std": OF_OPTION}
-    spec = spec_of(control=control, hierarchy={"levels": [{"count": 3}]}, compare_with=compare_with)
+    spec = small_spec(control=control, hierarchy={"levels": [{"count": 3}]}, compare_with=compare_with)
     size = Dimensions({"state": (2,)}, 2, 25)
     whole = parameters(build_hierarchy(spec, size))
     one, of_state = (baseline_spec(spec, baseline, size) for baseline in spec.compare_with)

@@ -26,7 +26,7 @@ def numbered(each):
     return Demonstrations(tuple(Demonstration(f"demo_{n}", *one) for n, one in enumerate(each)))
 
 
-def spec_of(counts=(2,), policy=LINEAR, **sections):
+def small_spec(counts=(2,), policy=LINEAR, **sections):
     """Levels whose policies are of one kind, terminations and meta-policy linear; no counts: a flat policy."""
     levels = [{"name": f"level-{d}", "count": k, "policy": policy} for d, k in enumerate(counts, 1)]
     flat = {"baseline": {"kind": "flat", "policy": policy}}
@@ -42,7 +42,7 @@ def spec_of(counts=(2,), policy=LINEAR, **sections):
 
 def make_spec(counts=(2,), seed=0, control=None, **training):
     training = {"optimizer": {"lr": 0.03}, "epochs": 20, **training}
-    return spec_of(counts, control=control or {"std": 0.1, "scale": "none"}, training=training, seed=seed)
+    return small_spec(counts, control=control or {"std": 0.1, "scale": "none"}, training=training, seed=seed)
 
 
 def make_trainer(spec, demos, path, on_event=ignore, jobs=1):
