@@ -35,11 +35,14 @@ STEPS = 3
 LABELS = [[5, -1, -1], [-1, 9, 5], [-1, -1, 9], [-1, -1, -1], [9, 9, -1]]
 
 
-def random_demonstrations(labels=LABELS, seed=0):
-    random = np.random.default_rng(seed)
-    sizes = ((len(each), 2) for each in labels)
-    drawn = (({"state": random.normal(size=size)}, 0.1 * random.normal(size=size)) for size in sizes)
-    return numbered((*one, {"phase": np.array(each)}) for one, each in zip(drawn, labels, strict=True))
+def random_demonstrations(labels=LABELS):
+    random = np.random.default_rng(0)
+
+    def one(phase):
+        state, actions = random.normal(size=(2, len(phase), 2))
+        return {"state": state}, 0.1 * actions, {"phase": np.array(phase)}
+
+    return numbered(map(one, labels))
 
 
 def labelled(level=1, counts=(2,), training=(), **own):
