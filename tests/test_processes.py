@@ -298,8 +298,8 @@ def test_two_processes_of_torchrun_give_the_bits_of_one(demos, tmp_path):
     demos.write(tmp_path / "demos.hdf5")
     short = make_spec(tmp_path / "demos.hdf5", patience=None, epochs=4, restarts=1)
     (tmp_path / "spec.yaml").write_text(dump_spec(short))
-    torchrun = [sys.executable, *"-m torch.distributed.run --standalone --nproc-per-node 2 -m ddco_pyro.cli".split()]
-    command = [*torchrun, "fit", "spec.yaml", "--out", "run"]
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    command += ["-m", "ddco_pyro.cli", "fit", "spec.yaml", "--out", "run"]
     ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600)
     assert ended.returncode == 0, ended.stderr
     assert ended.stdout.count("report: ") == 1

@@ -187,7 +187,7 @@ def test_flat_equal_counts_the_numbers_for_sigma():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"control": {"std": OF_OPTION | OF_STATE}}, "control.std.per_option: per_state gives each option its own σ already"),
+        ({"control": {"std": OF_OPTION | OF_STATE}}, "control.std.per_option: per_state gives each option its own σ"),
         ({"baseline": {"kind": "flat", "std": OF_STATE}}, "baseline.std: is for baselines in compare_with"),
         (
             {"control": {"std": 0.1}, "compare_with": [{"kind": "flat", "std": OF_STATE}]},
