@@ -122,6 +122,22 @@ def test_what_policies_of_options_do_not_read_does_not_begin_them(read, found):
     assert adjusted_rand_score(truths, alive(objective.known[0][1], [LENGTHS[number] for number in known])) == 1
 
 
+@pytest.mark.parametrize(("spread", "found"), [(1.7, "place"), (2.4, "move")])
+def test_observations_and_controls_have_the_same_weight(spread, found):
+    """Eight observations say one thing, two controls another; what varies more in mean square decides.
+
+    8 · 2² = 32 against (8 / 2) · 2 · spread²: 23 or 46. With a weight of 1 or of 8 it would be less or more for both.
+    """
+    steps = sum(LENGTHS)
+    truth = {"place": np.arange(steps) % 2, "move": np.arange(steps) // 2 % 2}
+    jitter = 0.01 * random_rows(2, 10)
+    vector = 2.0 * (2 * truth["place"] - 1)[:, None] + jitter[:, :8]
+    actions = spread * (2 * truth["move"] - 1)[:, None] + jitter[:, 8:]
+    batch = make_batch(vector, actions)
+    choices = alive(Clusters(batch, 2, seed=0, controls=True).choices(batch))
+    assert adjusted_rand_score(truth[found], choices) == 1
+
+
 # --- k-means itself ---------------------------------------------------------------------------------------------------
 
 FEW = (3, 2, 4)
@@ -148,13 +164,12 @@ def few_rows(seed, columns):
 
 @pytest.mark.parametrize("seed", range(2))
 def test_clusters_are_k_means_of_observations_and_weighted_controls(seed):
-    """Two controls have the weight of eight observations."""
-    vector, actions = few_rows(seed, 8), few_rows(seed + 10, 2)
+    vector, actions = few_rows(seed, 8), few_rows(seed + 10, 1)
     batch = make_batch(vector, actions, lengths=FEW)
     choices = alive(Clusters(batch, 3, seed).choices(batch), FEW)
     assert_k_means(vector, choices, 3)
     choices = alive(Clusters(batch, 3, seed, controls=True).choices(batch), FEW)
-    assert_k_means(np.hstack([vector, np.sqrt(8 / 2) * actions]), choices, 3)
+    assert_k_means(np.hstack([vector, np.sqrt(8) * actions]), choices, 3)
 
 
 def test_other_demonstrations_go_to_the_nearest_mean():
