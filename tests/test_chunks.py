@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from planted import small_spec
 from torch import Tensor
 
 from ddco_pyro.inference import log_likelihood
@@ -17,7 +18,6 @@ from ddco_pyro.model import hierarchy as chunking
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs
-from ddco_pyro.spec import parse_spec
 
 SHAPES = {"state": (3,), "camera": (10, 9, 3)}
 CONV = {"network": "conv", "filters": 3, "kernel": 3, "pooled": 2, "hidden": [6]}
@@ -45,20 +45,13 @@ def hierarchy(network: str, dtype: torch.dtype = torch.float64) -> Hierarchy:
     own = dict(NETWORKS[network])
     whole = own.pop("whole", None)
     reads: dict[str, Any] = {"network": "mlp", "inputs": [] if whole else ["state"]}
-    level = {"policy": {"network": "linear"}, "termination": {"network": "linear"}, **own}
+    lower = {"name": "lower", "count": 3, "policy": {"network": "linear"}, **own}
     if "trunk" not in own:
-        level["termination"] = reads
+        lower["termination"] = reads
     upper = {"name": "upper", "count": 2, "policy": reads, "termination": reads}
     meta = reads if whole else {"network": "lstm", "over": reads, "hidden": 3}
-    levels = [{"name": "lower", "count": 3, **level}, upper]
-    spec = parse_spec(
-        {
-            "demonstrations": {"path": "unused.hdf5"},
-            "observations": list(SHAPES),
-            "control": {"std": {"learn": True}},
-            "hierarchy": {"trunk": whole, "levels": levels, "meta_policy": meta},
-        }
-    )
+    model = {"trunk": whole, "levels": [lower, upper], "meta_policy": meta}
+    spec = small_spec(observations=list(SHAPES), control={"std": {"learn": True}}, hierarchy=model)
     torch.manual_seed(0)
     return Hierarchy(spec, SHAPES, 2, STEPS).to(dtype).train()
 
@@ -155,13 +148,8 @@ def test_a_gradient_takes_the_memory_of_a_chunk() -> None:
 def peaks() -> tuple[float, float]:
     """What a gradient takes in chunks and at once: 450 pictures of 64 × 64, of which convolutions keep over 50 MB."""
     torch.set_num_threads(1)
-    conv = {"network": "conv", "filters": 8, "hidden": []}
-    spec = {
-        "demonstrations": {"path": "unused"},
-        "observations": ["camera"],
-        "baseline": {"kind": "flat", "policy": conv},
-    }
-    model = Hierarchy(parse_spec(spec), {"camera": (64, 64, 3)}, 2, 450)
+    spec = small_spec((), {"network": "conv", "filters": 8, "hidden": []}, observations=["camera"])
+    model = Hierarchy(spec, {"camera": (64, 64, 3)}, 2, 450)
     pictures = torch.randint(256, (1, 450, 64, 64, 3), dtype=torch.uint8)
     seen = Batch(Inputs({}, {"camera": pictures}, torch.arange(450)), torch.randn(1, 450, 2), torch.tensor([450]))
 

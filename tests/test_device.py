@@ -14,13 +14,14 @@ import torch
 import yaml
 from command_line import call
 from elsewhere import THERE, Device, Elsewhere
+from planted import numbered, small_spec
 
 import ddco_pyro
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.pictures import padded
 from ddco_pyro.exporting import export
 from ddco_pyro.model.networks.conv import _field_means
-from ddco_pyro.spec import Spec, parse_spec
+from ddco_pyro.spec import Spec
 from ddco_pyro.training import devices
 from ddco_pyro.training.networks import Dimensions, build_hierarchy
 from ddco_pyro.training.restarts import OtherDevice
@@ -37,9 +38,7 @@ LINEAR = {"network": "linear", "inputs": ["pose"]}
 LSTM = {"network": "lstm", "over": {"network": "mlp", "hidden": [4], "inputs": ["pose"]}, "hidden": 3}
 TIMES = {"network": "per_timestep", "hidden": [4], "inputs": ["pose"]}
 BRANCHES = {"network": "branches", "of": {"camera": MEANS, "pose": {"network": "mlp", "hidden": [3]}}, "hidden": [4]}
-SAME = {
-    "mlp": {"policy": MLP, "termination": LINEAR},
-}
+SAME = {"mlp": {"policy": MLP, "termination": LINEAR}}
 """Those of which a double computes every number as the host does."""
 
 DROPPING = {"policy": {**MLP, "dropout": 0.2}, "termination": LINEAR}
@@ -61,33 +60,21 @@ ALL = [name if name in SAME else pytest.param(name, marks=pytest.mark.slow) for 
 def demos() -> Demonstrations:
     random = np.random.default_rng(0)
 
-    def one(number: int) -> Demonstration:
-        steps = 5 + number
-        seen = {
-            "pose": random.normal(size=(steps, 3)),
-            "camera": random.integers(0, 256, (steps, 9, 7, 3), dtype=np.uint8),
-        }
-        return Demonstration(f"demo_{number}", seen, random.normal(size=(steps, 2)))
+    def one(steps: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        camera = random.integers(0, 256, (steps, 9, 7, 3), dtype=np.uint8)
+        return {"pose": random.normal(size=(steps, 3)), "camera": camera}, random.normal(size=(steps, 2))
 
-    return Demonstrations(tuple(one(number) for number in range(7)))
+    return numbered(one(steps) for steps in range(5, 12))
 
 
 def spec_of(level: dict[str, Any], **training: Any) -> Spec:
-    return parse_spec(
-        {
-            "demonstrations": {"path": "unused.hdf5", "valid_fraction": 0.2},
-            "observations": ["pose", {"key": "camera", "augment": {"shift": 1}}],
-            "control": {"std": {"learn": True}},
-            "hierarchy": {"levels": [{"count": 2, **level}], "meta_policy": LINEAR},
-            "training": {
-                "epochs": 3,
-                "batch_size": 3,
-                "clip_gradient": 1.0,
-                "average": 0.5,
-                "layerwise": False,
-                **training,
-            },
-        }
+    own = {"epochs": 3, "batch_size": 3, "clip_gradient": 1.0, "average": 0.5, "layerwise": False}
+    return small_spec(
+        demonstrations={"path": "unused.hdf5", "valid_fraction": 0.2},
+        observations=["pose", {"key": "camera", "augment": {"shift": 1}}],
+        control={"std": {"learn": True}},
+        hierarchy={"levels": [{"count": 2, **level}], "meta_policy": LINEAR},
+        training=own | training,
     )
 
 

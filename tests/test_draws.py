@@ -81,16 +81,10 @@ def test_past_the_end_there_is_nothing() -> None:
 
 
 def test_a_demonstrations_draws_depend_on_its_place_and_the_seed_alone() -> None:
-    hierarchy = make_hierarchy((3,))
-    lengths = (40, 7, 30)
-    whole, some, other = (
-        drawn(hierarchy, demos, 6, seed).options["level-1"]
-        for demos, seed in (
-            (of_states(lengths), 1),
-            (of_states(lengths[:2]), 1),
-            (of_states(lengths), 2),
-        )
-    )
+    hierarchy, lengths = make_hierarchy((3,)), (40, 7, 30)
+    whole = drawn(hierarchy, of_states(lengths), 6, 1).options["level-1"]
+    some = drawn(hierarchy, of_states(lengths[:2]), 6, 1).options["level-1"]
+    other = drawn(hierarchy, of_states(lengths), 6, 2).options["level-1"]
     np.testing.assert_array_equal(whole[:, :, :2], some)
     assert not np.array_equal(whole, other)
     assert not np.array_equal(whole[:, 0], whole[:, 1])

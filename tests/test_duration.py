@@ -7,12 +7,11 @@ import math
 import numpy as np
 import pytest
 import torch
-from planted import make_spec, make_trainer, make_truth, plant
+from planted import make_spec, make_trainer, make_truth, plant, tabulated
 from scipy import integrate, stats
 
 import ddco_pyro
 from ddco_pyro.inference import log_likelihood
-from ddco_pyro.model.batch import encode
 from ddco_pyro.model.links import log_termination
 from ddco_pyro.spec import DurationSpec
 from ddco_pyro.training.checkpoint import Progress
@@ -88,16 +87,10 @@ def demos():
     return plant(make_truth(make_spec((2,)), ending=0.0), 12, 20, seed=1)[0]
 
 
-def fitted(demos, tmp_path, **training):
-    trainer = make_trainer(make_spec((2,), **TRAINING, **training), demos, tmp_path)
-    return trainer, trainer.run()
-
-
 def test_all_training_demonstrations_together_have_it_once(demos, tmp_path):
     """Whatever the minibatches; the tuning demonstrations in the same proportion to their likelihood."""
     spec = make_spec((2,), duration={"mean": 20, "weight": 3})
-    trainer = make_trainer(spec, demos, tmp_path)
-    material = trainer.data
+    material = make_trainer(spec, demos, tmp_path).data
     model, objective = material.hierarchy(0), Objective(material, Progress(0), plan(spec, 1)[-1])
     for batch in (material.train, material.tune):
         with torch.no_grad():
@@ -115,31 +108,28 @@ def test_all_training_demonstrations_together_have_it_once(demos, tmp_path):
         assert sum(parts) == pytest.approx(likelihood + means, rel=1e-6)
 
 
-def durations(model, demos):
-    """1/ψ of each option, by the mean of ψ over all steps."""
-    with torch.no_grad():
-        batch = encode(demos, model.encoder, model.scaling)
-        return 1 / model.tabulate(batch).termination[0][..., 1].exp().mean((0, 1))
+def fitted_psi(demos, tmp_path, **training):
+    """ψ of every demonstration, step and option."""
+    model = make_trainer(make_spec((2,), **TRAINING, **training), demos, tmp_path).run()
+    return tabulated(model, demos)[0].termination[0][..., 1].exp()
 
 
 def test_it_lengthens_options_and_much_of_it_makes_them_geometric(demos, tmp_path):
-    _, free = fitted(demos, tmp_path / "free")
-    _, some = fitted(demos, tmp_path / "some", duration={"mean": 12, "weight": 40.0})
-    _, much = fitted(demos, tmp_path / "much", duration={"mean": 12, "weight": 1e6})
-    assert (durations(free, demos) < 3).all()
-    assert (durations(some, demos) > 1.3 * durations(free, demos)).all()
-    assert (durations(some, demos) < 12).all()
-    with torch.no_grad():
-        psi = much.tabulate(encode(demos, much.encoder, much.scaling)).termination[0][..., 1].exp()
-    assert (psi - 1 / 12).abs().max() < 0.02  # at every step, whatever is seen
+    free = fitted_psi(demos, tmp_path / "free")
+    some = fitted_psi(demos, tmp_path / "some", duration={"mean": 12, "weight": 40.0})
+    much = fitted_psi(demos, tmp_path / "much", duration={"mean": 12, "weight": 1e6})
+    lasted, last = (1 / psi.mean((0, 1)) for psi in (free, some))
+    assert (lasted < 3).all()
+    assert (last > 1.3 * lasted).all()
+    assert (last < 12).all()
+    assert (much - 1 / 12).abs().max() < 0.02  # at every step, whatever is seen
 
 
 def test_what_is_reported_is_the_likelihood_alone(demos):
     spec = make_spec((2,), **{**TRAINING, "epochs": 4}, duration={"mean": 50, "weight": 1e3})
     fit = ddco_pyro.fit(spec, demos)
-    batch = encode(demos, fit.hierarchy.encoder, fit.hierarchy.scaling)
-    with torch.no_grad():
-        values = log_likelihood(fit.hierarchy.tabulate(batch), batch.lengths).numpy()
+    tables, batch = tabulated(fit.hierarchy, demos)
+    values = log_likelihood(tables, batch.lengths).numpy()
     for part in ("train", "valid"):
         names = [row.name for row in fit.metrics.demonstrations_by_likelihood if row.part == part]
         expected = sum(values[demos.names.index(name)] for name in names) / (20 * len(names))

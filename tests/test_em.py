@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from hierarchies import SHAPES, make_batch
-from planted import make_trainer
+from planted import LINEAR, make_trainer, small_spec
 from random_demonstrations import demonstrations
 from scipy import optimize, stats
 from sklearn.linear_model import LogisticRegression
@@ -17,7 +17,6 @@ from ddco_pyro.drawing import words
 from ddco_pyro.inference import log_likelihood
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.model.networks import Inputs
 from ddco_pyro.spec import RidgeSpec, SpecError, parse_spec, with_overrides
 from ddco_pyro.training import em
 from ddco_pyro.training.checkpoint import Progress, Restart
@@ -52,24 +51,23 @@ def batch_for(parts, trajectories=12, steps=9):
     return Batch(batch.inputs, actions, batch.lengths)
 
 
+def in_double(batch):
+    inputs = batch.inputs.map(torch.Tensor.double, batch.inputs.time)
+    return Batch(inputs, batch.actions.double(), batch.lengths)
+
+
 def linear(counts, parts=None, emits=("options",), memoryless=(), **control):
     """A random hierarchy of linear networks over three features, with these kinds of control."""
-    spec = {"network": "linear"}
-    levels = [
-        {"name": f"level-{number}", "count": count, "policy": {**spec, **({"emits": list(emits)} if number else {})},
-         "termination": "always" if number + 1 in memoryless else spec}
-        for number, count in enumerate(counts)
-    ]  # fmt: skip
-    whole = {"hierarchy": {"levels": levels, "meta_policy": {**spec, "emits": list(emits)}}}
-    if not counts:
-        whole = {"baseline": {"kind": "flat", "policy": spec}}
+    caller, whole = LINEAR | {"emits": list(emits)}, {"control": {"std": 0.7} | control}
+    if counts:
+        ends = ["always" if d in memoryless else LINEAR for d in range(1, 1 + len(counts))]
+        levels = [
+            {"name": f"level-{d}", "count": count, "policy": caller if d else LINEAR, "termination": end}
+            for d, (count, end) in enumerate(zip(counts, ends, strict=True))
+        ]
+        whole["hierarchy"] = {"levels": levels, "meta_policy": caller}
     torch.manual_seed(0)
-    return Hierarchy(
-        parse_spec(
-            {"demonstrations": {"path": "unused"}, "observations": ["state"], "control": {"std": 0.7} | control} | whole
-        ),
-        SHAPES, 2, steps=9, parts=parts,
-    )  # fmt: skip
+    return Hierarchy(small_spec(counts, **whole), SHAPES, 2, steps=9, parts=parts)
 
 
 def score(tables, piece, rows=None):
@@ -145,9 +143,7 @@ def test_steps_never_lower_the_penalised_likelihood_and_end_where_its_gradient_i
     made, values = expectation(model, ridge, batch)
     assert np.diff(values).min() > -1e-9 * abs(values[-1])
     assert values[-1] > values[0] + 1
-    inputs = Inputs({"state": batch.inputs.vectors["state"].double()}, {}, batch.inputs.time)
-    batch = Batch(inputs, batch.actions.double(), batch.lengths)
-    value = penalised(model, batch, ridge)
+    value = penalised(model, in_double(batch), ridge)
     free = [(name, one) for name, one in model.named_parameters() if "raw" not in name or not _at_floor(model, name)]
     gradients = torch.autograd.grad(value, [one for _, one in free])
     for (name, _), gradient in zip(free, gradients, strict=True):
@@ -174,12 +170,10 @@ def test_levels_are_discovered_under_a_uniform_meta_policy(discovering):
     """All weights of the levels end where the gradient is zero, those that select among options too."""
     model, ridge, batch = linear((2, 2), std=LEARNED).double(), RidgeSpec(), batch_for(None)
     expectation(model, ridge, batch, ("levels.",), discovering)
-    inputs = Inputs({"state": batch.inputs.vectors["state"].double()}, {}, batch.inputs.time)
-    whole = Batch(inputs, batch.actions.double(), batch.lengths)
     levels = tuple(f"levels.{level}." for level in range(discovering))
     there = [(name, one) for name, one in model.named_parameters() if name.startswith(levels)]
     assert len(there) == 5 * discovering - (discovering == 2)  # the second level has no σ
-    gradients = torch.autograd.grad(penalised(model, whole, ridge, discovering), [one for _, one in there])
+    gradients = torch.autograd.grad(penalised(model, in_double(batch), ridge, discovering), [one for _, one in there])
     for (name, _), gradient in zip(there, gradients, strict=True):
         assert gradient.abs().max() < 2e-2, name
 
@@ -289,25 +283,18 @@ def test_a_dead_option_keeps_finite_weights():
     assert all(bool(torch.isfinite(one).all()) for one in model.parameters())
 
 
-def small_spec(**training):
-    network = {"network": "linear"}
-    return parse_spec(
-        {
-            "demonstrations": {"path": "unused.hdf5", "valid_fraction": 0.2},
-            "observations": ["pose"],
-            "control": {"std": {**LEARNED, "per_option": True}},
-            "hierarchy": {
-                "levels": [{"count": 2, "policy": network, "termination": network}],
-                "meta_policy": network,
-            },
-            "compare_with": ["mixture", {"kind": "flat", "policy": {"network": "mlp", "hidden": [4]}}],
-            "training": {"optimizer": {"name": "em"}, "epochs": 60, **training},
-        }
+def em_spec(**training):
+    return small_spec(
+        demonstrations={"path": "unused.hdf5", "valid_fraction": 0.2},
+        observations=["pose"],
+        control={"std": {**LEARNED, "per_option": True}},
+        compare_with=["mixture", {"kind": "flat", "policy": {"network": "mlp", "hidden": [4]}}],
+        training={"optimizer": {"name": "em"}, "epochs": 60, **training},
     )
 
 
 def test_a_fit_by_em_says_so_and_trains_what_is_not_linear_by_gradients():
-    fit = ddco_pyro.fit(small_spec(), demonstrations(12))
+    fit = ddco_pyro.fit(em_spec(), demonstrations(12))
     trained = fit.metrics.trainings
     assert {name: one.by_em for name, one in trained.items()} == {"ddco": True, "mixture": True, "flat": False}
     assert trained["ddco"].spent.gradient_steps == trained["ddco"].spent.epochs
@@ -318,9 +305,9 @@ def test_a_fit_by_em_says_so_and_trains_what_is_not_linear_by_gradients():
 
 
 def flat_spec(kind="flat", **control):
-    network = {"network": "mlp", "hidden": [4] if kind == "flat" else []}
-    changes = {"hierarchy": None, "compare_with": [], "baseline": {"kind": kind, "policy": network}}
-    return parse_spec({**small_spec().model_dump(exclude_unset=True), **changes, "control": control})
+    baseline = {"kind": kind, "policy": {"network": "mlp", "hidden": [4] if kind == "flat" else []}}
+    own = em_spec().model_dump(exclude_unset=True)
+    return parse_spec({**own, "hierarchy": None, "compare_with": [], "baseline": baseline, "control": control})
 
 
 def test_a_flat_policy_for_each_time_step_is_least_squares_at_that_step():
@@ -345,15 +332,13 @@ def test_a_flat_policy_for_each_time_step_is_least_squares_at_that_step():
 
 @pytest.mark.parametrize("initialize", ["vq", "cuts", "mixture", "flat"])
 def test_a_fit_that_is_interrupted_has_the_same_bits(tmp_path, initialize):
-    flat = initialize == "flat"
-    spec, demos = flat_spec(std=LEARNED) if flat else small_spec(initialize=initialize), demonstrations(12)
+    spec = flat_spec(std=LEARNED) if initialize == "flat" else em_spec(initialize=initialize)
     spec = with_overrides(spec, {"training.epochs": 15})
-    whole, cut = (make_trainer(spec, demos, tmp_path / name) for name in ("whole", "cut"))
-    expected = train(whole.data, Restart(Progress(0)))
-    path = tmp_path / "restart.safetensors"
-    restart = Restart(Progress(0))
+    whole, cut = (make_trainer(spec, demonstrations(12), tmp_path / name).data for name in ("whole", "cut"))
+    expected = train(whole, Restart(Progress(0)))
+    path, restart = tmp_path / "restart.safetensors", Restart(Progress(0))
     for _ in range(1000):
-        restart = train(cut.data, restart, seconds=0.0)
+        restart = train(cut, restart, seconds=0.0)
         if restart.progress.done:
             break
         restart.written(path)
@@ -366,50 +351,45 @@ def test_a_fit_that_is_interrupted_has_the_same_bits(tmp_path, initialize):
 def test_a_spec_that_em_would_not_follow_is_refused():
     seen = [{"key": "pose", "augment": {"versions": "others"}}]
     with pytest.raises(SpecError, match=r"observations\.0\.augment\.versions: em sees"):
-        with_overrides(small_spec(), {"observations": seen})
+        with_overrides(em_spec(), {"observations": seen})
     for key, value in (("training.average", 0.9), ("training.clip_gradient", 1.0), ("training.optimizer.warmup", 2)):
         with pytest.raises(SpecError, match=f"{key}: em"):
-            with_overrides(small_spec(), {key: value})
+            with_overrides(em_spec(), {key: value})
 
 
 def test_linear_networks_are_trained_by_em_unless_the_spec_asks_for_gradient_steps():
-    linear, data = {"network": "linear"}, {"demonstrations": {"path": "unused.hdf5"}, "observations": ["pose"]}
-    own = {"levels": [{"count": 2, "policy": linear}], "meta_policy": linear}
-    flat = {"baseline": {"kind": "flat", "policy": linear}}
+    level, mlp = {"count": 2, "policy": LINEAR}, {"network": "mlp", "hidden": [4]}
+    own = {"levels": [level], "meta_policy": LINEAR}
 
-    def chosen(model=None, **rest):
-        return parse_spec({**data, **(model or {"hierarchy": own}), **rest}).training.optimizer.name
+    def chosen(counts=(2,), **sections):
+        return small_spec(counts, **sections).training.optimizer.name
 
-    assert chosen() == chosen(flat) == chosen(training={"optimizer": {"ridge": {"policy": 2}}}) == "em"
+    assert chosen() == chosen(()) == chosen(training={"optimizer": {"ridge": {"policy": 2}}}) == "em"
     for asked in ({"optimizer": {"lr": 0.1}}, {"optimizer": {"name": "adam"}}, {"average": 0.9}, {"clip_gradient": 1}):
         assert chosen(training=asked) == "adam"
     for changed in (
-        {"meta_policy": {"network": "mlp"}},
-        {"trunk": {"network": "mlp", "hidden": [4]}},
-        {"levels": [{"count": 2, "policy": linear, "trunk": {"network": "mlp", "hidden": [4]}}]},
-        {"levels": [{"count": 2, "policy": linear, "termination": {"network": "mlp"}}]},
+        {"meta_policy": mlp},
+        {"trunk": mlp},
+        {"levels": [level | {"trunk": mlp}]},
+        {"levels": [level | {"termination": mlp}]},
     ):
-        assert chosen({"hierarchy": own | changed}) == "adam"
-    assert chosen({"baseline": {"kind": "per_timestep", "policy": linear}}) == "adam"
+        assert chosen(hierarchy=own | changed) == "adam"
+    assert chosen((), baseline={"kind": "per_timestep", "policy": LINEAR}) == "adam"
     assert chosen(observations=[{"key": "pose", "augment": {"versions": "others"}}]) == "adam"
-    assert chosen(training={"optimizer": {"name": "em"}}, hierarchy=own | {"meta_policy": {"network": "mlp"}}) == "em"
+    assert chosen(training={"optimizer": {"name": "em"}}, hierarchy=own | {"meta_policy": mlp}) == "em"
 
 
 def test_tuning_demonstrations_decide_nothing_before_the_last_stage():
     """One tuning demonstration likes the beginning of a stage better than its end, where few train; segments then get
     lost.
     """
-    spec, demos = small_spec(initialize="vq_controls", epochs=None, patience=3), demonstrations(9)
+    spec, demos = em_spec(initialize="vq_controls", epochs=None, patience=3), demonstrations(9)
     train_with, histories = demos.select(demos.names[:6]), []
     for tuned_by in demos.names[6:]:
-        restart = make_trainer_of(spec, train_with, demos.select([tuned_by])).restarts[0]
+        trainer = Trainer(spec, Dimensions.of(train_with), train_with, demos.select([tuned_by]))
+        trainer.run()
+        restart = trainer.restarts[0]
         histories.append([row for row in restart.progress.history if row["stage"] != "joint"])
         assert all(end["rising"] == 0 for end in restart.progress.ended[:-1])  # EM has converged
     without_tuning = [[{**row, "tune": 0} for row in history] for history in histories]
     assert without_tuning[0] == without_tuning[1] == without_tuning[2]
-
-
-def make_trainer_of(spec, train_with, tune_with):
-    trainer = Trainer(spec, Dimensions.of(train_with), train_with, tune_with)
-    trainer.run()
-    return trainer

@@ -1,8 +1,6 @@
 """Commands that were killed (SIGKILL) or terminated (SIGTERM) go on when they are called again.
 
-They end as if nothing had happened.
-
-The files they were to write are equal to those of an undisturbed run; what is there is always whole.
+The files they write are equal to those of an undisturbed run; what is there is always whole.
 """
 
 from __future__ import annotations
@@ -10,7 +8,6 @@ from __future__ import annotations
 import json
 import shutil
 import signal
-import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterable
@@ -23,13 +20,15 @@ import pytest
 import selecting
 import toy_task
 import yaml
-from killing import COMMAND, Kept, Killed, answered, until_done, whole
+from killing import COMMAND, Kept, answered, started, until_done, whole
+from planted import numbered
 from random_demonstrations import demonstrations
 
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.importing import import_demonstrations
 from ddco_pyro.data.tensors import read_tensors
 from ddco_pyro.fitting import digest
+from ddco_pyro.spec import load_spec
+from ddco_pyro.training.data import demonstrations as demonstrations_of
 
 
 def same_hdf5(one: Path, other: Path) -> None:
@@ -39,14 +38,13 @@ def same_hdf5(one: Path, other: Path) -> None:
         found: dict[str, object] = {}
         with h5py.File(path) as file:
             found["/"] = dict(file.attrs)
-            file.visititems(lambda name, node: found.update({name: (dict(node.attrs), _values(node))}))
+            file.visititems(lambda name, node: found.update({name: (dict(node.attrs), values(node))}))
         return found
 
+    def values(node: h5py.HLObject) -> object:
+        return node[()] if isinstance(node, h5py.Dataset) else None
+
     np.testing.assert_equal(contents(one), contents(other))
-
-
-def _values(node: h5py.HLObject) -> object:
-    return node[()] if isinstance(node, h5py.Dataset) else None
 
 
 def same_run(one: Path, other: Path) -> None:
@@ -108,6 +106,11 @@ def written(paths: Iterable[Path]) -> set[object]:
     return {(path.name, path.stat().st_ino, path.stat().st_mtime_ns) for path in paths}
 
 
+def folds(folder: Path) -> set[object]:
+    """Those of a selection that are done, and the epochs of its models."""
+    return written(folder.glob("selected/folds/*.json")) | epochs(folder)
+
+
 def epochs(folder: Path) -> set[object]:
     """The epochs of every model that need not be trained again."""
     found: set[object] = set()
@@ -119,102 +122,64 @@ def epochs(folder: Path) -> set[object]:
 
 @dataclass(frozen=True)
 class Case:
-    """A command, the name of what it writes, how two of those are compared, what it keeps on the way, and files that
-    are in its folder from the beginning.
+    """What a command writes, how two of those are compared, what it keeps on the way, and the inputs that are in its
+    folder from the beginning.
     """
 
-    arguments: tuple[object, ...]
     result: str
     same: Callable[[Path, Path], None]
-    kept: Kept
-    inputs: tuple[Path, ...] = (Path(toy_task.__file__),)
+    kept: Kept = lambda folder: None
+    inputs: tuple[str, ...] = ()
+
+
+CASES = {
+    "collect": Case("demos.hdf5", same_hdf5, parts("demos.hdf5")),
+    "import": Case("imported.hdf5", same_hdf5, parts("imported.hdf5")),
+    "fit": Case("fitted", same_run, epochs),
+    "fit to pictures": Case("seen", same_run, epochs),
+    "select": Case("selected", same_selection, folds),
+    "segment": Case("labelled.hdf5", same_segments),
+    "segment in place": Case("toy.hdf5", same_segments, inputs=("toy.hdf5",)),
+    "merge": Case("merged", same_run, epochs, ("elsewhere/run",)),
+    "rollout": Case("run", same_rollouts, rolled, ("elsewhere/run",)),
+}
+COMMANDS = {
+    "collect": "collect {inputs}/toy.yaml --out demos.hdf5 --set demonstrations.count=40 --allow-code",
+    "import": "import {inputs}/source.hdf5 --out imported.hdf5",
+    "fit": "fit {inputs}/toy.yaml --out fitted --resume --allow-code --set training.epochs=100 "
+    "--set compare_with=[flat]",
+    "fit to pictures": "fit {inputs}/pictures.yaml --out seen --resume --processes 2",
+    "select": "select {inputs}/grid.yaml --out selected --jobs 2",
+    "segment": "segment {inputs}/run {inputs}/toy.hdf5 --out labelled.hdf5 --csv a.csv --html a.html",
+    "segment in place": "segment {inputs}/run toy.hdf5 --in-place --csv a.csv --html a.html",
+    "merge": "merge run --out merged --jobs 2 --allow-code",
+    "rollout": "rollout run --episodes 40 --jobs 2 --allow-code",
+}
 
 
 @pytest.fixture(scope="module")
-def cases(tmp_path_factory: pytest.TempPathFactory, toy_run) -> dict[str, Case]:
+def inputs(tmp_path_factory: pytest.TempPathFactory, toy_run) -> Path:
     folder = tmp_path_factory.mktemp("inputs")
     (folder / "toy.yaml").write_text(toy_task.SPEC.replace("task: toy", "task: toy_task:task"))
     demonstrations(300).write(folder / "source.hdf5")
-    short = [one for key in ("training.epochs=100", "compare_with=[flat]") for one in ("--set", key)]
-    shutil.copytree(toy_run.folder, folder / "run")
-    import_demonstrations(_toy_demonstrations(folder), folder / "toy.hdf5")
+    demonstrations_of(load_spec(folder / "toy.yaml", allow_code=True)).write(folder / "toy_source.hdf5")
+    import_demonstrations(folder / "toy_source.hdf5", folder / "toy.hdf5")
+    write_pictures(folder)
     data = selecting.data_at(folder)
     data["selection"] = data["selection"] | {"folds": 3}
     (folder / "grid.yaml").write_text(yaml.safe_dump(data))
-    tables = ("--csv", "a.csv", "--html", "a.html")
+    shutil.copytree(toy_run.folder, folder / "run")
     shutil.copytree(toy_run.folder, folder / "elsewhere" / "run")
     for path in (folder / "elsewhere").rglob("spec.yaml"):  # the task is found where the command is called
         path.write_text(path.read_text().replace("task: toy", "task: toy_task:task"))
-    return {
-        "collect": Case(
-            ("collect", folder / "toy.yaml", "--out", "demos.hdf5", "--set", "demonstrations.count=40", "--allow-code"),
-            "demos.hdf5",
-            same_hdf5,
-            parts("demos.hdf5"),
-        ),
-        "import": Case(
-            ("import", folder / "source.hdf5", "--out", "imported.hdf5"),
-            "imported.hdf5",
-            same_hdf5,
-            parts("imported.hdf5"),
-        ),
-        "fit": Case(
-            ("fit", folder / "toy.yaml", "--out", "fitted", "--resume", "--allow-code", *short),
-            "fitted",
-            same_run,
-            epochs,
-        ),
-        "fit to pictures": Case(
-            ("fit", _pictures(folder), "--out", "seen", "--resume", "--processes", "2"),
-            "seen",
-            same_run,
-            epochs,
-        ),
-        "select": Case(
-            ("select", folder / "grid.yaml", "--out", "selected", "--jobs", "2"),
-            "selected",
-            same_selection,
-            lambda folder: written(folder.glob("selected/folds/*.json")) | epochs(folder),
-        ),
-        "segment": Case(
-            ("segment", folder / "run", folder / "toy.hdf5", "--out", "labelled.hdf5", *tables),
-            "labelled.hdf5",
-            same_segments,
-            lambda folder: None,
-        ),
-        "segment in place": Case(
-            ("segment", folder / "run", "toy.hdf5", "--in-place", *tables),
-            "toy.hdf5",
-            same_segments,
-            lambda folder: None,
-            (folder / "toy.hdf5",),
-        ),
-        "merge": Case(
-            ("merge", "run", "--out", "merged", "--jobs", "2", "--allow-code"),
-            "merged",
-            same_run,
-            epochs,
-            (Path(toy_task.__file__), folder / "elsewhere" / "run"),
-        ),
-        "rollout": Case(
-            ("rollout", "run", "--episodes", "40", "--jobs", "2", "--allow-code"),
-            "run",
-            same_rollouts,
-            rolled,
-            (Path(toy_task.__file__), folder / "elsewhere" / "run"),
-        ),
-    }
+    return folder
 
 
-def _pictures(folder: Path) -> Path:
+def write_pictures(folder: Path) -> None:
     """A spec whose pictures are read ahead, in two processes, by a worker of each."""
     random = np.random.default_rng(0)
-
-    def one(number: int) -> Demonstration:
-        seen = {"camera": random.integers(0, 256, (9, 12, 10, 3), dtype=np.uint8)}
-        return Demonstration(f"demo_{number}", seen, random.normal(size=(9, 2)))
-
-    Demonstrations(tuple(one(number) for number in range(10))).write(folder / "pictures.hdf5")
+    pictures = ({"camera": random.integers(0, 256, (9, 12, 10, 3), dtype=np.uint8)} for _ in range(10))
+    numbered((seen, random.normal(size=(9, 2))) for seen in pictures).write(folder / "pictures.hdf5")
     policy = {"network": "conv", "filters": 2, "kernel": 3, "pooled": 2, "hidden": [4], "dropout": 0.1}
     data = {
         "demonstrations": {"path": str(folder / "pictures.hdf5")},
@@ -223,50 +188,38 @@ def _pictures(folder: Path) -> Path:
         "training": {"epochs": 60, "patience": None, "shards": 2, "batch_size": 4, "workers": 1},
     }
     (folder / "pictures.yaml").write_text(yaml.safe_dump(data))
-    return folder / "pictures.yaml"
 
 
-def _toy_demonstrations(folder: Path) -> Path:
-    from ddco_pyro.spec import load_spec
-    from ddco_pyro.training.data import demonstrations as of
-
-    path = folder / "toy_source.hdf5"
-    of(load_spec(folder / "toy.yaml", allow_code=True)).write(path)
-    return path
-
-
-def check(case: Case, tmp_path: Path, kills: int, seed: int, by: signal.Signals = signal.SIGKILL) -> Killed:
+def check(name: str, inputs: Path, tmp_path: Path, kills: int, seed: int, by: signal.Signals = signal.SIGKILL) -> int:
     """Undisturbed and killed again and again, each in a folder and with a cache of its own."""
-    folders = [tmp_path / name for name in ("whole", "killed")]
+    case, command = CASES[name], COMMANDS[name].format(inputs=inputs).split()
+    folders = [tmp_path / each for each in ("whole", "killed")]
     for folder in folders:
         folder.mkdir()
-        for path in case.inputs:
+        for path in (Path(toy_task.__file__), *(inputs / each for each in case.inputs)):
             shutil.copytree(path, folder / path.name) if path.is_dir() else shutil.copy(path, folder)
-    seconds = whole(case.arguments, folders[0], tmp_path / "cache-whole")
-    killed = until_done(case.arguments, folders[1], tmp_path / "cache-killed", kills, seconds, seed, case.kept, by)
+    seconds = whole(command, folders[0], tmp_path / "cache-whole")
+    killed = until_done(command, folders[1], tmp_path / "cache-killed", kills, seconds, seed, case.kept, by)
     case.same(folders[0] / case.result, folders[1] / case.result)
     assert not [path for path in folders[1].rglob("*") if path.name.endswith((".tmp", ".parts"))]
     return killed
 
 
-ALL = ["collect", "import", "fit", "fit to pictures", "select", "segment", "segment in place", "merge", "rollout"]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["collect", "fit", "fit to pictures", "select", "merge", "rollout"])
-def test_terminated_and_called_again(cases: dict[str, Case], tmp_path: Path, name: str) -> None:
+def test_terminated_and_called_again(inputs: Path, tmp_path: Path, name: str) -> None:
     """A scheduler's preemption, five times: each ends with a line, without helpers left behind, and goes on."""
-    assert check(cases[name], tmp_path, kills=5, seed=11, by=signal.SIGTERM).total > 0
+    assert check(name, inputs, tmp_path, kills=5, seed=11, by=signal.SIGTERM) > 0
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", range(4))
 def test_a_terminated_fit_in_two_processes_says_that_last(tmp_path: Path, number: int) -> None:
     """In training, while each process may have one that reads pictures: what the second leaves behind is no news."""
-    changes = ["--processes", "2", "--set", "training.epochs=2000"]
+    write_pictures(tmp_path)
+    fit = "fit pictures.yaml --out seen --processes 2 --set training.epochs=2000"
     with tempfile.TemporaryFile("w+") as err:
-        command = [COMMAND, "fit", str(_pictures(tmp_path)), "--out", "seen", *changes]
-        process = subprocess.Popen(command, cwd=tmp_path, stderr=err, start_new_session=True)
+        process = started([COMMAND, *fit.split()], err, tmp_path)
         while not list(tmp_path.glob("seen/checkpoints/*")):
             assert process.poll() is None
             time.sleep(0.05)
@@ -277,12 +230,10 @@ def test_a_terminated_fit_in_two_processes_says_that_last(tmp_path: Path, number
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ALL)
-def test_killed_at_very_many_moments(cases: dict[str, Case], tmp_path: Path, name: str) -> None:
-    found: list[Killed] = []
-    while sum(one.total for one in found) < 10:  # ninety in all; a moment that comes after the end kills nothing
-        folder = tmp_path / str(len(found))
+@pytest.mark.parametrize("name", CASES)
+def test_killed_at_very_many_moments(inputs: Path, tmp_path: Path, name: str) -> None:
+    killed: list[int] = []
+    while sum(killed) < 10:  # ninety in all; a moment that comes after the end kills nothing
+        folder = tmp_path / str(len(killed))
         folder.mkdir()
-        found.append(check(cases[name], folder, kills=10, seed=len(found)))
-    together, alone = sum(one.together for one in found), sum(one.alone for one in found)
-    print(f"{name}: killed {together + alone} times, {alone} of them without its helpers")
+        killed.append(check(name, inputs, folder, kills=10, seed=len(killed)))

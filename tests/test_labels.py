@@ -12,16 +12,16 @@ import pytest
 import torch
 from command_line import call
 from oracle import paths
-from planted import CONTROL, make_spec, make_trainer, make_truth, plant
+from planted import CONTROL, make_spec, make_trainer, make_truth, numbered, plant, small_spec, tabulated
 from sklearn.metrics import normalized_mutual_info_score
 
 import ddco_pyro
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.evaluation.agreement import agreement
 from ddco_pyro.inference import segment
 from ddco_pyro.model.batch import encode
 from ddco_pyro.report import write_report
-from ddco_pyro.spec import SpecError, parse_spec
+from ddco_pyro.spec import SpecError
 from ddco_pyro.training.checkpoint import Progress
 from ddco_pyro.training.initialization import Clusters
 from ddco_pyro.training.labels import Labels
@@ -35,19 +35,14 @@ STEPS = 3
 LABELS = [[5, -1, -1], [-1, 9, 5], [-1, -1, 9], [-1, -1, -1], [9, 9, -1]]
 
 
-def random_demonstrations(labels=LABELS, seed=0):
-    random = np.random.default_rng(seed)
-    return Demonstrations(
-        tuple(
-            Demonstration(
-                f"demo_{n}",
-                {"state": random.normal(size=(len(each), 2))},
-                0.1 * random.normal(size=(len(each), 2)),
-                {"phase": np.array(each)},
-            )
-            for n, each in enumerate(labels)
-        )
-    )
+def random_demonstrations(labels=LABELS):
+    random = np.random.default_rng(0)
+
+    def one(phase):
+        state, actions = random.normal(size=(2, len(phase), 2))
+        return {"state": state}, 0.1 * actions, {"phase": np.array(phase)}
+
+    return numbered(map(one, labels))
 
 
 def labelled(level=1, counts=(2,), training=(), **own):
@@ -160,15 +155,12 @@ def test_the_first_demonstrations_in_training_have_labels_those_to_tune_with_las
     train, tune = demos.split(0.2, 0)
     labels = Labels.of(labelled(count=count), train, tune)
     assert labels.demonstrations == (*train.names, *tune.names)[:used]
+    known = demos.select(labels.demonstrations)
+    seen = {value for demo in known for value in options(demo.labels["phase"].tolist())} - {-1}
     for part, tensor in ((train, labels.train), (tune, labels.tune)):
         for demo, row in zip(part, tensor.tolist(), strict=True):
             given = options(demo.labels["phase"].tolist()) if demo.name in labels.demonstrations else [-1] * STEPS
-            seen = {value for name in labels.demonstrations for value in options(_labels(demos, name))} - {-1}
             assert row == (given if seen == {1, 2} else [min(option, 1) for option in given])
-
-
-def _labels(demos, name):
-    return demos.select([name])[0].labels["phase"].tolist()
 
 
 def test_labels_of_unequal_length_are_free_past_the_end():
@@ -202,13 +194,10 @@ def test_the_clusters_of_labelled_options_start_from_their_steps(order):
     places = np.array([[0.0, 9.0], [9.0, 0.0], [0.0, 0.0]])
     truth = np.arange(12) % 3
     states = places[truth] + 0.1 * np.random.default_rng(0).normal(size=(12, 2))
-    demos = Demonstrations((Demonstration("demo", {"state": states}, states),))
-    trainer = make_batchable(demos)
     numbers = np.array(order) + 1
     for known in (3, 2):
         labels = np.where((np.arange(12) < 3) & (numbers[truth] <= known), numbers[truth], -1)
-        choices = Clusters(trainer, 3, seed=0, labels=torch.tensor(labels[None])).choices(trainer)
-        np.testing.assert_array_equal(choices[0], numbers[truth])
+        np.testing.assert_array_equal(clustered(states, 3, labels), numbers[truth])
 
 
 def test_labels_of_every_option_name_the_other_steps():
@@ -220,27 +209,23 @@ def test_labels_of_every_option_name_the_other_steps():
     )
     labels = np.where((along > 0) | (np.arange(400) > 200), -1, truth)  # of the near half of the first ones
     labels[np.flatnonzero(truth == 2)[:3]] = 2  # and of a few others, so that the means are apart along the way
-    batch = make_batchable(Demonstrations((Demonstration("demo", {"state": states}, states),)))
-    rows = batch.inputs.vector[0].numpy()
-    means = np.stack([rows[labels == option].mean(0) for option in (1, 2, 3)])
-    nearest = np.linalg.norm(rows[:, None] - means, axis=-1).argmin(1) + 1
-    choices = Clusters(batch, 3, seed=0, labels=torch.tensor(labels[None])).choices(batch)[0].numpy()
+    means = np.stack([states[labels == option].mean(0) for option in (1, 2, 3)])
+    nearest = np.linalg.norm(states[:, None] - means, axis=-1).argmin(1) + 1
     assert (nearest == truth).mean() < 0.9
-    assert (choices == truth).mean() > 0.99
+    assert (clustered(states, 3, labels) == truth).mean() > 0.99
     some = np.where(labels == 3, -1, labels)
-    begun = Clusters(batch, 3, seed=0, labels=torch.tensor(some[None])).choices(batch)[0].numpy()
-    assert len(np.unique(begun)) == 3
+    assert len(np.unique(clustered(states, 3, some))) == 3
 
 
 def test_one_option_needs_no_telling_apart():
-    batch = make_batchable(Demonstrations((Demonstration("demo", {"state": np.eye(4)[:, :2]}, np.eye(4)[:, :2]),)))
-    choices = Clusters(batch, 1, seed=0, labels=torch.tensor([[1, -1, -1, -1]])).choices(batch)
-    assert choices.tolist() == [[1, 1, 1, 1]]
+    assert clustered(np.eye(4)[:, :2], 1, [1, -1, -1, -1]).tolist() == [1, 1, 1, 1]
 
 
-def make_batchable(demos):
+def clustered(states, count, labels):
+    """The clusters of the steps of one demonstration, of which some have labels."""
     model = make_truth(make_spec((2,)))
-    return encode(demos, model.encoder, model.scaling)
+    batch = encode(numbered([({"state": states}, states)]), model.encoder, model.scaling)
+    return Clusters(batch, count, seed=0, labels=torch.tensor([list(labels)])).choices(batch)[0].numpy()
 
 
 # --- planted options --------------------------------------------------------------------------------------------------
@@ -254,17 +239,12 @@ def test_three_labelled_demonstrations_name_the_options_of_thirty(tmp_path):
     spec = make_spec((3,), control=CONTROL, labels=labels, **training)
     truth = make_truth(spec)
     demos, choices = plant(truth, 30, 24, seed=1)
-    demos = Demonstrations(
-        tuple(
-            Demonstration(demo.name, demo.observations, demo.actions, {"phase": np.array(names)[row[:, 0] - 1]})
-            for demo, row in zip(demos, choices.numpy(), strict=True)
-        )
-    )
+    phases = np.array(names)[choices[..., 0].numpy() - 1]
+    demos = Demonstrations(tuple(replace(demo, labels={"phase": row}) for demo, row in zip(demos, phases, strict=True)))
     held_out, true = plant(truth, 20, 24, seed=11)
     model = make_trainer(spec, demos, tmp_path).run()
-    with torch.no_grad():
-        batch = encode(held_out, model.encoder, model.scaling)
-        (found,) = segment(model.tabulate(batch), batch.lengths)
+    tables, batch = tabulated(model, held_out)
+    (found,) = segment(tables, batch.lengths)
     number = np.argsort(np.argsort(names)) + 1
     assert normalized_mutual_info_score(true.flatten(), found.flatten()) > 0.95
     assert (found.numpy() == number[true[..., 0] - 1]).mean() > 0.98
@@ -321,36 +301,19 @@ def test_a_run_says_for_which_labels_its_options_stand(files):
 
 
 def demonstrations():
-    random = np.random.default_rng(0)
-    demos = []
-    for number in range(6):
-        phase = np.repeat([0, 1, 2, 3], 4)
-        place = phase[:, None] + 0.1 * random.normal(size=(16, 1))
-        labels = {"phase": phase, "half": np.where(np.arange(16) == 8, -1, phase // 2)}
-        demos.append(Demonstration(f"demo_{number}", {"place": place}, random.normal(size=(16, 1)), labels))
-    return Demonstrations(tuple(demos))
-
-
-def spec(labels):
-    levels = [
-        {"name": name, "count": count, "policy": {"network": "linear"}, "termination": {"network": "linear"}}
-        for name, count in (("low", 3), ("high", 2))
-    ]
-    return parse_spec(
-        {
-            "demonstrations": {"path": "demos.hdf5", "labels": labels, "valid_fraction": 0.34},
-            "observations": ["place"],
-            "hierarchy": {"levels": levels, "meta_policy": {"network": "linear"}},
-            "training": {"epochs": 3, "layerwise": False},
-        }
-    )
+    random, phase = np.random.default_rng(0), np.repeat([0, 1, 2, 3], 4)
+    labels = {"phase": phase, "half": np.where(np.arange(16) == 8, -1, phase // 2)}
+    places = (phase[:, None] + 0.1 * random.normal(size=(16, 1)) for _ in range(6))
+    return numbered(({"state": place}, random.normal(size=(16, 1)), labels) for place in places)
 
 
 @pytest.mark.parametrize(("labels", "names"), [(["phase", "half"], ["phase", "half"]), ("half", ["half", "half"])])
 def test_each_level_is_measured_with_its_own_labels(tmp_path, monkeypatch, labels, names):
     monkeypatch.chdir(tmp_path)
     demonstrations().write(tmp_path / "demos.hdf5")
-    fit = ddco_pyro.fit(spec(labels), out=tmp_path / "run")
+    files = {"path": "demos.hdf5", "labels": labels, "valid_fraction": 0.34}
+    spec = small_spec((3, 2), demonstrations=files, training={"epochs": 3, "layerwise": False})
+    fit = ddco_pyro.fit(spec, out=tmp_path / "run")
     metrics = fit.metrics.agreement
     assert metrics.labels == names
     valid = demonstrations().select([row.name for row in fit.metrics.valid])
@@ -362,7 +325,7 @@ def test_each_level_is_measured_with_its_own_labels(tmp_path, monkeypatch, label
     if labels == "half":
         return
     page = write_report(ddco_pyro.load(tmp_path / "run"), fit.demonstrations).read_text()
-    for level, name in zip(("low", "high"), names, strict=True):
+    for level, name in zip(("level-1", "level-2"), names, strict=True):
         assert f"Where each label’s steps lie: level “{level}”, label “{name}”" in page
     assert call("segment", "run", "demos.hdf5", "--html", "page.html").status == 0
     shown = (tmp_path / "page.html").read_text()

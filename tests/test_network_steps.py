@@ -15,14 +15,14 @@ from ddco_pyro.model.networks import CLASSES, InputShape
 def step_by_step(network, inputs):
     """The outputs of a call for every step of every trajectory, the state carried from each to the next."""
     trajectories, steps = inputs.batch
-    rows = []
+    found = []
     for n in range(trajectories):
-        state = None
+        state, rows = None, []
         for t in range(steps):
-            here = inputs.map(lambda array, n=n, t=t: array[n, t][None, None], inputs.time[t : t + 1])
-            row, state = answer(network, here, state)
+            row, state = answer(network, inputs.part(slice(n, n + 1), slice(t, t + 1)), state)
             rows.append(row)
-    return torch.stack([torch.stack(rows[n * steps : (n + 1) * steps]) for n in range(trajectories)])[:, :, 0, 0]
+        found.append(torch.cat(rows, dim=1))
+    return torch.cat(found)
 
 
 sizes = st.lists(st.integers(1, 5), max_size=2)
@@ -80,24 +80,27 @@ def test_a_call_for_many_steps_is_a_call_for_each(kind, longest, trajectories, s
     assert_close(whole, step_by_step(network, inputs))
 
 
+def separate_memory(network, k):
+    """The k-th of the stacked memories, layer by layer, as torch's own with the same weights."""
+    for layer in network.memory:
+        alone = nn.LSTM(layer.inputs.weight.shape[1], layer.size[1], batch_first=True)
+        with torch.no_grad():
+            alone.weight_ih_l0.copy_(layer.inputs.weight[k].T)
+            alone.weight_hh_l0.copy_(layer.recurrent[k].T)
+            alone.bias_ih_l0.copy_(layer.inputs.bias[k, 0])
+            alone.bias_hh_l0.zero_()
+        yield alone
+
+
 @pytest.mark.parametrize("over", [None, {"hidden": [7]}])
 def test_lstms_are_separate_networks(over):
     network, inputs = make(network="lstm", over=over, hidden=[6, 5]), make_inputs()
-    values = torch.stack([inputs.vector] * COPIES)
-    if over:
-        values = torch.stack([separate(network.over.layers, k)(inputs.vector) for k in range(COPIES)])
     expected = []
     for k in range(COPIES):
-        own = values[k]
-        for layer in network.memory:
-            alone = nn.LSTM(layer.inputs.weight.shape[1], layer.size[1], batch_first=True)
-            with torch.no_grad():
-                alone.weight_ih_l0.copy_(layer.inputs.weight[k].T)
-                alone.weight_hh_l0.copy_(layer.recurrent[k].T)
-                alone.bias_ih_l0.copy_(layer.inputs.bias[k, 0])
-                alone.bias_hh_l0.zero_()
-            own, _ = alone(own)
-        expected.append(separate(network.layers, k)(own))
+        values = separate(network.over.layers, k)(inputs.vector) if over else inputs.vector
+        for alone in separate_memory(network, k):
+            values, _ = alone(values)
+        expected.append(separate(network.layers, k)(values))
     assert_close(answer(network, inputs)[0], torch.stack(expected, dim=2))
 
 
@@ -107,18 +110,11 @@ def test_a_memory_with_a_horizon_is_made_afresh_for_each_window(horizon, start):
     """Windows are counted from the first step of a trajectory, at whichever step a call begins."""
     network, k = make(network="lstm", hidden=[6, 5], horizon=horizon), COPIES - 1
     everything = random_inputs(SHAPE, 2, 23, 0)
-    alone = nn.LSTM(SHAPE.vector, 6, batch_first=True), nn.LSTM(6, 5, batch_first=True)
-    for layer, own in zip(network.memory, alone, strict=True):
-        with torch.no_grad():
-            own.weight_ih_l0.copy_(layer.inputs.weight[k].T)
-            own.weight_hh_l0.copy_(layer.recurrent[k].T)
-            own.bias_ih_l0.copy_(layer.inputs.bias[k, 0])
-            own.bias_hh_l0.zero_()
     expected = []
     for first in range(0, 23, horizon):
         values = everything.vector[:, first : first + horizon]
-        for own in alone:
-            values, _ = own(values)
+        for alone in separate_memory(network, k):
+            values, _ = alone(values)
         expected.append(separate(network.layers, k)(values))
     said, state = [], None
     for part in (slice(0, start), slice(start, None)) if start else (slice(None),):

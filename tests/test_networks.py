@@ -46,13 +46,9 @@ ACTIVATIONS = {
 }
 
 
-def test_every_activation_is_measured():
-    assert list(ACTIVATIONS) == list(get_args(Activation))
-
-
-@pytest.mark.parametrize(("name", "activation"), ACTIVATIONS.items())
-def test_an_activation_follows_every_convolution_and_every_hidden_layer(name, activation):
-    layers = [{"filters": 2, "kernel": 3}, {"filters": 3, "kernel": 3}]
+@pytest.mark.parametrize("name", get_args(Activation))
+def test_an_activation_follows_every_convolution_and_every_hidden_layer(name):
+    layers, activation = [{"filters": 2, "kernel": 3}, {"filters": 3, "kernel": 3}], ACTIVATIONS[name]
     settings = {"layers": layers, "pool": "flatten", "hidden": [5, 4], "activation": name}
     shape = InputShape({}, {"camera": PIXELS})
     network, inputs = make(shape, network="conv", **settings), random_inputs(shape, 2, LONGEST, 0)
@@ -153,13 +149,6 @@ def test_conv_networks_are_separate_networks(images):
     assert_close(network(inputs)[0], expected)
 
 
-POOLS = {
-    "mean": lambda maps: nn.functional.adaptive_avg_pool2d(maps, 3).flatten(1),
-    "flatten": lambda maps: maps.flatten(1),
-    "spatial_softmax": lambda maps: expected_places(maps),
-}
-
-
 def expected_places(maps):
     """Sum of the places of all pixels, weighted with the softmax over the pixels of each map."""
     height, width = maps.shape[2:]
@@ -168,12 +157,19 @@ def expected_places(maps):
     return torch.stack([(weights * place).sum((2, 3)) for place in (rows, columns)], 2).flatten(1)
 
 
+POOLS = {
+    "mean": lambda maps: nn.functional.adaptive_avg_pool2d(maps, 3).flatten(1),
+    "flatten": lambda maps: maps.flatten(1),
+    "spatial_softmax": expected_places,
+}
+
+
 @pytest.mark.parametrize("pool", POOLS)
 def test_several_convolutions_are_separate_networks(pool):
     layers = [{"filters": 3, "kernel": 4, "stride": 2, "padding": 1}, {"filters": 2, "kernel": 3}]
     shape = InputShape({}, {"camera": PIXELS})
     network = make(shape, network="conv", layers=layers, pool=pool, pooled=3, hidden=[8])
-    inputs = Inputs({}, make_inputs(images=("camera",)).images, torch.arange(LONGEST))
+    inputs = random_inputs(shape, 2, LONGEST, 0)
     pixels = inputs.images["camera"].flatten(0, 1).permute(0, 3, 1, 2) / 255
     first, second = network.convolutions[0]
     expected = []
@@ -217,24 +213,17 @@ def test_branches_read_each_their_own_and_are_joined():
 @pytest.mark.parametrize("settings", [{"network": "linear"}, {"network": "user_networks:Own"}])
 def test_a_network_reads_the_observations_that_it_is_to_read(settings):
     shape = InputShape({"pose": 2, "goal": 3}, {"camera": PIXELS})
-    generator = torch.Generator().manual_seed(1)
-    pose, goal = (torch.randn(2, LONGEST, size, generator=generator) for size in (2, 3))
-    images = make_inputs(images=("camera",)).images
-    torch.manual_seed(0)
-    network = build(network_spec(**settings, inputs=("goal",)), shape, OUTPUTS, COPIES)
-    torch.manual_seed(0)
-    alone = build(network_spec(**settings), InputShape({"goal": 3}), OUTPUTS, COPIES)
-    time = torch.arange(LONGEST)
-    found = network(Inputs({"pose": pose, "goal": goal}, images, time))[0]
-    assert_close(found, alone(Inputs({"goal": goal}, {}, time))[0])
+    inputs = random_inputs(shape, 2, LONGEST, 0)
+    network, alone = make(shape, **settings, inputs=("goal",)), make(InputShape({"goal": 3}), **settings)
+    assert_close(network(inputs)[0], alone(Inputs({"goal": inputs.vectors["goal"]}, {}, inputs.time))[0])
 
 
 def test_all_vectors_are_read_in_the_order_of_the_spec():
-    network = make(InputShape({"b": 1, "a": 2}), network="linear")
-    generator = torch.Generator().manual_seed(1)
-    b, a = (torch.randn(2, LONGEST, size, generator=generator) for size in (1, 2))
-    expected = torch.stack([separate(network.layers, k)(torch.cat([b, a], -1)) for k in range(COPIES)], dim=2)
-    assert_close(network(Inputs({"b": b, "a": a}, {}, torch.arange(LONGEST)))[0], expected)
+    shape = InputShape({"b": 1, "a": 2})
+    network, inputs = make(shape, network="linear"), random_inputs(shape, 2, LONGEST, 0)
+    both = torch.cat([inputs.vectors["b"], inputs.vectors["a"]], -1)
+    expected = torch.stack([separate(network.layers, k)(both) for k in range(COPIES)], dim=2)
+    assert_close(network(inputs)[0], expected)
 
 
 # --- a user's own -----------------------------------------------------------------------------------------------------
@@ -246,12 +235,9 @@ def test_a_network_of_ones_own():
 
 
 def test_trying_a_network_of_ones_own_leaves_no_trace():
-    spec, shape = (
-        network_spec(network="user_networks:Stateful"),
-        InputShape({"state": FEATURES}, {"camera": PIXELS}, steps=1),
-    )
+    shape = InputShape({"state": FEATURES}, {"camera": PIXELS}, steps=1)
     torch.manual_seed(0)
-    network = build(spec, shape, OUTPUTS, COPIES).module
+    network = build(network_spec(network="user_networks:Stateful"), shape, OUTPUTS, COPIES).module
     drawn = torch.rand(3)
     torch.manual_seed(0)
     untried = Stateful(shape, OUTPUTS, COPIES)

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from planted import numbered, small_spec
 from scipy import stats
 
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.fitting.fit import fit
-from ddco_pyro.spec import parse_spec
+from ddco_pyro.spec import with_overrides
 
 STD = 0.4  # of the control, in units of its spread
 
@@ -27,26 +27,21 @@ def drawn(number=16):
         change = np.diff(pose, axis=0, prepend=pose[:1])
         actions = 100 + pose @ [[1.0, -3.0], [0.5, 0.0], [0.0, 2.0]] + 4 * change[:, :2] + 9 * goal
         actions += [5, 30] * random.normal(size=(steps, 2))
-        records.append(Demonstration(f"demo_{index}", {"pose": pose, "goal": goal}, actions))
-    return Demonstrations(tuple(records))
+        records.append(({"pose": pose, "goal": goal}, actions))
+    return numbered(records)
 
 
 @pytest.fixture(scope="module")
-def flat(tmp_path_factory):
+def flat():
     """A flat linear policy with a fixed deviation, and the demonstrations that it was fitted to."""
-    folder, demos = tmp_path_factory.mktemp("flat"), drawn()
-    demos.write(folder / "demos.hdf5")
-    spec = parse_spec(
-        {
-            "demonstrations": {"path": str(folder / "demos.hdf5"), "valid_fraction": 0},
-            "observations": [{"key": "pose", "differences": True}, "goal"],
-            "control": {"std": STD},
-            "baseline": {"kind": "flat", "policy": {"network": "linear"}},
-            "training": {"epochs": 500, "patience": None, "optimizer": {"lr": 0.01}},
-        }
+    spec = small_spec(
+        (),
+        demonstrations={"path": "unused.hdf5", "valid_fraction": 0},
+        observations=[{"key": "pose", "differences": True}, "goal"],
+        control={"std": STD},
+        training={"epochs": 500, "patience": None, "optimizer": {"lr": 0.01}},
     )
-    found = fit(spec, out=folder / "run")
-    return found, demos.split(spec.training.tune_fraction, spec.seed)[0]
+    return fit(spec, drawn()), drawn().split(spec.training.tune_fraction, spec.seed)[0]
 
 
 def features(demo):
@@ -90,35 +85,26 @@ def test_a_flat_linear_policy_reaches_least_squares(flat):
 def skills(number=16, steps=12):
     """Two skills, told apart by the sign of ``turn`` and by how long they have lasted."""
     random, records = np.random.default_rng(1), []
-    for index in range(number):
+    for _ in range(number):
         turn = np.where(np.arange(steps) < random.integers(4, 9), 1.0, -1.0)[:, None]
         place = random.normal(size=(steps, 2))
         actions = turn * place @ [[1.0, 0.3], [-0.4, 0.8]] + 0.5 * (turn > 0) + 0.2 * random.normal(size=(steps, 2))
         seen = {"place": place, "turn": turn + 0.5 * random.normal(size=(steps, 1))}
-        records.append(Demonstration(f"demo_{index}", seen, actions))
-    return Demonstrations(tuple(records))
+        records.append((seen, actions))
+    return numbered(records)
 
 
 @pytest.fixture(scope="module")
-def options(tmp_path_factory):
+def options():
     """Runs of a hierarchy with linear options, after one epoch and at the end, and their training demonstrations."""
-    folder, demos = tmp_path_factory.mktemp("options"), skills()
-    demos.write(folder / "demos.hdf5")
-    data = {
-        "demonstrations": {"path": str(folder / "demos.hdf5"), "valid_fraction": 0},
-        "observations": ["place", "turn"],
-        "control": {"std": 0.3},
-        "hierarchy": {
-            "levels": [{"count": 2, "policy": {"network": "linear"}, "termination": {"network": "linear"}}],
-            "meta_policy": {"network": "linear"},
-        },
-    }
-    found = {}
-    for epochs in (1, 400):
-        training = {"initialize": "vq_controls", "layerwise": False, "epochs": epochs, "patience": None}
-        spec = parse_spec(data | {"training": training | {"optimizer": {"lr": 0.01}}})
-        found[epochs] = fit(spec, out=folder / str(epochs))
-    return found, demos.split(spec.training.tune_fraction, spec.seed)[0]
+    spec = small_spec(
+        demonstrations={"path": "unused.hdf5", "valid_fraction": 0},
+        observations=["place", "turn"],
+        control={"std": 0.3},
+        training={"initialize": "vq_controls", "layerwise": False, "patience": None, "optimizer": {"lr": 0.01}},
+    )
+    found = {epochs: fit(with_overrides(spec, {"training.epochs": epochs}), skills()) for epochs in (1, 400)}
+    return found, skills().split(spec.training.tune_fraction, spec.seed)[0]
 
 
 def maximised(found, demos):

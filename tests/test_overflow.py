@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 import torch
 from command_line import call
+from planted import small_spec
+from random_demonstrations import of_states
 
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.fitting.evaluation import NotFinite, evaluate
 from ddco_pyro.fitting.fit import fit
-from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.model.networks import Inputs, InputShape
-from ddco_pyro.spec import parse_spec
 from ddco_pyro.training.objective import TrainingError
 
 SPEC = """
@@ -109,37 +108,15 @@ class Undefined(torch.nn.Module):
         return torch.full((*inputs.batch, *self.size), torch.nan) * self.weight
 
 
-def demonstrations_for(path: Path) -> Demonstrations:
-    random = np.random.default_rng(0)
-    records = [
-        Demonstration(f"demo_{n}", {"pose": random.normal(size=(5, 2))}, random.normal(size=(5, 2))) for n in range(5)
-    ]
-    found = Demonstrations(tuple(records))
-    found.write(path)
-    return found
-
-
-def spec_of(path: Path, network: str):
-    policy = {"network": network}
-    return parse_spec(
-        {
-            "demonstrations": {"path": str(path), "valid_fraction": 0.4},
-            "observations": ["pose"],
-            "hierarchy": {"levels": [{"count": 2, "policy": policy}], "meta_policy": {"network": "linear"}},
-            "training": {"epochs": 1},
-        }
-    )
-
-
-def test_networks_that_give_no_numbers_are_named_before_training(tmp_path: Path) -> None:
-    demonstrations_for(tmp_path / "demos.hdf5")
+def test_networks_that_give_no_numbers_are_named_before_training() -> None:
+    spec = small_spec(policy={"network": f"{__name__}:Undefined"})
     with pytest.raises(TrainingError, match="before any training a network gives values that are NaN or infinite; loo"):
-        fit(spec_of(tmp_path / "demos.hdf5", f"{__name__}:Undefined"), out=tmp_path / "run")
+        fit(spec, of_states([5] * 5))
 
 
 def test_a_likelihood_that_is_none_is_not_reported(tmp_path: Path) -> None:
-    demos = demonstrations_for(tmp_path / "demos.hdf5")
-    found: Fit = fit(spec_of(tmp_path / "demos.hdf5", "linear"), out=tmp_path / "run")
+    demos = of_states([5] * 5)
+    found = fit(small_spec(training={"epochs": 1}), demos, out=tmp_path / "run")
     with torch.no_grad():
         next(found.hierarchy.levels[0].policy.parameters())[:] = torch.inf
     with pytest.raises(NotFinite, match=r"run: the log-likelihood of demo_0 under the fitted model is (nan|-inf); "):

@@ -21,13 +21,14 @@ import pytest
 import torch
 from command_line import Ended, call
 from killing import struck
+from planted import small_spec
+from random_demonstrations import of_states
 
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import only_one
 from ddco_pyro.errors import BadInput, Failed
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.model.batch import STEPS_AT_ONCE
-from ddco_pyro.spec import dump_spec, parse_spec
+from ddco_pyro.spec import dump_spec
 from ddco_pyro.training import restarts as restarting
 from ddco_pyro.training.checkpoint import Progress, Restart
 from ddco_pyro.training.jobs import beside, early_process
@@ -43,34 +44,16 @@ DROPPING = {"network": "mlp", "hidden": [6], "dropout": 0.3}
 TRAINING = {"shards": 4, "batch_size": 5, "epochs": 16, "restarts": 2, "halving": 2, "optimizer": {"lr": 0.03}}
 """Minibatches of 5 and of 3 demonstrations: a shard has two or one, or is empty."""
 
-TORCHRUN = (sys.executable, "-m", "torch.distributed.run")
-
 
 def make_spec(path="unused.hdf5", **training):
-    return parse_spec(
-        {
-            "demonstrations": {"path": str(path)},
-            "observations": ["state"],
-            "control": {"std": 0.5, "scale": "none"},
-            "hierarchy": {
-                "levels": [{"count": 2, "policy": DROPPING, "termination": {"network": "linear"}}],
-                "meta_policy": {"network": "linear"},
-            },
-            "training": {**TRAINING, **training},
-        }
-    )
+    control, training = {"std": 0.5, "scale": "none"}, {**TRAINING, **training}
+    return small_spec(policy=DROPPING, demonstrations={"path": str(path)}, control=control, training=training)
 
 
 @pytest.fixture(scope="module")
 def demos():
     """Of unequal lengths."""
-    random = np.random.default_rng(0)
-    return Demonstrations(
-        tuple(
-            Demonstration(f"demo_{n}", {"state": random.normal(size=(t, 3))}, random.normal(size=(t, 2)))
-            for n, t in enumerate(random.integers(4, 9, 10).tolist())
-        )
-    )
+    return of_states(np.random.default_rng(0).integers(4, 9, 10).tolist())
 
 
 # --- a gradient from shards -------------------------------------------------------------------------------------------
@@ -109,9 +92,7 @@ def make(spec, demos, long, folder=None, **processes):
     """A trainer that tunes on two demonstrations, ``long`` ones in two pieces."""
     train, tune = demos.split(0.2, 0)
     if long:
-        random, steps = np.random.default_rng(1), STEPS_AT_ONCE // 2 + 1
-        draw = [(random.normal(size=(steps, 3)), random.normal(size=(steps, 2))) for _ in range(2)]
-        tune = Demonstrations(tuple(Demonstration(f"long_{n}", {"state": s}, a) for n, (s, a) in enumerate(draw)))
+        tune = of_states([STEPS_AT_ONCE // 2 + 1] * 2, seed=1)
     return Trainer(spec, Dimensions.of(demos), train, tune, folder, **processes)
 
 
@@ -202,25 +183,28 @@ def test_killed_on_two_processes_and_resumed_on_one(whole, tmp_path):
     assert (folder / "checkpoints" / "restart-0.safetensors").exists()
     status, err = struck(command, tmp_path, "EpochEnded", 5, KILL_THE_FIRST)
     assert status == -signal.SIGKILL
-    assert_ends(int(next(line for line in err.splitlines() if line.isdigit())))
+    assert_ends(int(next(line for line in err.splitlines() if line.isdigit())), 60)
     assert not (folder / "model.safetensors").exists()
     fit(spec, out=folder)
     assert_same_run(folder, run)
 
 
-def assert_ends(pid):
+def alive(process):
+    """Whether there is such a process, which is not a zombie."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except (ProcessLookupError, FileNotFoundError):
+        return False
+
+
+def assert_ends(process, seconds):
     """An orphan, which nobody waits for."""
-    for _ in range(600):
-        try:
-            os.kill(pid, 0)
-            ended = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
-        except (ProcessLookupError, FileNotFoundError):
-            return
-        if ended:
-            return
-        time.sleep(0.1)
-    os.kill(pid, signal.SIGKILL)
-    pytest.fail("the other process goes on alone")
+    deadline = time.monotonic() + seconds
+    while alive(process) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    if alive(process):
+        os.kill(process, signal.SIGKILL)
+        pytest.fail("the other process goes on alone")
 
 
 def under_torchrun(folder, *arguments, other=lambda: None):
@@ -282,20 +266,21 @@ def test_what_is_refused_under_torchrun_is_one_line_of_one_process(whole, tmp_pa
     assert other == (0, "", "")
 
 
+def with_training_of_the_other(train, spec, folder):
+    """What two processes end with, where the second trains in another way."""
+    command = ("fit", spec, "--out", folder / "run")
+    return under_torchrun(folder, *command, other=lambda: setattr(restarting, "train", train))
+
+
 def test_what_went_wrong_in_another_process_is_said_by_the_first(whole, tmp_path):
     """It was not killed: its own error is the reason."""
 
     def fails(*_, **__):
         raise RuntimeError("no room on this device")
 
-    spec, _ = whole
-    first, other = under_torchrun(
-        tmp_path, "fit", spec, "--out", tmp_path / "run", other=lambda: setattr(restarting, "train", fails)
-    )
-    said = (
-        "ddco-pyro: process 1, which trained together with this one, has failed: RuntimeError: no room on this device"
-    )
-    assert (first.status, first.err) == (1, f"{said}\n")
+    first, other = with_training_of_the_other(fails, whole[0], tmp_path)
+    said = "process 1, which trained together with this one, has failed: RuntimeError: no room on this device"
+    assert (first.status, first.err) == (1, f"ddco-pyro: {said}\n")
     assert other == (0, "", "")
 
 
@@ -304,25 +289,18 @@ def test_a_process_that_is_killed_is_not_said_to_have_failed(whole, tmp_path):
         (tmp_path / "other.json").write_text('[1, "", ""]')
         os.kill(os.getpid(), signal.SIGKILL)
 
-    spec, _ = whole
-    first, _ = under_torchrun(
-        tmp_path, "fit", spec, "--out", tmp_path / "run", other=lambda: setattr(restarting, "train", dies)
-    )
+    first, _ = with_training_of_the_other(dies, whole[0], tmp_path)
     assert (first.status, first.err.count("\n")) == (1, 1)
     assert first.err.startswith("ddco-pyro: a process that trained together with this one was ended from outside")
-
-
-def torchrun(spec, folder, *more):
-    """How two processes that torchrun starts end a fit."""
-    command = [*TORCHRUN, "--standalone", "--nproc-per-node", "2", "-m", "ddco_pyro.cli", "fit", spec, "--out", folder]
-    return subprocess.run([*command, *more], cwd=folder.parent, capture_output=True, text=True, timeout=600)
 
 
 def test_two_processes_of_torchrun_give_the_bits_of_one(demos, tmp_path):
     demos.write(tmp_path / "demos.hdf5")
     short = make_spec(tmp_path / "demos.hdf5", patience=None, epochs=4, restarts=1)
     (tmp_path / "spec.yaml").write_text(dump_spec(short))
-    ended = torchrun(tmp_path / "spec.yaml", tmp_path / "run")
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    command += ["-m", "ddco_pyro.cli", "fit", "spec.yaml", "--out", "run"]
+    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600)
     assert ended.returncode == 0, ended.stderr
     assert ended.stdout.count("report: ") == 1
     fit(tmp_path / "spec.yaml", out=tmp_path / "alone")
@@ -356,15 +334,6 @@ def test_torchrun_decides_how_many_there_are(monkeypatch):
 
 
 # --- processes beside this one ----------------------------------------------------------------------------------------
-
-
-def alive(process: int) -> bool:
-    """Whether there is such a process, which is not a zombie."""
-    try:
-        with open(f"/proc/{process}/stat") as file:
-            return file.read().rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
 
 
 def test_a_process_is_ready_before_there_is_work_and_ends_with_it() -> None:
@@ -422,7 +391,4 @@ def test_a_process_ends_with_the_one_that_is_killed_while_it_waits_for_work(tmp_
     with open(tmp_path / "process", "w") as file:
         killed = subprocess.run([sys.executable, "-c", KILLED], stdout=file)
     assert killed.returncode == -signal.SIGKILL
-    process, deadline = int((tmp_path / "process").read_text()), time.monotonic() + 10
-    while alive(process) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert not alive(process)
+    assert_ends(int((tmp_path / "process").read_text()), 10)

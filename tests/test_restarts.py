@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 import user_networks
-from planted import make_spec, make_trainer
+from planted import make_spec, make_trainer, small_spec
 from random_demonstrations import of_states
 from sklearn.metrics import normalized_mutual_info_score
 
@@ -14,7 +14,7 @@ from ddco_pyro.drawing import words
 from ddco_pyro.events import EpochEnded, RestartDiverged, RestartStopped
 from ddco_pyro.inference import segment
 from ddco_pyro.metrics import Training
-from ddco_pyro.spec import parse_spec
+from ddco_pyro.spec import with_overrides
 from ddco_pyro.training import loop as training
 from ddco_pyro.training import restarts as restarting
 from ddco_pyro.training.checkpoint import Progress, Restart
@@ -37,8 +37,11 @@ def spec():
 @pytest.fixture(scope="module")
 def undisturbed(spec, demos, tmp_path_factory):
     """The trainer, its model, and what was told, in one process without interruption."""
+    return trained(spec, demos, tmp_path_factory.mktemp("undisturbed"))
+
+
+def trained(spec, demos, folder):
     told = []
-    folder = tmp_path_factory.mktemp("undisturbed")
     trainer = make_trainer(spec, demos, folder, told.append)
     return trainer, trainer.run().state_dict(), told, checkpoints(folder)
 
@@ -92,24 +95,28 @@ def test_two_processes_give_the_same_bits_also_where_one_had_begun(
 # --- going on ---------------------------------------------------------------------------------------------------------
 
 
-def test_an_interruption_changes_nothing(undisturbed, spec, demos, tmp_path, monkeypatch):
+def test_an_interruption_changes_nothing(undisturbed, demos, tmp_path, monkeypatch):
     """In the first rung, at its end, in the middle of later ones, again and again until it is done."""
-    monkeypatch.setattr(training, "SAVE_EVERY", 0.0)
-    interruptions, stopped = 0, []
-    while True:
-        told = Interrupting(4)
-        trainer = make_trainer(spec, demos, tmp_path, told)
-        try:
-            model = trainer.run().state_dict()
-        except KeyboardInterrupt:
-            interruptions += 1
-        else:
-            break
-        finally:
-            stopped += told.stopped
+    stopped, interruptions = interrupted_again_and_again(4, undisturbed, demos, tmp_path, monkeypatch)
     assert stopped == [event for event in undisturbed[2] if isinstance(event, RestartStopped)]  # each once
     assert interruptions >= len(undisturbed[0].history) // 4
-    assert_same(trainer, model, tmp_path, undisturbed)
+
+
+def interrupted_again_and_again(epochs, undisturbed, demos, folder, monkeypatch):
+    """After so many epochs, until it is done and gives the same bits; which restarts were said to be stopped, and how
+    often it was interrupted.
+    """
+    monkeypatch.setattr(training, "SAVE_EVERY", 0.0)
+    stopped = []
+    for interruptions in range(100):
+        told = Interrupting(epochs)
+        trainer = make_trainer(undisturbed[0].spec, demos, folder, told)
+        try:
+            assert_same(trainer, trainer.run().state_dict(), folder, undisturbed)
+            return stopped + told.stopped, interruptions
+        except KeyboardInterrupt:
+            stopped += told.stopped
+    pytest.fail("it makes no progress")
 
 
 # --- who goes on ------------------------------------------------------------------------------------------------------
@@ -183,8 +190,7 @@ def test_the_worse_half_is_stopped_at_each_rung(demos, tmp_path, monkeypatch, se
 def test_without_halving_all_are_trained_and_the_best_is_kept(demos, tmp_path, undisturbed, spec):
     """Each as a training of its own would be, which knows nothing of restarts."""
     told = []
-    off = spec.model_copy(update={"training": spec.training.model_copy(update={"halving": None})})
-    trainer = make_trainer(off, demos, tmp_path, told.append)
+    trainer = make_trainer(with_overrides(spec, {"training.halving": None}), demos, tmp_path, told.append)
     model = trainer.run().state_dict()
     assert not any(isinstance(event, RestartStopped) for event in told)
     alone = []
@@ -219,16 +225,8 @@ def test_what_is_told_of_restarts_adds_up(undisturbed):
 def diverging(passes, **training):
     """Restarts of which those that begin with a positive weight have that many passes before they give NaN."""
     policy = {"network": "user_networks:Diverging", "options": {"passes": passes}}
-    model = {"hierarchy": None, "baseline": {"kind": "flat", "policy": policy}}
-    return parse_spec(
-        model
-        | {
-            "demonstrations": {"path": "unused.hdf5"},
-            "observations": ["state"],
-            "control": {"std": 1.0, "scale": "none"},
-            "training": {"restarts": 6, "halving": 3, "epochs": 12, "patience": None, "tune_fraction": 0.2, **training},
-        }
-    )
+    own = {"restarts": 6, "halving": 3, "epochs": 12, "patience": None, "tune_fraction": 0.2, **training}
+    return small_spec((), policy, control={"std": 1.0, "scale": "none"}, training=own)
 
 
 def diverged(trainer):
@@ -238,9 +236,8 @@ def diverged(trainer):
 @pytest.fixture(scope="module", params=[(1, 3), (4, 3), (10, 2)])
 def with_diverging(request, demos, tmp_path_factory):
     """As ``undisturbed``; restarts diverge in the first rung, after it, or when all others have been stopped."""
-    told, folder = [], tmp_path_factory.mktemp("diverging")
-    trainer = make_trainer(diverging(request.param[0], halving=request.param[1]), demos, folder, told.append)
-    return trainer, trainer.run().state_dict(), told, checkpoints(folder)
+    passes, halving = request.param
+    return trained(diverging(passes, halving=halving), demos, tmp_path_factory.mktemp("diverging"))
 
 
 def test_a_restart_that_diverges_ends_there_and_is_not_the_best(with_diverging):
@@ -269,18 +266,8 @@ def test_a_restart_that_diverges_ends_there_and_is_not_the_best(with_diverging):
 
 
 def test_an_interruption_changes_nothing_where_restarts_diverge(with_diverging, demos, tmp_path, monkeypatch):
-    monkeypatch.setattr(training, "SAVE_EVERY", 0.0)
-    told = []
-    for _ in range(100):
-        trainer, interrupting = None, Interrupting(7)
-        try:
-            trainer = make_trainer(with_diverging[0].spec, demos, tmp_path, interrupting)
-            model = trainer.run().state_dict()
-            break
-        except KeyboardInterrupt:
-            told.append(trainer)
-    assert len(told) > 3
-    assert_same(trainer, model, tmp_path, with_diverging)
+    _, interruptions = interrupted_again_and_again(7, with_diverging, demos, tmp_path, monkeypatch)
+    assert interruptions > 3
 
 
 @pytest.mark.slow

@@ -11,15 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import call
+from planted import numbered
 
 from ddco_pyro.data.checks import rounding
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.inspection import inspect
 from ddco_pyro.data.starting import starting_spec
 from ddco_pyro.model.encoder import ObservationEncoder
 from ddco_pyro.spec import ObservationSpec
-
-SHAPES = {"resting": (4,), "half": (3,), "place": (2,), "distance": (1,), "settled": (1,)}
 
 
 def make_demonstrations(number: int = 6, steps: int = 20) -> Demonstrations:
@@ -29,15 +28,15 @@ def make_demonstrations(number: int = 6, steps: int = 20) -> Demonstrations:
         noise = random.normal(0, 2e-7, (steps, 3))
         place = random.normal(size=(steps, 2)).cumsum(0)
         observations = {
-            "resting": np.column_stack([np.ones(steps), noise]).astype(np.float32),  # a quaternion
+            "resting": np.column_stack([np.ones(steps), noise]),  # a quaternion
             "half": np.column_stack([place[:, :1], 0.7 + noise[:, :1], random.normal(0, 1e-3, steps)]),
             "place": place,
             "distance": 1e-7 * place[:, :1],  # small, and nothing but signal
             "settled": np.full((steps, 1), 0.3 * index) + noise[:, :1],  # differs between demonstrations alone
         }
         observations = {key: values.astype(np.float32) for key, values in observations.items()}
-        records.append(Demonstration(f"demo_{index}", observations, place + random.normal(0, 0.1, (steps, 2))))
-    return Demonstrations(tuple(records))
+        records.append((observations, place + random.normal(0, 0.1, (steps, 2))))
+    return numbered(records)
 
 
 DEMOS = make_demonstrations()
@@ -91,11 +90,11 @@ def test_init_leaves_them_out(path: Path) -> None:
     assert all(f"  - {{key: {key}, differences: true}}\n" in text for key in ("half", "place", "distance"))
 
 
-def features(key: str, differences: bool = False) -> np.ndarray:
+def features(key: str, differences: bool = False, demos: Demonstrations = DEMOS) -> np.ndarray:
     """What networks see of an observation in all steps, [steps, F]."""
-    encoder = ObservationEncoder([ObservationSpec(key=key, differences=differences)], SHAPES)
-    encoder.fit(DEMOS)
-    return encoder.inputs(demo.observations for demo in DEMOS).vector.flatten(0, 1).numpy()
+    encoder = ObservationEncoder([ObservationSpec(key=key, differences=differences)], demos.observation_shapes)
+    encoder.fit(demos)
+    return encoder.inputs(demo.observations for demo in demos).vector.flatten(0, 1).numpy()
 
 
 def test_the_encoder_only_centres_them() -> None:
@@ -115,8 +114,5 @@ def test_differences_of_what_rests_in_each_demonstration_are_only_centred() -> N
 def test_slow_motion_is_no_rounding() -> None:
     """At 1 kHz a metre of float64 moves by micrometres in a step, which is a velocity."""
     steps = np.sin(np.linspace(0, 3, 50))[:, None]
-    records = [Demonstration(f"demo_{n}", {"place": 0.5 + 1e-5 * (steps * n).cumsum(0)}, steps) for n in range(1, 4)]
-    encoder = ObservationEncoder([ObservationSpec(key="place", differences=True)], {"place": (1,)})
-    encoder.fit(Demonstrations(tuple(records)))
-    found = np.concatenate([encoder.inputs([demo.observations]).vector[0].numpy() for demo in records])
-    np.testing.assert_allclose(found.std(0), 1, atol=1e-5)
+    moving = numbered(({"place": 0.5 + 1e-5 * (steps * n).cumsum(0)}, steps) for n in range(1, 4))
+    np.testing.assert_allclose(features("place", True, moving).std(0), 1, atol=1e-5)

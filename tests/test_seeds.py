@@ -6,19 +6,19 @@ import csv
 import json
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
-from command_line import call
+from command_line import call, with_set
+from planted import LINEAR, numbered, small_spec
 from scipy import stats
 
 import ddco_pyro
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
+from ddco_pyro.data.demonstrations import DemonstrationsError
 from ddco_pyro.drawing import words
 from ddco_pyro.metrics import Rollouts, Seeds
-from ddco_pyro.spec import load_spec, parse_spec, with_overrides
+from ddco_pyro.spec import load_spec, with_overrides
 
 SPEC = {
     "task": "toy",
@@ -147,47 +147,29 @@ def test_rollouts_have_the_same_two_parts_and_the_same_seeds(written, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("changes", "said"),
     [
-        (
-            ["--set", "demonstrations.valid_fraction=0", "--set", "compare_with=[]"],
-            "compares on held-out demonstrations",
-        ),
-        (["--set", f"training.seed={2**32 - 2}"], "training.seed: must be at most 4294967295"),
+        (("demonstrations.valid_fraction=0", "compare_with=[]"), "compares on held-out demonstrations"),
+        ((f"training.seed={2**32 - 2}",), "training.seed: must be at most 4294967295"),
     ],
 )
-def test_what_cannot_be_repeated_is_refused_before_any_work(written, tmp_path, arguments, said):
-    ended = call("fit", written[0], "--out", tmp_path / "run", "--seeds", 3, *arguments)
+def test_what_cannot_be_repeated_is_refused_before_any_work(written, tmp_path, changes, said):
+    ended = call("fit", written[0], "--out", tmp_path / "run", "--seeds", 3, *with_set(*changes))
     assert ended.status == 2
     assert said in ended.err
     assert len(ended.err.splitlines()) == 1
-    assert not Path(tmp_path / "run").exists()
+    assert not (tmp_path / "run").exists()
 
 
 # --- few demonstrations: each is left out once ------------------------------------------------------------------------
 
 
-LINEAR = {"network": "linear"}
-
-
-def spec_of(**demonstrations):
-    return parse_spec(
-        {
-            "demonstrations": {"path": "unused.hdf5", "leave_one_out": True, "labels": "skill", **demonstrations},
-            "observations": ["state"],
-            "control": {"std": {"learn": True, "floor": 0.01, "per_option": True}},
-            "hierarchy": {
-                "levels": [{"count": 2, "policy": LINEAR, "termination": LINEAR}],
-                "meta_policy": LINEAR,
-            },
-            "compare_with": [{"kind": "flat", "policy": LINEAR}],
-            "training": {
-                "optimizer": {"name": "em"},
-                "epochs": 30,
-                "tune_fraction": 0,
-                "initialize": "vq_controls",
-            },
-        }
+def few_spec():
+    return small_spec(
+        demonstrations={"path": "unused.hdf5", "leave_one_out": True, "labels": "skill"},
+        control={"std": {"learn": True, "floor": 0.01, "per_option": True}},
+        compare_with=[{"kind": "flat", "policy": LINEAR}],
+        training={"optimizer": {"name": "em"}, "epochs": 30, "tune_fraction": 0, "initialize": "vq_controls"},
     )
 
 
@@ -198,28 +180,26 @@ def planted(number=4):
         skill = np.repeat([0, 1], [8 + n, 12 - n])
         state = random.normal(size=(20, 2)) + 2.0 * np.where(skill == 0, -1, 1)[:, None]
         actions = np.where(skill[:, None] == 0, state, -state) + 0.1 * random.normal(size=state.shape)
-        each.append(Demonstration(f"demo_{n}", {"state": state}, actions, labels={"skill": skill}))
-    return Demonstrations(tuple(each))
+        each.append(({"state": state}, actions, {"skill": skill}))
+    return numbered(each)
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    return ddco_pyro.fit(spec_of(), planted(), out=tmp_path_factory.mktemp("few") / "run")
+    return ddco_pyro.fit(few_spec(), planted(), out=tmp_path_factory.mktemp("few") / "run")
 
 
 def test_every_demonstration_trains_and_is_held_out_from_a_fit_without_it(run):
     demos, counts = planted(), run.metrics.demonstrations
     assert (counts.train, counts.tune, counts.valid, counts.left_out) == (4, 0, 4, True)
-    whole = with_overrides(run.spec, {"demonstrations.leave_one_out": False})
+    alone = {"demonstrations.leave_one_out": False, "compare_with": []}
+    masked, one = replace(demos, masks={"valid": ("demo_0",)}), demos.select(["demo_0"])
     for method, model in (("ddco", run), *run.baselines.items()):
-        spec = with_overrides(model.spec, {"demonstrations.leave_one_out": False})
-        each = {row.name: row.log_likelihood for row in model.metrics.valid}
-        for name in demos.names[:1]:
-            masked = replace(demos, masks={"valid": (name,)})  # the same held out by a mask instead
-            apart = ddco_pyro.fit(with_overrides(spec, {"compare_with": []}), masked)
-            assert each[name] == pytest.approx(float(apart.log_likelihood(demos.select([name]))[0])), method
-            assert each[name] < float(model.log_likelihood(demos.select([name]))[0])  # which the model was fitted to
-    everything = ddco_pyro.fit(with_overrides(whole, {"demonstrations.valid_fraction": 0.0, "compare_with": []}), demos)
+        (held_out,) = (row.log_likelihood for row in model.metrics.valid if row.name == "demo_0")
+        apart = ddco_pyro.fit(with_overrides(model.spec, alone), masked)  # the same held out by a mask instead
+        assert held_out == pytest.approx(float(apart.log_likelihood(one)[0])), method
+        assert held_out < float(model.log_likelihood(one)[0])  # which the model was fitted to
+    everything = ddco_pyro.fit(with_overrides(run.spec, alone | {"demonstrations.valid_fraction": 0.0}), demos)
     np.testing.assert_array_equal(run.log_likelihood(demos), everything.log_likelihood(demos))
 
 
@@ -245,16 +225,13 @@ def test_a_run_has_the_models_without_one_and_goes_on_with_them(run, tmp_path):
 def test_what_masks_hold_out_cannot_be_trained_with():
     masked = replace(planted(), masks={"valid": ("demo_0",)})
     with pytest.raises(DemonstrationsError, match="leave_one_out: trains with every demonstration"):
-        ddco_pyro.fit(spec_of(), masked)
+        ddco_pyro.fit(few_spec(), masked)
 
 
 def test_runs_are_compared_by_what_the_fits_without_one_say(run):
     compared = ddco_pyro.compare([run.folder, run.folder / "baselines" / "flat"])
     each = {row.name: row.each for row in compared.rows}
     assert each[str(run.folder)] == pytest.approx([row.log_likelihood for row in run.metrics.valid])
-
     assert "each is held out from a fit without it" in words.verdict(run.metrics)
-    assert (
-        words.division(run.metrics.demonstrations)
-        == "4 for training, 0 for tuning, each held out from a fit without it"
-    )
+    said = words.division(run.metrics.demonstrations)
+    assert said == "4 for training, 0 for tuning, each held out from a fit without it"

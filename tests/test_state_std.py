@@ -6,19 +6,18 @@ import numpy as np
 import pytest
 import torch
 from hierarchies import make_batch, make_hierarchy, varied
+from planted import LINEAR, numbered, small_spec
 from scipy import stats
 
 import ddco_pyro
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.inference.engines import compare_engines
 from ddco_pyro.model.controls import INITIAL_STD
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.spec import SpecError, parse_spec
+from ddco_pyro.spec import SpecError
 from ddco_pyro.training.networks import Dimensions, baseline_spec, build_hierarchy, parameters
 
 OF_STATE = {"learn": True, "per_state": True}
 OF_OPTION = {"learn": True, "per_option": True}
-LINEAR = {"network": "linear"}
 
 
 def softplus(values):
@@ -72,14 +71,7 @@ def test_at_first_it_is_the_same_everywhere(network):
 def test_dimensions_with_other_sigmas_stand_beside():
     """One of the state, one of each option, one fixed."""
     parts = [{"name": "a", "dims": [2], "std": OF_STATE}, {"name": "b", "dims": [0], "std": OF_OPTION}]
-    spec = parse_spec(
-        {
-            "demonstrations": {"path": "unused.hdf5"},
-            "observations": ["state"],
-            "control": {"std": 0.3, "parts": parts},
-            "hierarchy": {"levels": [{"count": 2}]},
-        }
-    )
+    spec = small_spec(control={"std": 0.3, "parts": parts})
     hierarchy, batch = varied(Hierarchy(spec, {"state": (3,)}, 3, 4)), make_batch()
     with torch.no_grad():
         hierarchy.levels[0].policy.std.raw_own[1] += 1
@@ -100,27 +92,24 @@ def noisy(number=40, steps=25):
     One policy does all of it: there is no skill.
     """
     random, made, densities = np.random.default_rng(0), [], []
-    for index in range(number):
+    for _ in range(number):
         state = random.uniform(-1, 1, (steps, 2))
         mean = state @ np.array([[1.0, -0.5], [0.3, 1.0]])
         std = 0.05 + softplus(2.5 * state[:, :1] - 1 + np.array([0.0, 0.5]))
         actions = mean + std * random.normal(size=mean.shape)
-        made.append(Demonstration(f"demo_{index}", {"state": state}, actions))
+        made.append(({"state": state}, actions))
         densities.append(stats.norm.logpdf(actions, mean, std).sum() / steps)
-    return Demonstrations(tuple(made)), dict(zip((demo.name for demo in made), densities, strict=True))
+    demos = numbered(made)
+    return demos, dict(zip(demos.names, densities, strict=True))
 
 
 def flat_spec(**changes):
-    return parse_spec(
-        {
-            "demonstrations": {"path": "unused.hdf5", "valid_fraction": 0.4},
-            "observations": ["state"],
-            "control": {"std": {**OF_STATE, "floor": 0.02}, "scale": "none", "kind": "gaussian"},
-            "baseline": {"kind": "flat", "policy": LINEAR},
-            "training": {"epochs": 150, "optimizer": {"lr": 0.03}, "batch_size": 24},
-        }
-        | changes
-    )
+    sections = {
+        "demonstrations": {"path": "unused.hdf5", "valid_fraction": 0.4},
+        "control": {"std": {**OF_STATE, "floor": 0.02}, "scale": "none", "kind": "gaussian"},
+        "training": {"epochs": 150, "optimizer": {"lr": 0.03}, "batch_size": 24},
+    }
+    return small_spec((), **sections | changes)
 
 
 @pytest.fixture(scope="module")
@@ -181,14 +170,9 @@ def test_without_skill_options_lead_by_their_sigma_alone():
 # --- a baseline's own -------------------------------------------------------------------------------------------------
 
 
-def beside(*compare_with, **control):
-    return flat_spec(
-        control=control, baseline=None, hierarchy={"levels": [{"count": 3}]}, compare_with=list(compare_with)
-    )
-
-
 def test_flat_equal_counts_the_numbers_for_sigma():
-    spec = beside("flat_equal", {"kind": "flat_equal", "std": OF_STATE}, std=OF_OPTION)
+    compare_with, control = ["flat_equal", {"kind": "flat_equal", "std": OF_STATE}], {"std": OF_OPTION}
+    spec = small_spec(control=control, hierarchy={"levels": [{"count": 3}]}, compare_with=compare_with)
     size = Dimensions({"state": (2,)}, 2, 25)
     whole = parameters(build_hierarchy(spec, size))
     one, of_state = (baseline_spec(spec, baseline, size) for baseline in spec.compare_with)
@@ -199,13 +183,11 @@ def test_flat_equal_counts_the_numbers_for_sigma():
 
 # --- what is refused --------------------------------------------------------------------------------------------------
 
-BOTH = {"learn": True, "per_option": True, "per_state": True}
-
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"control": {"std": BOTH}}, "control.std.per_option: per_state gives each option its own σ already"),
+        ({"control": {"std": OF_OPTION | OF_STATE}}, "control.std.per_option: per_state gives each option its own σ"),
         ({"baseline": {"kind": "flat", "std": OF_STATE}}, "baseline.std: is for baselines in compare_with"),
         (
             {"control": {"std": 0.1}, "compare_with": [{"kind": "flat", "std": OF_STATE}]},

@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from planted import CONTROL, TRAINING, make_spec, make_trainer, make_truth, plant, recovered
+from planted import CONTROL, TRAINING, make_spec, make_trainer, make_truth, numbered, per_step, plant, recovered
 from random_demonstrations import of_states
 
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.inference import log_likelihood
-from ddco_pyro.spec import parse_spec, with_overrides
+from ddco_pyro.spec import with_overrides
 from ddco_pyro.training.checkpoint import Progress, Restart
 from ddco_pyro.training.loop import StageTraining, backward, train
 from ddco_pyro.training.objective import Objective, TrainingError
@@ -21,19 +21,6 @@ from ddco_pyro.training.stages import RISING, StageEnd, plan
 
 QUICK = {"control": {"std": 1.0}, "optimizer": {"lr": 0.1}}
 """Every stage soon stops."""
-
-
-def flat(kind="flat", network="linear", lr=0.03, **training):
-    """The spec of a policy without options."""
-    return parse_spec(
-        {
-            "demonstrations": {"path": "unused.hdf5"},
-            "observations": ["state"],
-            "control": {"std": 0.5, "scale": "none"},
-            "baseline": {"kind": kind, "policy": {"network": network}},
-            "training": {"optimizer": {"lr": lr}, **training},
-        }
-    )
 
 
 @pytest.mark.parametrize(
@@ -57,7 +44,7 @@ def test_stages_go_from_the_lowest_level_up(training, depth, names):
 def lines(**training):
     """Ten demonstrations along a line, cut into three equal parts, and how they are fitted."""
     line = np.linspace(-1, 1, 12)[:, None] * [1.0, 0.0] + np.random.default_rng(0).normal(0, 0.02, (10, 12, 2))
-    demos = Demonstrations(tuple(Demonstration(f"demo_{n}", {"state": one}, one) for n, one in enumerate(line)))
+    demos = numbered(({"state": one}, one) for one in line)
     own = {"initialize": "equal_parts", "layerwise": False, "optimizer": {"lr": 0.1}, "epochs": 800, "patience": None}
     return make_trainer(make_spec((3,), **own, **training), demos, None).data
 
@@ -174,11 +161,10 @@ def test_stages_share_the_budget_and_what_one_leaves_goes_to_the_later_ones(tmp_
     assert trainer.summary["spent"]["epochs"] == 62 - left
 
 
-@pytest.mark.parametrize("model", [(2, 2), "flat"])
-def test_every_model_has_the_same_budget(tmp_path, model):
+@pytest.mark.parametrize("counts", [(2, 2), ()])
+def test_every_model_has_the_same_budget(tmp_path, counts):
     """Whatever the number of its stages: 1 or 6 here. The steps are those of minibatches of 3 out of 8."""
-    training = {"epochs": 14, "patience": None, "batch_size": 3, "restarts": 2}
-    spec = flat(model, **training) if isinstance(model, str) else make_spec(model, **training)
+    spec = make_spec(counts, epochs=14, patience=None, batch_size=3, restarts=2)
     trainer = make_trainer(spec, of_states([8] * 10), tmp_path)
     trainer.run()
     assert sum(epochs_of(trainer, 0).values()) == sum(epochs_of(trainer, 1).values()) == 14
@@ -223,8 +209,7 @@ def test_the_running_mean_of_the_weights_is_evaluated_and_kept(tmp_path, monkeyp
 
     monkeypatch.setattr(StageTraining, "step", step)
     monkeypatch.setattr(Objective, "tune", tune)
-    spec = flat(average=decay, epochs=3, batch_size=4)
-    final = make_trainer(spec, of_states([8] * 10), tmp_path).run()
+    final = make_trainer(make_spec((), average=decay, epochs=3, batch_size=4), of_states([8] * 10), tmp_path).run()
     assert (len(steps), len(shown)) == (3 * 2, 1 + 3)
     for epoch, seen in enumerate(shown[1:], start=1):
         taken = steps[: 2 * epoch]
@@ -296,8 +281,7 @@ def test_both_engines_train_to_the_same_model(tmp_path):
     demos = of_states([5] * 6)
     states = []
     for engine in ("fused", "enumerate"):
-        spec = make_spec((2,), epochs=8, control={"std": 1.0})
-        spec = spec.model_copy(update={"inference": spec.inference.model_copy(update={"engine": engine})})
+        spec = with_overrides(make_spec((2,), epochs=8, control={"std": 1.0}), {"inference.engine": engine})
         states.append(make_trainer(spec, demos, tmp_path / engine).run().state_dict())
     for name, value in states[0].items():
         torch.testing.assert_close(states[1][name], value, rtol=1e-3, atol=1e-5)
@@ -332,12 +316,8 @@ def test_how_much_a_stage_still_rose(tune, patience, rising, over):
 def test_what_is_called_converged_is_at_the_optimum(tmp_path):
     """A linear policy with a fixed σ is least squares: its optimum is known without any training."""
     random = np.random.default_rng(0)
-    weights = random.normal(size=(3, 2))
-    records = []
-    for number in range(10):
-        state = random.normal(size=(50, 3))
-        records.append(Demonstration(f"demo_{number}", {"state": state}, state @ weights + random.normal(size=(50, 2))))
-    demos = Demonstrations(tuple(records))
+    weights, states = random.normal(size=(3, 2)), random.normal(size=(10, 50, 3))
+    demos = numbered(({"state": state}, state @ weights + random.normal(size=(50, 2))) for state in states)
     train, tune = demos.split(0.2, 0)
     states = [
         np.concatenate([np.column_stack([d.observations["state"], np.ones(50)]) for d in p]) for p in (train, tune)
@@ -347,7 +327,8 @@ def test_what_is_called_converged_is_at_the_optimum(tmp_path):
     optimum = (-0.5 * (error / 0.5) ** 2 - np.log(0.5) - 0.5 * np.log(2 * np.pi)).sum(1).mean()
     below = {}
     for epochs in (15, 400):
-        trainer = make_trainer(flat(epochs=epochs, patience=None, batch_size=8), demos, tmp_path / str(epochs))
+        spec = make_spec((), control={"std": 0.5, "scale": "none"}, epochs=epochs, patience=None, batch_size=8)
+        trainer = make_trainer(spec, demos, tmp_path / str(epochs))
         trainer.run()
         below[trainer.summary["converged"]] = optimum - trainer.restarts[0].progress.best
     assert below[True] < RISING
@@ -389,13 +370,8 @@ def test_a_hierarchy_begins_from_the_mixtures_fit_with_psi_one_half(tmp_path, co
     always = {f"hierarchy.levels.{n}.termination": "always" for n in range(len(counts))}
     mixture = replace(data, spec=with_overrides(spec, always)).hierarchy(0)
     mixture.load_state_dict({name: restart.states["model"][name] for name in mixture.state_dict()})
-    with torch.no_grad():
-        ends = [level[..., 1].exp() for level in model.tabulate(data.train).termination]
-        without = [
-            float(log_likelihood(mixture.tabulate(batch), batch.lengths).sum()) / batch.steps
-            for batch in (data.train, data.tune)
-        ]
-    assert all(torch.allclose(level, torch.tensor(0.5)) for level in ends)
+    assert [torch.allclose(ends, torch.tensor(0.5)) for ends in psi(model, data.train)] == [True] * len(counts)
+    without = [per_step(mixture, batch) for batch in (data.train, data.tune)]
     tuned = [row["tune"] for row in restart.progress.history if row["stage"] == "mixture"]
     kept = tuned[-1] if optimizer["name"] == "em" else max(tuned)  # EM before the last stage keeps what converged
     assert kept == pytest.approx(without[1], abs=1e-5)
@@ -403,14 +379,14 @@ def test_a_hierarchy_begins_from_the_mixtures_fit_with_psi_one_half(tmp_path, co
     assert restart.progress.ended[-1]["stage"] == "joint"
     assert restart.progress.best > without[1]
     found = data.hierarchy(0, restart.states["best"])
+    assert per_step(found, data.train) > without[0]
+    assert not all(torch.allclose(ends, torch.tensor(0.5)) for ends in psi(found, data.train))
+
+
+def psi(model, batch):
+    """Of each level."""
     with torch.no_grad():
-        assert (
-            float(log_likelihood(found.tabulate(data.train), data.train.lengths).sum()) / data.train.steps > without[0]
-        )
-        assert any(
-            not torch.allclose(level[..., 1].exp(), torch.tensor(0.5))
-            for level in found.tabulate(data.train).termination
-        )
+        return [level[..., 1].exp() for level in model.tabulate(batch).termination]
 
 
 @pytest.mark.slow
@@ -450,11 +426,6 @@ def odd(demos, name):
     return Demonstrations(
         tuple(replace(demo, actions=-3 * demo.actions) if demo.name == name else demo for demo in demos)
     )
-
-
-def per_step(model, batch):
-    with torch.no_grad():
-        return float(log_likelihood(model.tabulate(batch), batch.lengths).sum()) / batch.steps
 
 
 @pytest.mark.parametrize("number", [25, 30])

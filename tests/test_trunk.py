@@ -5,31 +5,24 @@ from __future__ import annotations
 import pytest
 import torch
 from hierarchies import SHAPES, make_batch
+from planted import LINEAR, small_spec
 from stacked_networks import COPIES, FEATURES, LONGEST, PIXELS, answer, assert_close, make, random_inputs
 
 from ddco_pyro.inference import log_likelihood
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import InputShape, ShapeError, build_trunk
-from ddco_pyro.spec import SpecError, network_spec, parse_spec
+from ddco_pyro.spec import SpecError, network_spec
 from ddco_pyro.training.stages import plan
 
 SEES = {"network": "mlp", "hidden": [5], "activation": "tanh"}
 JOINED = {"network": "mlp", "hidden": [4], "activation": "tanh"}
-LINEAR = {"network": "linear"}
 
 
 def spec_of(network, trunk=None, own=None, meta=None, **training):
     """Two levels; ``own`` is the trunk of each."""
     level = {"policy": network, "termination": network, "trunk": own}
     levels = [level | {"name": "lower", "count": 3}, level | {"name": "upper", "count": 2}]
-    return parse_spec(
-        {
-            "demonstrations": {"path": "unused.hdf5"},
-            "observations": list(SHAPES),
-            "hierarchy": {"trunk": trunk, "levels": levels, "meta_policy": meta or network},
-            "training": training,
-        }
-    )
+    return small_spec(hierarchy={"trunk": trunk, "levels": levels, "meta_policy": meta or network}, training=training)
 
 
 def made(spec):

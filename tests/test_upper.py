@@ -21,8 +21,8 @@ from ddco_pyro.training.upper import Constants, expected, fitted, improved
 STEPS = 3
 
 
-def random_constants(tables, seed=0):
-    return Constants.drawn(tables, np.random.default_rng(seed))
+def random_constants(tables):
+    return Constants.drawn(tables, np.random.default_rng(0))
 
 
 # --- an iteration -----------------------------------------------------------------------------------------------------
@@ -39,20 +39,20 @@ def random_constants(tables, seed=0):
 def test_an_iteration_divides_counts_over_every_path(monkeypatch, counts, hybrid):
     """Selections and terminations counted on one path after another, each weighted by its probability."""
     monkeypatch.setattr(upper, "PSEUDO", 0.0)
-    tables = random_tables(counts, hybrid, 2, STEPS)
+    tables, lengths = random_tables(counts, hybrid, 2, STEPS), (STEPS, STEPS - 1)
     constants = random_constants(tables)
     constant, depth = constants.within(tables), len(counts)
     selected = [np.zeros(table.shape) for table in constants.selection]
     ended = [np.zeros((count, 2)) for count in counts[1:]]
     value = 0.0
-    for n in range(2):
-        every = list(paths(constant, n, STEPS, [1 + count for count in counts]))
+    for n, length in enumerate(lengths):
+        every = list(paths(constant, n, length, [1 + count for count in counts]))
         total = sum(probability for *_, probability in every)
         value += math.log(total)
         for h, b, probability in every:
             if probability:
                 _count(h, b, probability / total, depth, selected, ended)
-    found, after = improved([(tables, torch.tensor([STEPS, STEPS]))], constants)
+    found, after = improved([(tables, torch.tensor(lengths))], constants)
     assert found == pytest.approx(value, abs=1e-9)
     for own, counted in zip(after.selection, selected, strict=True):
         np.testing.assert_allclose(own, counted / counted.sum(-1, keepdims=True), atol=1e-9)
@@ -62,7 +62,7 @@ def test_an_iteration_divides_counts_over_every_path(monkeypatch, counts, hybrid
 
 def _count(h, b, weight, depth, selected, ended):
     """A path's selections, and the ends of levels whose lower neighbour ended too."""
-    for t, level in itertools.product(range(STEPS), range(depth)):
+    for t, level in itertools.product(range(len(h)), range(depth)):
         if b[t][level]:
             caller = h[t][level + 1] - 1 if level + 1 < depth else 0
             selected[level][caller, h[t][level] - 1] += weight
@@ -123,17 +123,6 @@ def _log_selections_and_ends(tables, n, h, b):
         if level == 1 and t > 0 and b[t][0]:
             total += float(tables.termination[1][n, t, h[t - 1][1] - 1, b[t][1]])
     return total
-
-
-def test_no_networks_are_scored_higher_than_the_expected_counts(monkeypatch):
-    """Gibbs' inequality: of what says the same at every step, an iteration's result is the best."""
-    monkeypatch.setattr(upper, "PSEUDO", 0.0)
-    tables, lengths = random_tables((3, 2), (False, False), 4, 6), torch.tensor([6, 6, 2, 5])
-    constants = random_constants(tables)
-    best = improved([(tables, lengths)], constants)[1]
-    score = float(expected(best.within(tables), lengths, constants).sum())
-    for seed in range(5):
-        assert float(expected(random_constants(tables, seed + 1).within(tables), lengths, constants).sum()) < score
 
 
 def test_the_gradient_stays_finite_where_callers_have_no_control():

@@ -11,11 +11,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 COMMAND = Path(sys.executable).with_name("ddco-pyro")
 
@@ -31,16 +29,15 @@ def environment(cache: Path) -> dict[str, str]:
 
 def whole(arguments: Sequence[object], folder: Path, cache: Path) -> float:
     """Run a command undisturbed; its seconds."""
-    start = time.monotonic()
-    subprocess.run(
-        [COMMAND, *map(str, arguments)],
-        cwd=folder,
-        env=environment(cache),
-        check=True,
-        capture_output=True,
-        timeout=HANGS,
-    )
+    start, command = time.monotonic(), [COMMAND, *map(str, arguments)]
+    subprocess.run(command, cwd=folder, env=environment(cache), check=True, capture_output=True, timeout=HANGS)
     return time.monotonic() - start
+
+
+def started(command: Sequence[object], err: IO[str], folder: Path, **more: Any) -> subprocess.Popen[bytes]:
+    """In a group of its own; ``err`` is no pipe, which orphans would keep open."""
+    own = {"stdout": subprocess.DEVNULL, "stderr": err, "start_new_session": True}
+    return subprocess.Popen([str(part) for part in command], cwd=folder, **own, **more)
 
 
 STRIKES_ITSELF = """
@@ -71,16 +68,9 @@ def struck(arguments: Sequence[object], folder: Path, event: str, after: int, st
     :returns: its exit status, and what it printed to stderr.
     """
     program = STRIKES_ITSELF.format(event=event, after=after, strike=strike)
-    with tempfile.TemporaryFile("w+") as err:  # not a pipe: orphans would keep it open
-        process = subprocess.Popen(
-            [sys.executable, "-c", program, *map(str, arguments)],
-            cwd=folder,
-            env={**os.environ, "OMP_NUM_THREADS": "1"},
-            stdout=subprocess.DEVNULL,
-            stderr=err,
-            start_new_session=True,
-            preexec_fn=_heed,
-        )
+    with tempfile.TemporaryFile("w+") as err:
+        command, own = [sys.executable, "-c", program, *arguments], {**os.environ, "OMP_NUM_THREADS": "1"}
+        process = started(command, err, folder, env=own, preexec_fn=_heed)
         status = process.wait(timeout=HANGS)
         err.seek(0)
         return status, err.read()
@@ -89,18 +79,6 @@ def struck(arguments: Sequence[object], folder: Path, event: str, after: int, st
 def _heed() -> None:
     """A shell's background jobs, and all they start, ignore Ctrl-C."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
-@dataclass(frozen=True)
-class Killed:
-    """How often a command was killed, together with the processes it started and alone."""
-
-    together: int
-    alone: int
-
-    @property
-    def total(self) -> int:
-        return self.together + self.alone
 
 
 Kept = Callable[[Path], set[object] | None]
@@ -116,7 +94,7 @@ def until_done(
     seed: int,
     kept: Kept = lambda folder: None,
     by: signal.Signals = signal.SIGKILL,
-) -> Killed:
+) -> int:
     """Run a command again and again, killing it at random moments, ``kills`` times at most.
 
     Half of the time all its processes get the signal, as when a machine loses power; else it alone, and its helpers are
@@ -124,30 +102,23 @@ def until_done(
 
     :param seconds: how long it takes undisturbed: moments lie within.
     :param by: SIGKILL; or SIGTERM, after which it says one line and leaves no process behind.
+    :returns: how often it was killed.
     """
-    choose, killed, safe = random.Random(seed), Counter[bool](), set[object]()
+    choose, killed, safe = random.Random(seed), 0, set[object]()
     groups = []
     try:
         while True:
-            with tempfile.TemporaryFile("w+") as err:  # not a pipe: orphans would keep it open
-                process = subprocess.Popen(
-                    [COMMAND, *map(str, arguments)],
-                    cwd=folder,
-                    env=environment(cache),
-                    stdout=subprocess.DEVNULL,
-                    stderr=err,
-                    start_new_session=True,
-                )
+            with tempfile.TemporaryFile("w+") as err:
+                process = started([COMMAND, *arguments], err, folder, env=environment(cache))
                 groups.append(process.pid)
-                limit = choose.uniform(0, seconds) if killed.total() < kills else HANGS
+                limit = choose.uniform(0, seconds) if killed < kills else HANGS
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     process.wait(timeout=limit)
                 running = process.poll() is None
                 if running:
-                    assert killed.total() < kills, "it hangs"
-                    alone = choose.random() < 0.5
-                    killed[alone] += 1
-                    process.send_signal(by) if alone else os.killpg(process.pid, by)
+                    assert killed < kills, "it hangs"
+                    killed += 1
+                    process.send_signal(by) if choose.random() < 0.5 else os.killpg(process.pid, by)
                     process.wait(timeout=HANGS)
                     answered(process, err, by)
                     running = by is signal.SIGKILL or process.returncode != 0  # or it had just come to its end
@@ -157,7 +128,7 @@ def until_done(
                 if not running:
                     err.seek(0)
                     assert process.returncode == 0, err.read()
-                    return Killed(killed[False], killed[True])
+                    return killed
     finally:
         for group in groups:
             with contextlib.suppress(ProcessLookupError):

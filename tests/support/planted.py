@@ -16,25 +16,33 @@ from ddco_pyro.spec import parse_spec
 from ddco_pyro.training.networks import Dimensions, build_hierarchy
 from ddco_pyro.training.restarts import Trainer
 
+LINEAR = {"network": "linear"}
 CONTROL = {"std": 0.05, "scale": "none"}
 TRAINING = {"epochs": 900, "restarts": 3, "patience": 25, "initialize": "vq_controls"}
 
 
-def make_spec(counts=(2,), seed=0, control=None, **training):
-    levels = [
-        {"name": f"level-{d}", "count": k, "policy": {"network": "linear"}, "termination": {"network": "linear"}}
-        for d, k in enumerate(counts, 1)
-    ]
+def numbered(each):
+    """Demonstrations ``demo_0``, ``demo_1``, ... of (observations, actions) or (observations, actions, labels)."""
+    return Demonstrations(tuple(Demonstration(f"demo_{n}", *one) for n, one in enumerate(each)))
+
+
+def small_spec(counts=(2,), policy=LINEAR, **sections):
+    """Levels whose policies are of one kind, terminations and meta-policy linear; no counts: a flat policy."""
+    levels = [{"name": f"level-{d}", "count": k, "policy": policy} for d, k in enumerate(counts, 1)]
+    flat = {"baseline": {"kind": "flat", "policy": policy}}
     return parse_spec(
         {
             "demonstrations": {"path": "unused.hdf5"},
             "observations": ["state"],
-            "control": control or {"std": 0.1, "scale": "none"},
-            "hierarchy": {"levels": levels, "meta_policy": {"network": "linear"}},
-            "training": {"optimizer": {"lr": 0.03}, "epochs": 20, **training},
-            "seed": seed,
+            **({"hierarchy": {"levels": levels, "meta_policy": LINEAR}} if counts else flat),
+            **sections,
         }
     )
+
+
+def make_spec(counts=(2,), seed=0, control=None, **training):
+    training = {"optimizer": {"lr": 0.03}, "epochs": 20, **training}
+    return small_spec(counts, control=control or {"std": 0.1, "scale": "none"}, training=training, seed=seed)
 
 
 def make_trainer(spec, demos, path, on_event=ignore, jobs=1):
@@ -62,10 +70,7 @@ def plant(truth, number, steps, seed):
         choices.append(torch.stack(previous, -1))
         state = (state + action[:, :2].float()).clamp(-1, 1)
     arrays = [torch.stack(part, 1).double().numpy() for part in (states, actions)]
-    demos = Demonstrations(
-        tuple(Demonstration(f"demo_{n}", {"state": arrays[0][n]}, arrays[1][n]) for n in range(number))
-    )
-    return demos, torch.stack(choices, 1)
+    return numbered(({"state": state}, action) for state, action in zip(*arrays, strict=True)), torch.stack(choices, 1)
 
 
 def preferences(callers, options):
@@ -100,17 +105,27 @@ def make_truth(spec, ending=-1.7, parts=None):
     return truth.eval()
 
 
+def tabulated(model, demos):
+    """What a model says of demonstrations, and the batch that they are for it."""
+    with torch.no_grad():
+        batch = encode(demos, model.encoder, model.scaling)
+        return model.tabulate(batch), batch
+
+
+def per_step(model, batch):
+    """The log-likelihood."""
+    with torch.no_grad():
+        return float(log_likelihood(model.tabulate(batch), batch.lengths).sum()) / batch.steps
+
+
 def recovered(found, truth, held_out, choices):
     """Held-out log-likelihood per step of both, and the NMI of their segments with the true choices of each level."""
     values = {}
     for name, model in (("found", found), ("truth", truth)):
-        with torch.no_grad():
-            batch = encode(held_out, model.encoder, model.scaling)
-            tables = model.tabulate(batch)
-            values[name] = float(log_likelihood(tables, batch.lengths).sum()) / batch.steps
-            segments = segment(tables, batch.lengths)
+        tables, batch = tabulated(model, held_out)
+        values[name] = per_step(model, batch)
         values[f"{name} nmi"] = [
             float(normalized_mutual_info_score(choices[..., level].flatten(), one.flatten()))
-            for level, one in enumerate(segments)
+            for level, one in enumerate(segment(tables, batch.lengths))
         ]
     return values

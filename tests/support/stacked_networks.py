@@ -26,13 +26,7 @@ def answer(network, inputs, state=None):
 
 
 def make_inputs(trajectories=2, steps=LONGEST, start=0, images=()):
-    generator = torch.Generator().manual_seed(1)
-    vector = torch.randn(trajectories, steps, FEATURES, generator=generator)
-    pictures = {
-        key: torch.randint(0, 256, (trajectories, steps, *PIXELS), generator=generator, dtype=torch.uint8)
-        for key in images
-    }
-    return Inputs({"state": vector}, pictures, torch.arange(start, start + steps))
+    return random_inputs(InputShape({"state": FEATURES}, dict.fromkeys(images, PIXELS)), trajectories, steps, start)
 
 
 def random_inputs(shape, trajectories, steps, start):

@@ -50,7 +50,6 @@ class Wrong(Own):
         return {
             "joined": lambda: found.flatten(2),
             "swapped": lambda: found.transpose(2, 3),
-            "one": lambda: found[:, :, :1],
             "squeezed": lambda: found.squeeze(0),
             "time first": lambda: found.transpose(0, 1),
             "fails": lambda: found @ torch.ones(7),
