@@ -70,24 +70,20 @@ def alone(place: str, values: Callable[[int, int], Any]) -> Callable[[Arrays, in
 
 
 def padded(made: Arrays, number: int) -> None:
-    """Repeat the last step four times."""
     for place, values in made.items():
         made[place] = np.concatenate([values, np.repeat(values[-1:], 4, axis=0)])
 
 
 def twins(made: Arrays, number: int) -> None:
-    """The last demonstration is the first again."""
     if number == NUMBER - 1:
         made.update(arrays(0))
 
 
 def leaked(made: Arrays, number: int) -> None:
-    """An observation is the control."""
     made["obs/command"] = made["actions"].astype(np.float32)
 
 
 def only_leaked(made: Arrays, number: int) -> None:
-    """Nothing is observed but the control."""
     leaked(made, number)
     del made["obs/pose"]
 
@@ -124,7 +120,8 @@ def one_step(made: Arrays, number: int) -> None:
 def _integers(steps: int, number: int, least: int, most: int, columns: int | None = 1) -> np.ndarray:
     size = steps if columns is None else (steps, columns)
     drawn = np.random.default_rng(number).integers(least, most + 1, size)
-    drawn[: most + 1 - least] = np.arange(least, most + 1)[:steps] if columns is None else drawn[: most + 1 - least]
+    if columns is None:
+        drawn[: most + 1 - least] = np.arange(least, most + 1)[:steps]
     return drawn
 
 
@@ -133,7 +130,8 @@ def _bytes(*shape: int, dtype: str = "u1") -> Callable[[int, int], np.ndarray]:
     return lambda steps, number: np.random.default_rng(number).integers(0, high, (steps, *shape)).astype(dtype)
 
 
-MASK_ROWS: dict[str, Row] = {
+ROWS: dict[str, Row] = {
+    # --- which demonstrations there are to train with and to validate with
     "masks overlap": _row(
         says="demo_1 is in mask/train and in mask/valid",
         masks={"train": [b"demo_0", b"demo_1", b"demo_2"], "valid": [b"demo_1", b"demo_3"]},
@@ -156,10 +154,7 @@ MASK_ROWS: dict[str, Row] = {
     ),
     "one demonstration": _row(says="holds 1 demonstration", number=1),
     "two demonstrations": _row(says="holds 2 demonstrations", number=2),
-}
-"""Which demonstrations there are to train with and to validate with."""
-
-LABEL_ROWS: dict[str, Row] = {
+    # --- labels
     "labels of a column": _row(put("labels/phase", lambda steps, number: _half(steps)[:, None].astype(int))),
     "labels of text": _row(put("labels/phase", lambda steps, number: [b"reach"] * steps)),
     "labels of floats": _row(put("labels/phase", lambda steps, number: np.ones(steps))),
@@ -169,9 +164,7 @@ LABEL_ROWS: dict[str, Row] = {
             put("labels/phase", lambda steps, n: _half(steps).astype(int))(made, number) if number else None
         )
     ),
-}
-
-PICTURE_ROWS: dict[str, Row] = {
+    # --- pictures
     "channels first": _row(put("obs/camera", _bytes(3, 12, 10))),
     "channels first alone": _row(alone("obs/camera", _bytes(3, 12, 10))),
     "grey": _row(put("obs/camera", _bytes(12, 10))),
@@ -179,9 +172,7 @@ PICTURE_ROWS: dict[str, Row] = {
     "16-bit depth": _row(put("obs/depth", _bytes(12, 10, dtype="u2"))),
     "16-bit depth alone": _row(alone("obs/depth", _bytes(12, 10, dtype="u2")), says="no observation can be used"),
     "16-bit depth with a channel": _row(put("obs/depth", _bytes(12, 10, 1, dtype="u2"))),
-}
-
-CONTROL_ROWS: dict[str, Row] = {
+    # --- controls
     "integers -1, 0, 1": _row(put("actions", lambda steps, number: _integers(steps, number, -1, 1))),
     "integers [T]": _row(put("actions", lambda steps, number: _integers(steps, number, 0, 3, None))),
     "integers of two columns": _row(put("actions", lambda steps, number: _integers(steps, number, -1, 2, 2))),
@@ -198,16 +189,13 @@ CONTROL_ROWS: dict[str, Row] = {
         with_switch(lambda steps, number: np.where(_half(steps), -1 if number < 3 else 0, 1))
     ),
     "controls of another size in one": _row(
-        _another_size,
-        says=r"actions (is in 4 of 5 demonstrations|has shape \(1,\))",
+        _another_size, says=r"actions (is in 4 of 5 demonstrations|has shape \(1,\))"
     ),
     "a number that single precision does not hold": _row(_huge),
     "no control that moves": _row(
         put("actions", lambda steps, number: np.ones((steps, 2))), says="every dimension is constant"
     ),
-}
-
-SAME_ROWS: dict[str, Row] = {
+    # --- what is there twice
     "equal tails": _row(padded),
     "a demonstration twice": _row(twins),
     "an observation that is the control": _row(leaked),
@@ -259,6 +247,3 @@ def drawn(path: Path, seed: int) -> Path:
 
     masks = choose.choice(MASKS) if choose.random() < 0.5 else {}
     return write(path, change, masks, choose.choice([2, 3, NUMBER, NUMBER]))
-
-
-ROWS: dict[str, Row] = {**MASK_ROWS, **LABEL_ROWS, **PICTURE_ROWS, **CONTROL_ROWS, **SAME_ROWS}
