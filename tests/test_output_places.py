@@ -47,9 +47,7 @@ def inputs(toy_run, tmp_path_factory) -> Path:
 
 
 class Command(NamedTuple):
-    """A command that writes: its arguments before the place, the input that a place must not be, and the kind of what
-    it writes.
-    """
+    """Arguments before the place that is written, an input that it must not be, and whether it is a folder."""
 
     arguments: str
     read: str

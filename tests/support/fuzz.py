@@ -184,8 +184,8 @@ EDITS: tuple[Edit, ...] = (
 
 # --- where they are tried ---------------------------------------------------------------------------------------------
 
-LIMIT = 2 * 2**30
-"""Bytes of memory."""
+GROWN = 3 * 2**29
+"""Bytes of memory beyond those of the process, which together are less than 2 GB."""
 
 
 def tried(path: Path) -> list[str]:
@@ -198,7 +198,7 @@ def tried(path: Path) -> list[str]:
     )
     child = forked.run(lambda: [_end(way) for way in ways])
     out.unlink(missing_ok=True)
-    return child.value if child.status == 0 and child.grown < LIMIT else [f"{child}"]
+    return child.value if child.status == 0 and child.grown < GROWN else [f"{child}"]
 
 
 def _end(way: Callable[[], object]) -> str:

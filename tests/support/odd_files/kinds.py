@@ -16,6 +16,8 @@ NUMBER = 5
 """Demonstrations of a file."""
 
 Arrays = dict[str, Any]
+Change = Callable[[Arrays, int], None]
+Masks = dict[str, list[bytes]]
 
 
 def arrays(number: int) -> Arrays:
@@ -26,17 +28,13 @@ def arrays(number: int) -> Arrays:
     return {"actions": -pose[:, :2] + 0.1 * noise.normal(size=(steps, 2)), "obs/pose": pose}
 
 
-def write(
-    path: Path,
-    change: Callable[[Arrays, int], None] = lambda made, number: None,
-    masks: dict[str, list[bytes]] | None = None,
-    number: int = NUMBER,
-) -> Path:
+def write(path: Path, change: Change | None = None, masks: Masks | None = None, number: int = NUMBER) -> Path:
     """A file of demonstrations ``demo_0``, ``demo_1``, ..., each of them changed."""
     with h5py.File(path, "w") as file:
         for index in range(number):
             made = arrays(index)
-            change(made, index)
+            if change is not None:
+                change(made, index)
             for place, values in made.items():
                 file[f"data/demo_{index}/{place}"] = values
         for mask, names in (masks or {}).items():
@@ -44,13 +42,11 @@ def write(
     return path
 
 
-def _row(
-    change: Callable[[Arrays, int], None] = lambda made, number: None, says: str | None = None, **more: Any
-) -> Row:
+def _row(change: Change | None = None, says: str | None = None, **more: Any) -> Row:
     return Row(lambda folder: write(folder / "demos.hdf5", change, **more), says)
 
 
-def put(place: str, values: Callable[[int, int], Any]) -> Callable[[Arrays, int], None]:
+def put(place: str, values: Callable[[int, int], Any]) -> Change:
     """A change: at ``place`` are these values of (steps, number of the demonstration)."""
 
     def change(made: Arrays, number: int) -> None:
@@ -59,7 +55,7 @@ def put(place: str, values: Callable[[int, int], Any]) -> Callable[[Arrays, int]
     return change
 
 
-def alone(place: str, values: Callable[[int, int], Any]) -> Callable[[Arrays, int], None]:
+def alone(place: str, values: Callable[[int, int], Any]) -> Change:
     """The same, and no other observation."""
 
     def change(made: Arrays, number: int) -> None:
@@ -88,7 +84,7 @@ def only_leaked(made: Arrays, number: int) -> None:
     del made["obs/pose"]
 
 
-def with_switch(values: Callable[[int, int], Any]) -> Callable[[Arrays, int], None]:
+def with_switch(values: Callable[[int, int], Any]) -> Change:
     """A third control dimension with these values of (steps, number of the demonstration)."""
 
     def change(made: Arrays, number: int) -> None:
@@ -203,7 +199,7 @@ ROWS: dict[str, Row] = {
     "demonstrations of one step": _row(one_step),
 }
 
-CHANGES: tuple[Callable[[Arrays, int], None], ...] = (
+CHANGES: tuple[Change, ...] = (
     put("labels/phase", lambda steps, number: _half(steps)[:, None].astype(int)),
     put("labels/step", lambda steps, number: [b"reach"] * steps),
     put("labels/half", lambda steps, number: _half(steps).astype(int)),
@@ -225,7 +221,7 @@ CHANGES: tuple[Callable[[Arrays, int], None], ...] = (
 )
 """What may be odd in a file, all at once."""
 
-MASKS: tuple[dict[str, list[bytes]], ...] = (
+MASKS: tuple[Masks, ...] = (
     {},
     {"valid": [b"demo_0"]},
     {"train": [b"demo_1", b"demo_2"], "better": [b"demo_0"]},
