@@ -19,6 +19,7 @@ from ddco_pyro.data.sources.metadata import check_keys
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.spec import parse_spec
 
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("run")
