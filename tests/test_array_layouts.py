@@ -17,7 +17,6 @@ from ddco_pyro.data.pictures import channels_last, turned
 
 
 def stored(path: Path, key: str) -> list[np.ndarray]:
-    """The arrays of a key as the file has them."""
     with h5py.File(path) as file:
         return [file[f"data/demo_{index}/obs/{key}"][()] for index in range(NUMBER)]
 

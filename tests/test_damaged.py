@@ -7,15 +7,14 @@ import io
 import json
 import shutil
 import struct
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 import yaml
 from command_line import call
+from fuzz import places
 from selecting import data_at
 
 import ddco_pyro
@@ -70,27 +69,26 @@ def refused(run: Path, command: tuple[str, ...], path: Path, what: str) -> None:
 
 # --- metrics.json -----------------------------------------------------------------------------------------------------
 
-DAMAGE: tuple[tuple[Any, str], ...] = (
-    (lambda text: text[: len(text) // 2], "is no JSON: EOF while parsing"),
-    (lambda text: "", "is no JSON: EOF while parsing a value at line 1 column 0"),
-    (lambda text: "[]", "must be a mapping (key: value), got []"),
-    (
-        lambda text: text.replace('"parameters": ', '"parameters": "many", "was": '),
-        "comparison.flat.parameters: must be a whole number, got 'many'",
-    ),
-    (lambda text: text.replace('"comparison"', '"comparisons"'), "comparison: missing"),
-)
-
 
 def test_damaged_metrics(run: Path) -> None:
     path = run / "metrics.json"
     whole = path.read_text()
     data = json.loads(whole)
-    other = json.dumps(data | {"options": [[*data["options"][0], data["options"][0][-1]]]}).encode()
-    damaged = [*((change(whole).encode(), what) for change, what in DAMAGE), (other, "is not about levels with 2")]
-    for content, what in (*damaged, (b"\xff\xfe\x00", ""), (b"[" * 100_000, ""), (b'{"model": NaN}', "")):
-        path.write_bytes(content)
+    many = whole.replace('"parameters": ', '"parameters": "many", "was": ')
+    for content, what in (
+        (whole[: len(whole) // 2], "is no JSON: EOF while parsing"),
+        ("", "is no JSON: EOF while parsing a value at line 1 column 0"),
+        ("[]", "must be a mapping (key: value), got []"),
+        (many, "comparison.flat.parameters: must be a whole number, got 'many'"),
+        (whole.replace('"comparison"', '"comparisons"'), "comparison: missing"),
+        (json.dumps(data | {"options": [[*data["options"][0], data["options"][0][-1]]]}), "is not about levels with 2"),
+        ("[" * 100_000, ""),
+        ('{"model": NaN}', ""),
+    ):
+        path.write_text(content)
         refused(run, COMMANDS["report"], path, what)
+    path.write_bytes(b"\xff\xfe\x00")
+    refused(run, COMMANDS["report"], path, "")
     path.write_text(whole)
     (run / "baselines" / "flat" / "metrics.json").write_text("{}")
     refused(run, COMMANDS["report"], run / "baselines" / "flat" / "metrics.json", "model: missing")
@@ -124,35 +122,8 @@ def test_weights_that_are_not_finite(run: Path, monkeypatch: pytest.MonkeyPatch)
         path.write_bytes(content)
 
 
-def places(data: Any, place: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    yield place
-    items = data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list) else ()
-    for key, value in items:
-        yield from places(value, (*place, key))
-
-
-REMOVED = object()
-
-
-def changed(data: Any, place: tuple[Any, ...], value: Any) -> Any:
-    copy = json.loads(json.dumps(data))
-    node = copy
-    for key in place[:-1]:
-        node = node[key]
-    if value is REMOVED:
-        del node[place[-1]]
-    else:
-        node[place[-1]] = value
-    return copy
-
-
 def read_all(fit: Fit, metrics: Metrics) -> None:
     """Everything that is read from ``metrics.json``, short of drawing it."""
-    with contextlib.redirect_stdout(io.StringIO()):
-        _read_all(fit, metrics)
-
-
-def _read_all(fit: Fit, metrics: Metrics) -> None:
     words.verdict(metrics), words.success(metrics)
     again = replace(fit, metrics=metrics)
     training.degeneracies(again), header(fit, metrics), training.particulars(again)
@@ -168,20 +139,26 @@ def _read_all(fit: Fit, metrics: Metrics) -> None:
 
 @pytest.mark.parametrize("every", [9, pytest.param(1, marks=pytest.mark.slow)])
 def test_whatever_is_damaged_is_refused_or_makes_no_difference_to_readers(run: Path, every: int) -> None:
-    """At each place one of the values, another at the next, or all of them."""
+    """At each place one of the values, another at the next, or all of them; the first is that nothing is there."""
     path, fit = run / "metrics.json", ddco_pyro.load(run)
-    data = json.loads(path.read_text())
+    text = path.read_text()
     assert fit.baselines
     counts = {"refused": 0, "read": 0}
-    for number, place in enumerate(list(places(data))[1:]):
-        for value in (REMOVED, None, "text", 1.5, -1, [], {}, [[]], True)[number % every :: every]:
-            path.write_text(json.dumps(changed(data, place, value)))
+    for place in range(len(list(places(json.loads(text))))):
+        for value in (..., None, "text", 1.5, -1, [], {}, [[]], True)[place % every :: every]:
+            data = json.loads(text)
+            node, key = list(places(data))[place]
+            node[key] = value
+            if value is ...:
+                del node[key]
+            path.write_text(json.dumps(data))
             try:
                 metrics = Metrics.read(run, [2])
             except Damaged:
                 counts["refused"] += 1
             else:
-                read_all(fit, metrics)
+                with contextlib.redirect_stdout(io.StringIO()):
+                    read_all(fit, metrics)
                 counts["read"] += 1
     assert min(counts.values()) > 30, counts
 
@@ -271,25 +248,11 @@ def test_a_flipped_bit_is_refused_or_makes_no_difference(toy_run: Fit, tmp_path:
 # --- selections -------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def selected(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("selected")
-    data = data_at(folder) | {"selection": {"folds": 2, "grid": {"seed": [1, 2]}}}
-    (folder / "spec.yaml").write_text(yaml.safe_dump(data))
-    select(load_spec(folder / "spec.yaml"), folder / "run")
-    return folder
-
-
-SCORES = (
-    lambda text: text[:40],
-    lambda text: text.replace('"fold": 1', '"fold": 0'),
-    lambda text: text.replace('"steps": [', '"steps": [0, '),
-)
-
-
-def test_a_damaged_score_and_damaged_folds(selected: Path, tmp_path: Path) -> None:
-    shutil.copytree(selected, tmp_path, dirs_exist_ok=True)
-    again = ("select", selected / "spec.yaml", "--out", tmp_path / "run", "--jobs", "1", "--resume")
+def test_a_damaged_score_and_damaged_folds(tmp_path: Path) -> None:
+    spec = tmp_path / "spec.yaml"
+    spec.write_text(yaml.safe_dump(data_at(tmp_path) | {"selection": {"folds": 2, "grid": {"seed": [1, 2]}}}))
+    select(load_spec(spec), tmp_path / "run")
+    again = ("select", spec, "--out", tmp_path / "run", "--jobs", "1", "--resume")
 
     def damaged(path: Path, text: str) -> str:
         path.write_text(text)
@@ -300,14 +263,14 @@ def test_a_damaged_score_and_damaged_folds(selected: Path, tmp_path: Path) -> No
 
     path = tmp_path / "run" / "folds" / "001-01.json"
     whole = path.read_text()
-    for change in SCORES:
-        assert change(whole) != whole
-        assert "; remove it and do the same again: this fold alone is trained anew" in damaged(path, change(whole))
+    for text in (whole[:40], whole.replace('"fold": 1', '"fold": 0'), whole.replace('"steps": [', '"steps": [0, ')):
+        assert text != whole
+        assert "; remove it and do the same again: this fold alone is trained anew" in damaged(path, text)
     path.write_text(whole)
     path = tmp_path / "run" / "folds.json"
     content = path.read_bytes()
     for text in (content[:50].decode(), "[]"):
         damaged(path, text)
     path.unlink()
-    select(load_spec(selected / "spec.yaml"), tmp_path / "run")
+    select(load_spec(spec), tmp_path / "run")
     assert path.read_bytes() == content

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from odd_files.hdf5 import instead, spoil
 from random_demonstrations import demonstration, demonstrations
 
 from ddco_pyro.data.checks import LARGEST
@@ -25,15 +26,6 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "demos.hdf5"
 
 
-def assert_equal(one: Demonstration, other: Demonstration) -> None:
-    assert (one.name, one.attributes) == (other.name, other.attributes)
-    np.testing.assert_array_equal(one.actions, other.actions, strict=True)
-    for ours, theirs in ((one.observations, other.observations), (one.labels, other.labels)):
-        assert set(ours) == set(theirs)
-        for key in ours:
-            np.testing.assert_array_equal(ours[key], theirs[key], strict=True)
-
-
 # --- reading and writing ----------------------------------------------------------------------------------------------
 
 
@@ -44,7 +36,12 @@ def test_what_is_read_is_what_was_written(path: Path) -> None:
     assert read.names == original.names
     assert (read.masks, read.attributes) == (original.masks, original.attributes)
     for one, other in zip(read, original, strict=True):
-        assert_equal(one, other)
+        assert (one.name, one.attributes) == (other.name, other.attributes)
+        np.testing.assert_array_equal(one.actions, other.actions, strict=True)
+        for ours, theirs in ((one.observations, other.observations), (one.labels, other.labels)):
+            assert set(ours) == set(theirs)
+            for key in ours:
+                np.testing.assert_array_equal(ours[key], theirs[key], strict=True)
 
 
 @settings(max_examples=40)
@@ -66,7 +63,6 @@ def test_numbers_survive_exactly(tmp_path_factory: pytest.TempPathFactory, actio
 def test_only_what_is_asked_for_is_read(path: Path) -> None:
     demonstrations().write(path)
     with h5py.File(path, "r+") as file:
-        file["data/demo_3/obs/camera"][...] = 0
         del file["data/demo_4/obs/camera"]
     read = Demonstrations.read(path, ["pose"], ())
     assert read.observation_shapes == {"pose": (3,)}
@@ -82,11 +78,9 @@ def test_types_in_memory(path: Path) -> None:
         demo["obs/camera"] = np.ones((3, 4, 4, 3), np.uint8)
         demo["labels/phase"] = np.ones(3, np.int8)
     (read,) = Demonstrations.read(path, labels=["phase"])
-    types = [
-        array.dtype
-        for array in (read.actions, read.observations["pose"], read.observations["camera"], read.labels["phase"])
-    ]
-    assert types == [np.float64, np.float64, np.uint8, np.int64]
+    arrays = {"actions": read.actions, **read.observations, **read.labels}
+    types = {"actions": np.float64, "pose": np.float64, "camera": np.uint8, "phase": np.int64}
+    assert {key: array.dtype for key, array in arrays.items()} == types
     assert read.attributes == {}
 
 
@@ -98,13 +92,6 @@ def test_the_layout_is_robomimics(path: Path) -> None:
         assert file["data/demo_1"].attrs["num_samples"] == 4
         assert sorted(file["data/demo_1"]) == ["actions", "labels", "obs"]
         assert file["mask/train"][()].tolist() == [b"demo_1"]
-
-
-def test_equal_demonstrations_give_equal_files(path: Path) -> None:
-    demonstrations(2).write(path)
-    other = path.with_name("other.hdf5")
-    demonstrations(2).write(other)
-    assert path.read_bytes() == other.read_bytes()
 
 
 @pytest.mark.skipif(not METAWORLD.exists(), reason="the Meta-World demonstrations are not on this machine")
@@ -197,27 +184,20 @@ def test_splits_that_cannot_be(number: int, masks: dict[str, tuple[str, ...]], m
 # --- what cannot be used ----------------------------------------------------------------------------------------------
 
 
-def replace(place: str, data: object) -> Callable[[h5py.File], None]:
+Change = Callable[[h5py.File], object]
+
+
+def replace(place: str, data: object) -> Change:
     """A change of a file: what is at ``place`` becomes ``data``."""
-
-    def change(file: h5py.File) -> None:
-        if place in file:
-            del file[place]
-        file[place] = data
-
-    return change
+    return lambda file: instead(file, place, data)
 
 
-def remove(place: str) -> Callable[[h5py.File], None]:
-    def change(file: h5py.File) -> None:
-        del file[place]
-
-    return change
+def remove(place: str) -> Change:
+    return lambda file: file.pop(place)
 
 
-def empty(file: h5py.File) -> None:
-    for name in list(file["data"]):
-        del file["data"][name]
+def misspell(file: h5py.File) -> None:
+    file["data/demo_1/obs"].move("pose", "poze")
 
 
 def count_wrongly(file: h5py.File) -> None:
@@ -225,20 +205,19 @@ def count_wrongly(file: h5py.File) -> None:
 
 
 def group_for_actions(file: h5py.File) -> None:
-    del file["data/demo_1/actions"]
-    file.create_group("data/demo_1/actions")
+    instead(file, "data/demo_1/actions", file["mask"])
 
 
 NAN = np.array([[0.0, 1.0], [2.0, np.nan], [0.0, 0.0], [0.0, 0.0]])
 
-REFUSED: list[tuple[str, Callable[[h5py.File], None], str]] = [
+REFUSED: list[tuple[str, Change, str]] = [
     ("no data", remove("data"), "data is missing; there is: mask"),
     ("data is an array", replace("data", [1]), "data has to be a group, not a dataset"),
-    ("no demonstrations", empty, "the group 'data' holds no demonstrations; at least one is needed"),
+    ("no demonstrations", lambda file: file["data"].clear(), "the group 'data' holds no demonstrations"),
     ("no actions", remove("data/demo_1/actions"), "demo_1: actions is missing; there is: labels/phase, obs/camera"),
     ("group for actions", group_for_actions, "demo_1: actions has to be a dataset, not a group"),
     ("no obs", remove("data/demo_1/obs"), "demo_1: obs is missing; there is: actions, labels"),
-    ("no such key", remove("data/demo_1/obs/pose"), "demo_1: obs/pose is missing; there is: camera"),
+    ("misspelt key", misspell, "demo_1: obs/pose is missing (did you mean 'poze'?); there is: camera, poze"),
     ("no labels", remove("data/demo_1/labels"), "demo_1: labels is missing; there is: actions, obs"),
     ("short obs", replace("data/demo_1/obs/pose", np.ones((3, 3))), "demo_1: obs/pose has 3 steps, but actions has 4"),
     ("scalar obs", replace("data/demo_1/obs/pose", 3.0), "demo_1: obs/pose has no steps; it has to be an array"),
@@ -248,8 +227,6 @@ REFUSED: list[tuple[str, Callable[[h5py.File], None], str]] = [
     ("infinite", replace("data/demo_1/obs/pose", np.full((4, 3), -np.inf)), "demo_1: obs/pose is -inf at step 0"),
     ("text", replace("data/demo_1/actions", [["a"]] * 4), "demo_1: actions holds object, it has to hold real numbers"),
     ("complex", replace("data/demo_1/actions", np.ones((4, 2), complex)), "demo_1: actions holds complex128"),
-    ("flat actions", replace("data/demo_1/actions", np.ones(4)), "demo_1: actions is float64 of shape [steps]"),
-    ("float labels", replace("data/demo_1/labels/phase", np.ones(4)), "demo_1: labels/phase is float64 of shape"),
     ("other obs shape", replace("data/demo_1/obs/pose", np.ones((4, 2))), "demo_1: obs/pose has shape"),
     ("other actions shape", replace("data/demo_1/actions", np.ones((4, 3))), "demo_1: actions has shape"),
     ("unknown in mask", replace("mask/valid", [b"demo_11"]), "mask/valid: there is no demonstration 'demo_11'"),
@@ -257,7 +234,7 @@ REFUSED: list[tuple[str, Callable[[h5py.File], None], str]] = [
 
 
 @pytest.mark.parametrize(("change", "message"), [case[1:] for case in REFUSED], ids=[case[0] for case in REFUSED])
-def test_refused_in_one_line(path: Path, change: Callable[[h5py.File], None], message: str) -> None:
+def test_refused_in_one_line(path: Path, change: Change, message: str) -> None:
     demonstrations(3, {"valid": ("demo_1",)}).write(path)
     with h5py.File(path, "r+") as file:
         change(file)
@@ -283,12 +260,6 @@ def test_a_key_that_differs_between_demonstrations_is_refused(path: Path) -> Non
         Demonstrations.read(path)
 
 
-def test_a_misspelt_key_is_refused_with_the_nearest(path: Path) -> None:
-    demonstrations(2).write(path)
-    with pytest.raises(DemonstrationsError, match=r"demo_0: obs/poze is missing \(did you mean 'pose'\?\); there is:"):
-        Demonstrations.read(path, ["poze"])
-
-
 def test_files_that_are_no_hdf5(tmp_path: Path) -> None:
     with pytest.raises(DemonstrationsError, match=r"none\.hdf5: there is no such file; check the path$"):
         Demonstrations.read(tmp_path / "none.hdf5")
@@ -309,11 +280,7 @@ def test_files_that_are_cut_short(path: Path) -> None:
 def test_damaged_data_is_refused(path: Path) -> None:
     with h5py.File(path, "w") as file:
         file.create_dataset("data/demo_0/actions", data=np.arange(4000.0).reshape(2000, 2), fletcher32=True)
-    with h5py.File(path) as file:
-        offset = file["data/demo_0/actions"].id.get_chunk_info(0).byte_offset
-    content = bytearray(path.read_bytes())
-    content[offset + 8] ^= 1
-    path.write_bytes(content)
+    spoil(path, "data/demo_0/actions")
     with pytest.raises(DemonstrationsError, match=r"demo_0: actions cannot be read .* the file may be damaged$"):
         Demonstrations.read(path, [])
 

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
 import os
 import shutil
 import signal
 import tracemalloc
 
+import forked
 import h5py
 import numpy as np
 import pytest
 import torch
 from command_line import call
 from dots import SIZE, dots, followed, together
+from odd_files.hdf5 import instead
 from planted import make_spec, make_trainer, make_truth, plant
 from safetensors.torch import load_file
 from sklearn.decomposition import PCA
@@ -48,14 +49,9 @@ def out(tmp_path):
 
 
 def contents(out):
-    """Every array and attribute of the file, and every byte beside it."""
-    arrays = {}
-    with h5py.File(out) as file:
-        file.visititems(
-            lambda name, node: arrays.update({name: node[()].tolist() if isinstance(node, h5py.Dataset) else None})
-        )
+    """Every byte of the file and of what is beside it."""
     beside = {path.name: path.read_bytes() for path in out.with_name(f"{out.name}.encoder").iterdir()}
-    return arrays, beside
+    return out.read_bytes(), beside
 
 
 # --- what comes out ---------------------------------------------------------------------------------------------------
@@ -197,10 +193,7 @@ def killed(path, out, encoding, kind, after):
         if left == 0:
             os.kill(os.getpid(), signal.SIGKILL)
 
-    process = multiprocessing.get_context("fork").Process(target=encode, args=(path, out, encoding, strike))
-    process.start()
-    process.join(600)
-    assert process.exitcode == -signal.SIGKILL
+    assert forked.run(lambda: encode(path, out, encoding, strike)).status == -signal.SIGKILL
     assert not out.exists()
 
 
@@ -216,10 +209,8 @@ def test_killed_again_and_again(few_dots, tmp_path, monkeypatch):
     assert [event.done for event in seen if isinstance(event, DemonstrationsDone)] == [5, 6]
     assert not [event for event in seen if isinstance(event, UpdatesDone)]
     assert contents(out) == contents(tmp_path / "whole.hdf5")
-    assert sorted(path.name for path in tmp_path.iterdir() if "killed" in path.name) == [
-        "killed.hdf5",
-        "killed.hdf5.encoder",
-    ]
+    left = {path.name for path in tmp_path.iterdir() if "killed" in path.name}
+    assert left == {"killed.hdf5", "killed.hdf5.encoder"}
 
 
 def test_the_command(few_dots, out):
@@ -260,9 +251,7 @@ def test_the_command(few_dots, out):
 )
 @pytest.mark.filterwarnings("ignore:divide by zero")
 def test_what_cannot_be_used(few_dots, out, options, message):
-    ended = call("encode", few_dots, "--observation", "camera", "--allow-code", *options, "--out", out)
-    assert (ended.status, ended.err.count("\n")) == (2, 1)
-    assert message in ended.err
+    refused(call("encode", few_dots, "--observation", "camera", "--allow-code", *options, "--out", out), out, message)
     assert not list(out.parent.iterdir())
 
 
@@ -271,10 +260,6 @@ def test_what_was_not_written_here_stays(few_dots, out):
     assert call("encode", few_dots, "--observation", "camera", "--out", out).status == 2
     assert out.read_bytes() == b"mine"
     out.unlink()
-    out.mkdir()
-    ended = call("encode", few_dots, "--observation", "camera", "--out", out)
-    assert (ended.status, ended.err) == (2, f"ddco-pyro: --out {out}: is a folder; name a file\n")
-    out.rmdir()
     (out.parent / "out.hdf5.encoder").mkdir()
     ended = call("encode", few_dots, "--observation", "camera", "--out", out)
     assert (ended.status, ended.err.count("\n")) == (2, 1)
@@ -293,9 +278,7 @@ def test_features_that_only_later_pictures_spoil(tmp_path, out):
 
 def test_user_code_needs_permission(few_dots, out):
     ended = call("encode", few_dots, "--observation", "camera", "--encoder", f"{OWN}Means", "--out", out)
-    assert (ended.status, ended.err.count("\n")) == (2, 1)
-    assert "would import user code; pass --allow-code" in ended.err
-    assert not list(out.parent.iterdir())
+    refused(ended, out, "would import user code; pass --allow-code")
     folder = encode(few_dots, out, Encoding("camera", f"{OWN}Means"), allow_code=True).folder
     with pytest.raises(BadInput, match="would import user code"):
         load(folder)
@@ -348,7 +331,6 @@ MODELS = {
 
 
 def fitted(few_dots, folder, model, camera=None):
-    """A run of one epoch."""
     observations = [{"key": "camera", **(camera or {})}, {"key": "place"}]
     spec = {"demonstrations": {"path": str(few_dots)}, "observations": observations, "training": {"epochs": 1}}
     return ddco_pyro.fit(parse_spec(spec | model), out=folder)
@@ -400,11 +382,7 @@ def test_an_encoder_that_names_user_code_is_damaged(few_dots, branched, tmp_path
 def test_another_fit_is_another_encoding(few_dots, branched, tmp_path):
     out, run = tmp_path / "out.hdf5", shutil.copytree(branched, tmp_path / "run")
     arguments = ("encode", few_dots, "--observation", "camera", "--encoder", run, "--out", out)
-    ended = call(*arguments)
-    assert (ended.status, ended.out.startswith(f"{out}: 6 demonstrations, obs/camera_features: 5 of 5 fea")) == (
-        0,
-        True,
-    )
+    assert call(*arguments).out.startswith(f"{out}: 6 demonstrations, obs/camera_features: 5 of 5 features")
     assert call(*arguments).status == 0
     shutil.rmtree(run)
     fitted(few_dots, run, flat(BRANCHES | {"hidden": [7]}))
@@ -426,9 +404,8 @@ ALONE = {"network": "mlp", "hidden": [4], "inputs": ["place"]}
 def test_fits_that_have_no_encoder(few_dots, tmp_path, model, camera, message):
     out, run = tmp_path / "out.hdf5", tmp_path / "run"
     fitted(few_dots, run, model, camera)
-    refused(
-        call("encode", few_dots, "--observation", "camera", "--encoder", run, "--out", out), out, f"{run}: {message}"
-    )
+    ended = call("encode", few_dots, "--observation", "camera", "--encoder", run, "--out", out)
+    refused(ended, out, f"{run}: {message}")
 
 
 def test_pictures_that_the_fit_does_not_know(few_dots, branched, tmp_path):
@@ -438,9 +415,7 @@ def test_pictures_that_the_fit_does_not_know(few_dots, branched, tmp_path):
     with h5py.File(few_dots) as source, h5py.File(tmp_path / "cut.hdf5", "w") as file:
         source.copy("data", file)
         for demo in file["data"].values():
-            pictures = demo["obs/camera"][:, 1:]
-            del demo["obs/camera"]
-            demo["obs/camera"] = pictures
+            instead(demo, "obs/camera", demo["obs/camera"][:, 1:])
     cut = call("encode", tmp_path / "cut.hdf5", "--observation", "camera", "--encoder", run, "--out", out)
     refused(cut, out, f"{run}: this fit observed camera of (20, 20, 2), and these are (19, 20, 2)")
     (run / "model.safetensors").unlink()

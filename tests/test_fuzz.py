@@ -9,12 +9,11 @@ import resource
 import time
 from collections import Counter
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
 from command_line import call
-from fuzz import SECONDS, Worker, damaged_file, damaged_spec
+from fuzz import SECONDS, damaged_file, damaged_spec, tried
 from random_demonstrations import demonstrations
 
 SPEC = """
@@ -34,15 +33,11 @@ seed: 3
 """
 
 
-@pytest.fixture(scope="module")
-def base(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    path = tmp_path_factory.mktemp("fuzz") / "demos.hdf5"
-    demonstrations(6).write(path)
-    return yaml.safe_load(SPEC.replace("PATH", str(path)))
-
-
-def check_specs(base: dict[str, Any], path: Path, seeds: range) -> None:
-    ended = {0: 0, 2: 0}
+@pytest.mark.parametrize("seeds", [range(20), pytest.param(range(1000, 2200), marks=pytest.mark.slow)], ids=len)
+def test_damaged_specs(tmp_path: Path, seeds: range) -> None:
+    path, ended = tmp_path / "spec.yaml", {0: 0, 2: 0}
+    demonstrations(6).write(tmp_path / "demos.hdf5")
+    base = yaml.safe_load(SPEC.replace("PATH", str(tmp_path / "demos.hdf5")))
     for seed in seeds:
         path.write_bytes(damaged_spec(base, seed))
         start = time.process_time()
@@ -57,35 +52,15 @@ def check_specs(base: dict[str, Any], path: Path, seeds: range) -> None:
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < 2 * 2**20
 
 
-def check_files(folder: Path, seeds: range) -> None:
-    worker, ended = Worker(), Counter[str]()
-    try:
-        for seed in seeds:
-            path = folder / f"{seed}.hdf5"
-            damaged_file(path, seed)
-            found = worker.try_file(path)
-            assert set(found) <= {"fine", "refused"}, f"seed {seed}: {found}"
-            ended.update(found)
-            path.unlink()
-    finally:
-        worker.close()
+@pytest.mark.parametrize("seeds", [range(12), pytest.param(range(1000, 1500), marks=pytest.mark.slow)], ids=len)
+def test_damaged_files(tmp_path: Path, seeds: range) -> None:
+    ended = Counter[str]()
+    for seed in seeds:
+        path = tmp_path / f"{seed}.hdf5"
+        damaged_file(path, seed)
+        found = tried(path)
+        assert set(found) <= {"fine", "refused"}, f"seed {seed}: {found}"
+        ended.update(found)
+        path.unlink()
     print(f"{len(seeds)} damaged files, each read, looked at and imported: {dict(ended)}")
     assert set(ended) == {"fine", "refused"}
-
-
-def test_damaged_specs(base: dict[str, Any], tmp_path: Path) -> None:
-    check_specs(base, tmp_path / "spec.yaml", range(20))
-
-
-def test_damaged_files(tmp_path: Path) -> None:
-    check_files(tmp_path, range(12))
-
-
-@pytest.mark.slow
-def test_very_many_damaged_specs(base: dict[str, Any], tmp_path: Path) -> None:
-    check_specs(base, tmp_path / "spec.yaml", range(1000, 2200))
-
-
-@pytest.mark.slow
-def test_very_many_damaged_files(tmp_path: Path) -> None:
-    check_files(tmp_path, range(1000, 1500))

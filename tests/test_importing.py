@@ -7,18 +7,18 @@ from __future__ import annotations
 
 import gc
 import json
-import shutil
 from pathlib import Path
 
 import gymnasium
 import h5py
 import minari
 import numpy as np
-import pyarrow.parquet as parquet
 import pytest
 from command_line import call
 from gymnasium import spaces
 from minari.data_collector.episode_buffer import EpisodeBuffer
+from odd_files import lerobot as odd
+from odd_files.hdf5 import instead
 from random_demonstrations import demonstrations
 
 from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
@@ -27,8 +27,7 @@ from ddco_pyro.data.inspection import inspect
 from ddco_pyro.data.sources.video import _frames
 from ddco_pyro.errors import BadInput
 
-FIXTURES = Path(__file__).parent / "fixtures"
-ROBOMIMIC, LEROBOT = FIXTURES / "robomimic.hdf5", FIXTURES / "lerobot"
+ROBOMIMIC, LEROBOT = Path(__file__).parent / "fixtures" / "robomimic.hdf5", odd.FIXTURE
 
 
 @pytest.fixture
@@ -124,7 +123,7 @@ def test_lerobots_videos_frame_by_frame(out: Path) -> None:
 
 @no_file_is_left_open
 def test_a_video_need_not_be_read_to_its_end() -> None:
-    video = next((LEROBOT / "videos").rglob("*.mp4"))
+    video = LEROBOT / odd.VIDEO
     frames = _frames(video, "demo_0", 0.0, 20, 10.0, (16, 32))
     assert next(frames).shape == (16, 32, 3)
     frames.close()
@@ -133,72 +132,34 @@ def test_a_video_need_not_be_read_to_its_end() -> None:
     gc.collect()
 
 
-@pytest.fixture
-def dataset(tmp_path: Path) -> Path:
-    return shutil.copytree(LEROBOT, tmp_path / "dataset")
-
-
-def test_lerobot_splits_and_subtasks(dataset: Path, out: Path) -> None:
-    info = dataset / "meta" / "info.json"
-    said = json.loads(info.read_text()) | {"splits": {"train": "0:3", "val": "3:4"}}
-    info.write_text(json.dumps(said))
-    data = next((dataset / "data").rglob("*.parquet"))
-    table = parquet.read_table(data)
-    parquet.write_table(table.append_column("subtask_index", table["frame_index"]), data)
-    import_demonstrations(dataset, out)
+def test_lerobot_splits_and_subtasks(tmp_path: Path, out: Path) -> None:
+    splits = odd.info(splits={"train": "0:3", "val": "3:4"})
+    subtasks = odd.rewritten(odd.DATA, lambda table: table.append_column("subtask_index", table["frame_index"]))
+    import_demonstrations(odd.changed(splits, subtasks)(tmp_path), out)
     demos = Demonstrations.read(out, labels=["subtask"])
     assert demos.masks == {"train": ("demo_0", "demo_1", "demo_2"), "valid": ("demo_3",)}
     np.testing.assert_array_equal(demos[3].labels["subtask"], np.arange(8))
 
 
-def remove_video(dataset: Path) -> None:
-    next((dataset / "videos").rglob("*.mp4")).unlink()
-
-
-def no_video(dataset: Path) -> None:
-    next((dataset / "videos").rglob("*.mp4")).write_bytes(b"nothing")
-
-
-def small_video(dataset: Path) -> None:
-    info = dataset / "meta" / "info.json"
-    said = json.loads(info.read_text())
-    said["features"]["observation.images.top"]["shape"][:2] = [11, 12]
-    info.write_text(json.dumps(said))
-
-
-def older(dataset: Path) -> None:
-    info = dataset / "meta" / "info.json"
-    info.write_text(info.read_text().replace('"v3.0"', '"v2.1"'))
-
-
-def cut(dataset: Path) -> None:
-    data = next((dataset / "data").rglob("*.parquet"))
-    data.write_bytes(data.read_bytes()[:-100])
-
-
-def no_rows(dataset: Path) -> None:
-    data = next((dataset / "data").rglob("*.parquet"))
-    parquet.write_table(parquet.read_table(data).slice(6), data)
-
-
-def no_json(dataset: Path) -> None:
-    (dataset / "meta" / "info.json").write_text("{")
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (remove_video, r"file-000\.mp4: the video is missing; leave its observation out with --observation"),
-        (no_video, r"file-000\.mp4: cannot be decoded: .*Invalid data found"),
-        (small_video, r"file-000\.mp4: is \d+ x \d+, and meta/info\.json says 11 x 12"),
-        (older, r"is a LeRobot dataset v2\.1, and v3\.x can be read; convert it with LeRobot's own script: python -m"),
-        (cut, r"demo_0: cannot be read, or is damaged"),
-        (no_rows, r"demo_0: its rows are missing in .*file-000\.parquet"),
-        (no_json, r"info\.json: cannot be read, or is damaged"),
+        (lambda dataset: (dataset / odd.VIDEO).unlink(), r"file-000\.mp4: the video is missing; leave its observation"),
+        (lambda dataset: (dataset / odd.VIDEO).write_bytes(b"nothing"), r"file-000\.mp4: cannot be decoded"),
+        (
+            odd.feature("observation.images.top", dtype="video", shape=[11, 12, 3]),
+            r"file-000\.mp4: is \d+ x \d+, and meta/info\.json says 11 x 12",
+        ),
+        (
+            lambda dataset: (dataset / odd.DATA).write_bytes((dataset / odd.DATA).read_bytes()[:-100]),
+            r"demo_0: cannot be read, or is damaged",
+        ),
+        (lambda dataset: (dataset / "meta" / "info.json").write_text("{"), r"info\.json: cannot be read, or is"),
     ],
+    ids=["no video", "damaged video", "small video", "damaged data", "damaged metadata"],
 )
-def test_a_damaged_lerobot_dataset_is_refused(dataset: Path, out: Path, change, message: str) -> None:
-    change(dataset)
+def test_a_damaged_lerobot_dataset_is_refused(tmp_path: Path, out: Path, change: odd.Change, message: str) -> None:
+    dataset = odd.changed(change)(tmp_path)
     with pytest.raises(DemonstrationsError, match=message):
         import_demonstrations(dataset, out, choice=Choice(videos=True))
     assert not out.exists()
@@ -281,8 +242,7 @@ def test_minaris_episodes_are_counted(written_by_minari, out: Path) -> None:
         del file["episode_1"]
         file["episode_2"].attrs["total_steps"] = 9
         joints = file["episode_3/observations/arm/joints"][:]
-        del file["episode_3/observations/arm/joints"]
-        file["episode_3/observations/arm/joints"] = np.concatenate([joints, joints[:1]])
+        instead(file, "episode_3/observations/arm/joints", np.concatenate([joints, joints[:1]]))
     left_out = import_demonstrations(folder, out, choice=Choice(skip_broken=True)).left_out
     assert Demonstrations.read(out).names == ("demo_0",)
     for name, message in {

@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 import pytest
 from command_line import call
+from odd_files.hdf5 import instead, spoil
 from odd_files.kinds import ROWS, twins, write
 from random_demonstrations import demonstrations
 
@@ -61,11 +62,9 @@ def test_what_a_fit_would_refuse_is_said(path: Path) -> None:
     with h5py.File(path, "r+") as file:
         file["data/demo_1/obs/pose"][2, 1] = np.nan
         file["data/demo_2/obs/pose"][0, 0] = np.inf
-        del file["data/demo_3/obs/goal"]
-        file["data/demo_3/obs/goal"] = np.ones((2, 2))
+        instead(file, "data/demo_3/obs/goal", np.ones((2, 2)))
         del file["data/demo_4/actions"]
-        del file["mask/valid"]
-        file["mask/valid"] = [b"demo_9"]
+        instead(file, "mask/valid", [b"demo_9"])
     found = inspect(path)
     assert (found.fields["obs/pose"].nan, found.fields["obs/pose"].infinite) == (1, 1)
     assert np.isfinite(found.fields["obs/pose"].minimum).all()
@@ -104,9 +103,7 @@ def test_values_that_cannot_be_used_have_a_place(path: Path, block: int, monkeyp
 def test_what_reading_refuses_is_a_problem_and_is_not_imported(path: Path, tmp_path: Path) -> None:
     with h5py.File(path, "r+") as file:
         file["data/demo_1"].attrs["num_samples"] = 9
-        steps = len(file["data/demo_2/actions"])
-        del file["data/demo_2/obs/goal"]
-        file["data/demo_2/obs/goal"] = np.ones((steps, 7))
+        instead(file, "data/demo_2/obs/goal", np.ones((5, 7)))
     short = "demo_1: actions has 4 steps, but num_samples is 9"
     other = "demo_2: obs/goal has shape (7,) at each step, but (2,) in"
     first, second, *_ = inspect(path).problems
@@ -150,11 +147,6 @@ def test_markup_in_names_is_shown_as_it_is(path: Path) -> None:
     assert "obs/[red]x[/red]" in call("inspect", path).out
 
 
-def notes_of(name: str, folder: Path) -> list[str]:
-    """What is noted of a row of odd files, kinds of controls aside."""
-    return [note for note in inspect(ROWS[name].make(folder)).notes if "by control.kind" not in note]
-
-
 NOTES: dict[str, list[str]] = {
     "equal tails": [
         "control dimension 0: exactly -0.30100668315876145 in 9.3 % of the steps",
@@ -184,7 +176,8 @@ def test_what_coincides_is_noted_once(
     name: str, notes: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for _ in range(2):
-        assert [note[: len(said)] for note, said in zip(notes_of(name, tmp_path), notes, strict=True)] == notes
+        found = [note for note in inspect(ROWS[name].make(tmp_path)).notes if "by control.kind" not in note]
+        assert [note[: len(said)] for note, said in zip(found, notes, strict=True)] == notes
         monkeypatch.setattr("ddco_pyro.data.pictures.BLOCK_BYTES", 1)
 
 
@@ -221,17 +214,11 @@ def test_copies_are_noted_where_the_masks_part_them(tmp_path: Path) -> None:
 
 def test_demonstrations_that_cannot_be_read_equal_nothing(tmp_path: Path) -> None:
     path = write(tmp_path / "demos.hdf5")
-    with h5py.File(path, "r+") as file:
-        for name in ("demo_1", "demo_2"):
-            actions = file[f"data/{name}/actions"][()]
-            del file[f"data/{name}/actions"]
-            file.create_dataset(f"data/{name}/actions", data=actions, fletcher32=True, chunks=actions.shape)
-    with h5py.File(path) as file:
-        places = [file[f"data/{name}/actions"].id.get_chunk_info(0).byte_offset for name in ("demo_1", "demo_2")]
-    content = bytearray(path.read_bytes())
-    for place in places:
-        content[place + 8] ^= 1
-    path.write_bytes(content)
+    for place in ("data/demo_1/actions", "data/demo_2/actions"):
+        with h5py.File(path, "r+") as file:
+            actions = file.pop(place)[()]
+            file.create_dataset(place, data=actions, fletcher32=True, chunks=actions.shape)
+        spoil(path, place)
     found = inspect(path)
     assert found.unreadable == ("demo_1", "demo_2")
     assert not any("equal another one" in note for note in found.notes)

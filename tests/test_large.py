@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 
 import h5py
@@ -44,17 +43,6 @@ def large(path: Path, number: int, steps: int, size: int = 1000) -> Path:
     return path
 
 
-def toy_like(path: Path, number: int, steps: int) -> Path:
-    """What the toy run was fitted to, much of it."""
-    with h5py.File(path, "w") as file:
-        for index in range(number):
-            group = file.create_group(f"data/demo_{index}")
-            zeros(group, "obs/offsets", (steps, 4), (steps, 4))
-            zeros(group, "obs/visited", (steps, 1), (steps, 1))
-            zeros(group, "actions", (steps, 2), (steps, 2))
-    return path
-
-
 def spec_of(path: Path, *observations: str) -> Path:
     spec = path.with_suffix(".yaml")
     data = yaml.safe_load(toy_task.SPEC)
@@ -67,20 +55,10 @@ def spec_of(path: Path, *observations: str) -> Path:
 # --- before anything is read ------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def eight(tmp_path: Path) -> Path:
-    """8 GB in a file of a few megabytes."""
-    return large(tmp_path / "eight.hdf5", 10, 100_000)
-
-
-def gigabytes(size: float) -> str:
-    """As a refusal says it, the program itself included."""
-    return f"{math.ceil((size + PROGRAM) / 1e8) / 10:g}"
-
-
-def test_a_fit_to_what_is_larger_than_memory_is_refused(eight: Path, tmp_path: Path) -> None:
-    """28 bytes for each observation and control of a step."""
-    spec, size = spec_of(eight, "state"), gigabytes(28 * 10**6 * (1000 + 2))
+def test_a_fit_to_what_is_larger_than_memory_is_refused(tmp_path: Path) -> None:
+    """8 GB in a file of a few megabytes: 28 bytes for each observation and control of a step, and the program."""
+    eight = large(tmp_path / "eight.hdf5", 10, 100_000)
+    spec, size = spec_of(eight, "state"), f"{math.ceil((28 * 10**6 * (1000 + 2) + PROGRAM) / 1e8) / 10:g}"
     for command in (["check", spec], ["fit", spec, "--out", tmp_path / "run"], ["select", spec, "--out", tmp_path]):
         ended = call(*command)
         assert (ended.status, ended.err.count("\n")) == (2, 1)
@@ -110,43 +88,35 @@ def test_more_can_be_allowed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         assert allowed() == meant
 
 
-def camera(path: Path, demonstrations: int, steps: int, height: int, width: int) -> Path:
-    """Pictures of noise, stored as they are; the same ones in each demonstration."""
-    random = np.random.default_rng(0)
-    block = random.integers(0, 256, (steps, height, width, 3), dtype=np.uint8)
-    with h5py.File(path, "w") as file:
-        for index in range(demonstrations):
-            file[f"data/demo_{index}/obs/seen"] = block
-            file[f"data/demo_{index}/actions"] = random.normal(size=(steps, 3))
-    return path
-
-
-def flat_fit(path: Path, **observation: object) -> Path:
-    """A spec that is soon fitted: one epoch of a flat policy."""
-    policy = {"network": "conv", "filters": 4, "hidden": [8]}
-    data = {
-        "demonstrations": {"path": str(path), "valid_fraction": 0.2},
-        "observations": [{"key": "seen", **observation}],
-        "baseline": {"kind": "flat", "policy": policy},
-        "training": {"epochs": 1},
-    }
-    spec = path.with_suffix(".yaml")
-    spec.write_text(yaml.safe_dump(data))
-    return spec
-
-
 @pytest.mark.slow
 def test_a_fit_to_pictures_stays_within_what_is_allowed(tmp_path: Path) -> None:
     """290 MB of pictures; what they take on the way through networks is a multiple of that."""
-    path = camera(tmp_path / "demos.hdf5", 3, 420, 240, 320)
-    ended = measured("fit", flat_fit(path), "--out", tmp_path / "run", DDCO_PYRO_MEMORY="850MB")
+    path, spec, random = tmp_path / "demos.hdf5", tmp_path / "spec.yaml", np.random.default_rng(0)
+    noise = random.integers(0, 256, (420, 240, 320, 3), dtype=np.uint8)
+    with h5py.File(path, "w") as file:
+        for index in range(3):
+            file[f"data/demo_{index}/obs/seen"] = noise
+            file[f"data/demo_{index}/actions"] = random.normal(size=(420, 3))
+    data = {
+        "demonstrations": {"path": str(path), "valid_fraction": 0.2},
+        "observations": ["seen"],
+        "baseline": {"kind": "flat", "policy": {"network": "conv", "filters": 4, "hidden": [8]}},
+        "training": {"epochs": 1},
+    }
+    spec.write_text(yaml.safe_dump(data))
+    ended = measured("fit", spec, "--out", tmp_path / "run", DDCO_PYRO_MEMORY="850MB")
     print(f"{path.stat().st_size / 1e6:.0f} MB of pictures: {ended.peak / 1e6:.0f} MB at most")
     assert ended.status == 0, ended.err
     assert ended.peak < 850e6
 
 
 def test_a_demonstration_that_cannot_be_segmented_is_refused(toy_run, tmp_path: Path) -> None:
-    path = toy_like(tmp_path / "long.hdf5", 2, 1_000_000)
+    """What the toy run was fitted to, much of it."""
+    path, steps = tmp_path / "long.hdf5", 10**6
+    with h5py.File(path, "w") as file:
+        for name in ("demo_0", "demo_1"):
+            for key, size in (("obs/offsets", 4), ("obs/visited", 1), ("actions", 2)):
+                zeros(file, f"data/{name}/{key}", (steps, size), (steps, size))
     ended = call("segment", toy_run.folder, path, "--in-place")
     assert (ended.status, ended.err.count("\n")) == (2, 1)
     assert ended.err.startswith(f"ddco-pyro: {path}: demo_0: segmenting its 1000000 steps takes about")
@@ -156,36 +126,31 @@ def test_a_demonstration_that_cannot_be_segmented_is_refused(toy_run, tmp_path: 
 # --- what no block of it can be read ----------------------------------------------------------------------------------
 
 
-def one_step(group: h5py.Group) -> None:
-    zeros(group, "obs/state", (3, 2 * 10**6), (1, 10**6))
+def nothing(group: h5py.Group, place: str, shape: tuple[int, ...], chunk: tuple[int, ...]) -> None:
+    """An array of which no chunk is stored."""
+    group.create_dataset(place, shape, "f8", chunks=chunk, compression="gzip")
 
 
-def one_chunk(group: h5py.Group) -> None:
-    zeros(group, "obs/state", (300, 10**4), (300, 10**4))
-
-
-def nothing_stored(group: h5py.Group) -> None:
-    group.create_dataset("obs/state", (3, 10**9), "f8", chunks=(1, 10**6), compression="gzip")
+MUCH = "demo_0: obs/state: to read one step takes about 0.1 GB of memory, and 0.01 are allowed; store"
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
+    ("make", "shape", "chunk", "message"),
     [
-        (one_step, "demo_0: obs/state: to read one step takes about 0.1 GB of memory, and 0.01 are allowed; store"),
-        (one_chunk, "demo_0: obs/state: to read one step takes about 0.1 GB of memory, and 0.01 are allowed; store"),
-        (nothing_stored, "demo_0: obs/state claims 24000000000 bytes, but the file holds 0; write it again"),
+        (zeros, (3, 2 * 10**6), (1, 10**6), MUCH),
+        (zeros, (300, 10**4), (300, 10**4), MUCH),
+        (nothing, (3, 10**9), (1, 10**6), "demo_0: obs/state claims 24000000000 bytes, but the file holds 0; write it"),
     ],
+    ids=["one step", "one chunk", "nothing stored"],
 )
-def test_what_cannot_be_read_in_blocks(
-    make: Callable[[h5py.Group], None], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_cannot_be_read_in_blocks(make, shape, chunk, message: str, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setenv("DDCO_PYRO_MEMORY", "10MB")
     path = tmp_path / "demos.hdf5"
     with h5py.File(path, "w") as file:
         for number in range(3):
             group = file.create_group(f"data/demo_{number}")
             group["actions"] = np.zeros((3, 2))
-            make(group)
+            make(group, "obs/state", shape, chunk)
     assert message in " ".join(inspect(path).problems)
     with pytest.raises(DemonstrationsError, match=message):
         Demonstrations.read(path)
@@ -213,10 +178,8 @@ def test_a_file_that_really_has_more_than_memory(tmp_path: Path, toy_run, toy_sp
             group = file.create_group(f"data/demo_{index}")
             one = originals[index % len(originals)]
             rows = np.resize(np.arange(len(one)), steps)
-            group["obs/offsets"], group["obs/visited"] = (
-                one.observations["offsets"][rows],
-                one.observations["visited"][rows],
-            )
+            for key in ("offsets", "visited"):
+                group[f"obs/{key}"] = one.observations[key][rows]
             group["actions"] = one.actions[rows]
             group.create_dataset("obs/camera", data=random.integers(0, 256, (steps, 250, 267, 3), dtype=np.uint8))
     assert path.stat().st_size > 2.6 * GIGABYTE

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from command_line import call
 from odd_files import layouts as odd
+from odd_files.hdf5 import instead
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.hdf5 import DemonstrationsError
@@ -32,7 +33,7 @@ def same_controls(demos: Demonstrations) -> None:
 
 @pytest.mark.parametrize("obs", ["array", "tree"])
 def test_maniskill(obs: str, tmp_path: Path) -> None:
-    path = odd.maniskill(obs)(tmp_path)
+    path = odd.maniskill(tmp_path, obs)
     assert inspect(path).format == "maniskill"
     demos = imported(path, tmp_path)
     same_controls(demos)
@@ -44,17 +45,16 @@ def test_maniskill(obs: str, tmp_path: Path) -> None:
 
 
 def test_maniskill_with_two_observations_too_many_is_refused(tmp_path: Path) -> None:
-    path = odd.maniskill("array")(tmp_path)
+    path = odd.maniskill(tmp_path, "array")
     with h5py.File(path, "r+") as file:
-        del file["traj_1/obs"]
-        file["traj_1/obs"] = odd.state(1, 2)
+        instead(file, "traj_1/obs", odd.state(1, 2))
     with pytest.raises(DemonstrationsError, match="demo_1: obs/state has 7 steps, but actions has 5"):
         imported(path, tmp_path)
 
 
 @pytest.mark.parametrize("encoded", [False, True])
 def test_act(encoded: bool, tmp_path: Path) -> None:
-    folder = odd.act(encoded)(tmp_path)
+    folder = odd.act(tmp_path, encoded)
     assert inspect(folder).format == "act"
     demos = imported(folder, tmp_path)
     same_controls(demos)
@@ -65,30 +65,27 @@ def test_act(encoded: bool, tmp_path: Path) -> None:
 
 
 def test_one_episode_of_act(tmp_path: Path) -> None:
-    folder = odd.act()(tmp_path)
+    folder = odd.act(tmp_path)
     demos = imported(folder / "episode_2.hdf5", tmp_path)
     assert demos.names == ("demo_2",)
     np.testing.assert_array_equal(demos[0].actions, odd.control(2))
 
 
 def test_the_base_of_a_mobile_robot_is_part_of_its_control(tmp_path: Path) -> None:
-    demos = imported(odd.act(base=True)(tmp_path), tmp_path)
+    demos = imported(odd.act(tmp_path, base=True), tmp_path)
     for number, demo in enumerate(demos):
         np.testing.assert_array_equal(demo.actions, np.hstack([odd.control(number), -odd.control(number)]))
 
 
-def test_d4rl(tmp_path: Path) -> None:
-    path = odd.d4rl()(tmp_path)
+@pytest.mark.parametrize("block", [24, 10**9], ids=["two steps at a time", "all at once"])
+def test_d4rl(block: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ddco_pyro.data.pictures.BLOCK_BYTES", block)
+    path = odd.d4rl(tmp_path)
     assert inspect(path).format == "d4rl"
     demos = imported(path, tmp_path)
     same_controls(demos)
     for number, demo in enumerate(demos):
         np.testing.assert_array_equal(demo.observations["state"], odd.state(number))
-
-
-def test_d4rl_in_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ddco_pyro.data.pictures.BLOCK_BYTES", 24)  # two steps
-    same_controls(imported(odd.d4rl()(tmp_path), tmp_path))
 
 
 @pytest.mark.parametrize("name", [name for name, row in odd.ROWS.items() if row.says not in (None, odd.IMPORT)])

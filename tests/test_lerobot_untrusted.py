@@ -7,9 +7,9 @@ import re
 from pathlib import Path
 
 import pytest
-import yaml
 from command_line import call
 from odd_files import lerobot as odd
+from odd_files import snapshot
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.hdf5 import DemonstrationsError
@@ -19,32 +19,20 @@ from ddco_pyro.data.sources.metadata import check_keys
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.spec import parse_spec
 
-SPEC = """
-demonstrations: {path: PATH, valid_fraction: 0.25}
-observations: [state]
-control: {std: 0.5}
-hierarchy:
-  levels:
-    - {name: skill, count: 2, policy: {network: linear}}
-  meta_policy: {network: linear}
-training: {epochs: 1, batch_size: 3}
-"""
-
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("run")
     import_demonstrations(odd.FIXTURE, folder / "demos.hdf5")
-    return fit(parse_spec(yaml.safe_load(SPEC.replace("PATH", str(folder / "demos.hdf5")))), out=folder / "run").folder
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    """Every file below a folder, and what links say; sockets and the like by name."""
-    return {
-        str(path.relative_to(folder)): str(path.readlink()).encode() if path.is_symlink() else path.read_bytes()
-        for path in folder.rglob("*")
-        if path.is_symlink() or path.is_file()
+    linear = {"network": "linear"}
+    spec = {
+        "demonstrations": {"path": str(folder / "demos.hdf5"), "valid_fraction": 0.25},
+        "observations": ["state"],
+        "control": {"std": 0.5},
+        "hierarchy": {"levels": [{"count": 2, "policy": linear}], "meta_policy": linear},
+        "training": {"epochs": 1, "batch_size": 3},
     }
+    return fit(parse_spec(spec), out=folder / "run").folder
 
 
 def refused(ended, message: str) -> None:
@@ -57,14 +45,14 @@ def refused(ended, message: str) -> None:
 def test_what_leads_out_is_refused_and_nothing_is_touched(name: str, tmp_path: Path, run: Path) -> None:
     row = odd.ROWS[name]
     dataset = row.make(tmp_path)
-    before = contents(tmp_path)
+    before = snapshot(tmp_path)
     for command in (
         ("inspect", dataset),
         ("import", dataset, "--out", tmp_path / "demos.hdf5"),
         ("segment", run, dataset, "--lerobot", tmp_path / "annotated"),
     ):
         refused(call(*command), row.says)
-        assert contents(tmp_path) == before
+        assert snapshot(tmp_path) == before
 
 
 def test_videos_that_lead_out_are_refused(tmp_path: Path) -> None:
@@ -81,14 +69,14 @@ def test_the_hubs_cache_is_read_and_copied(tmp_path: Path, run: Path) -> None:
     for number, path in enumerate(path for path in sorted(dataset.rglob("*")) if path.is_file()):
         path.rename(hub / "blobs" / str(number))
         path.symlink_to(hub / "blobs" / str(number))
-    before = contents(tmp_path)
+    before = snapshot(tmp_path)
     assert call("import", dataset, "--out", tmp_path / "demos.hdf5").status == 0
     assert Demonstrations.read(tmp_path / "demos.hdf5").lengths == (5, 6, 7, 8)
     out = tmp_path / "annotated"
     assert call("segment", run, dataset, "--lerobot", out).status == 0
     assert not any(path.is_symlink() for path in out.rglob("*"))
     assert (out / odd.VIDEO).read_bytes() == (odd.FIXTURE / odd.VIDEO).read_bytes()
-    assert before.items() <= contents(tmp_path).items()
+    assert before.items() <= snapshot(tmp_path).items()
 
 
 @pytest.mark.parametrize("name", odd.EPISODES_NOT_WHOLE)
@@ -106,15 +94,12 @@ def test_an_episode_that_is_not_whole_is_named_and_can_be_skipped(name: str, tmp
 
 
 def test_missing_files_and_episodes_are_skipped_by_name(tmp_path: Path) -> None:
-    for number, (name, left) in enumerate(
-        [
-            ("lerobot missing file", ("demo_0", "demo_1")),
-            ("lerobot episode twice", ("demo_0", "demo_1", "demo_3")),
-            ("lerobot episodes missing", ("demo_0", "demo_1", "demo_2")),
-        ]
-    ):
-        folder = tmp_path / str(number)
-        folder.mkdir()
+    for name, left in {
+        "lerobot missing file": ("demo_0", "demo_1"),
+        "lerobot episode twice": ("demo_0", "demo_1", "demo_3"),
+        "lerobot episodes missing": ("demo_0", "demo_1", "demo_2"),
+    }.items():
+        (folder := tmp_path / name).mkdir()
         dataset, out = odd.ROWS[name].make(folder), folder / "demos.hdf5"
         refused(call("import", dataset, "--out", out), odd.ROWS[name].says)
         assert import_demonstrations(dataset, out, choice=Choice(skip_broken=True)).names == left

@@ -2,36 +2,20 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import forked
 import pytest
 import yaml
-from command_line import Ended, call
-from odd_files import Row, lerobot, rows
+from command_line import call
+from odd_files import Row, lerobot, rows, snapshot
 
 MEMORY = 500 * 10**6
 ROWS = rows()
-
-
 PROGRESS = re.compile(r"\w+: \d+/\d+")
-
-
-def digests(folder: Path, out: Path) -> dict[str, str]:
-    """Of every file below a folder, by its kind and contents; what lies in ``out`` aside."""
-    found = {}
-    for path in sorted(folder.rglob("*")):
-        if path != out and out not in path.parents:
-            regular = path.is_file() and not path.is_symlink()
-            content = hashlib.sha256(path.read_bytes()).hexdigest() if regular else ""
-            target = str(path.readlink()) if path.is_symlink() else ""
-            found[str(path)] = f"{oct(path.lstat().st_mode)} {target} {content}"
-    return found
 
 
 def commands(path: Path, out: Path, run: Path) -> Iterator[tuple[object, ...]]:
@@ -41,13 +25,13 @@ def commands(path: Path, out: Path, run: Path) -> Iterator[tuple[object, ...]]:
         yield "check", path
         yield "fit", path, "--out", written
         return
-    if (path / "spec.yaml").exists():
-        yield "report", path
-        return
     yield "inspect", path
     if not path.is_dir():  # the others are to be imported first
         yield "init", path, "--out", written
-        yield "check", spec_of(path, out)
+        spec, policy = out / "spec.yaml", {"kind": "flat", "policy": {"network": "linear"}}
+        data = {"demonstrations": {"path": str(path)}, "observations": ["offsets"], "baseline": policy}
+        spec.write_text(yaml.safe_dump(data))
+        yield "check", spec
     yield "import", path, "--out", written
     yield "segment", run, path, "--csv", written
 
@@ -56,36 +40,13 @@ ASIDE = "check", "segment"
 """What these say of a file may be something else: the spec and the run may be about other observations."""
 
 
-class Tried(NamedTuple):
-    """A command that was called.
-
-    :param stayed: whether all other files are unchanged.
-    :param wrote: the names of the files that it wrote.
-    """
-
-    command: tuple[object, ...]
-    ended: Ended
-    stayed: bool
-    wrote: set[str]
-
-
-def tried(command: tuple[object, ...], folder: Path, out: Path, before: dict[str, str]) -> Tried:
-    """Call a command, and remove what it wrote."""
+def tried(command: tuple[object, ...], folder: Path, out: Path, before: dict[str, tuple[object, ...]]):
+    """A command, how it ended, whether all other files stayed as they were, and the names of those that it wrote."""
     ended = call(*command)
-    found = Tried(command, ended, digests(folder, out) == before, {one.name for one in out.iterdir()})
+    stayed, wrote = snapshot(folder, out) == before, {one.name for one in out.iterdir()}
     for one in out.glob("*"):
         one.unlink()
-    return found
-
-
-def spec_of(path: Path, out: Path) -> Path:
-    """A spec for such a file, beside what is written."""
-    spec = out / "spec.yaml"
-    network = {"network": "linear"}
-    policy = {"kind": "flat", "policy": network}
-    data = {"demonstrations": {"path": str(path)}, "observations": ["offsets"], "baseline": policy}
-    spec.write_text(yaml.safe_dump(data))
-    return spec
+    return command, ended, stayed, wrote
 
 
 @pytest.fixture(scope="module")
@@ -126,9 +87,9 @@ def test_an_odd_file(name: str, tmp_path: Path, warm: Path) -> None:
     folder.mkdir()
     path = row.make(folder)
     out.mkdir()
-    before = digests(tmp_path, out)
+    before = snapshot(tmp_path, out)
 
-    def all_but_segment() -> list[Tried]:
+    def all_but_segment():
         given = commands(path, out, warm)
         return [tried(command, tmp_path, out, before) for command in given if command[0] != "segment"]
 

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
 import shlex
 import shutil
-import stat
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,6 +14,7 @@ import pytest
 import toy_task
 from command_line import Ended, call
 from odd_files import places as places_rows
+from odd_files import snapshot
 from random_demonstrations import demonstrations
 
 from ddco_pyro.data.demonstrations import Demonstrations
@@ -23,18 +22,7 @@ from ddco_pyro.data.files import NotWritable, Output, check_outputs
 from ddco_pyro.training.data import demonstrations as of
 
 
-def digest(folder: Path) -> dict[str, object]:
-    """All that there is in a folder: kinds, times and contents."""
-    found: dict[str, object] = {}
-    for path in sorted(folder.rglob("*")):
-        about = path.lstat()
-        content = hashlib.sha256(path.read_bytes()).hexdigest() if stat.S_ISREG(about.st_mode) else None
-        found[str(path.relative_to(folder))] = (about.st_mode, about.st_mtime_ns, content)
-    return found
-
-
 def refused(ended: Ended, says: str) -> None:
-    """One line, status 2."""
     assert (ended.status, ended.out, ended.err.count("\n")) == (2, "", 1), ended
     assert ended.err.startswith("ddco-pyro: ")
     assert re.search(says, ended.err), ended.err
@@ -59,9 +47,7 @@ def inputs(toy_run, tmp_path_factory) -> Path:
 
 
 class Command(NamedTuple):
-    """A command that writes: its arguments before the place, the input that a place must not be, and the kind of what
-    it writes.
-    """
+    """Arguments before the place that is written, an input that it must not be, and whether it is a folder."""
 
     arguments: str
     read: str
@@ -77,6 +63,7 @@ COMMANDS = {
     "fit": Command("fit toy.yaml --out", "toy.yaml", folder=True),
     "collect": Command("collect toy.yaml --out", "toy.yaml"),
     "init": Command("init demos.hdf5 --force --out", "demos.hdf5"),
+    "encode": Command("encode demos.hdf5 --observation camera --out", "demos.hdf5"),
     "import": Command("import demos.hdf5 --out", "demos.hdf5"),
 }
 
@@ -103,7 +90,6 @@ NO_FOLDER = {"file": "is a file; name a folder", "pipe": "is a file; name a fold
 
 
 def places(command: Command) -> dict[str, str]:
-    """Bad places for its output, and what is said of each."""
     if command.read == "run":
         return NOWHERE | NO_FOLDER | dict.fromkeys(["run/new", "link-run/new"], "lies in run, which this command reads")
     read = dict.fromkeys((command.read, f"link-{command.read}", f"hard-{command.read}"), READ)
@@ -113,20 +99,20 @@ def places(command: Command) -> dict[str, str]:
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_bad_place_is_refused_before_anything_is_done(inputs: Path, monkeypatch, name: str) -> None:
     monkeypatch.chdir(inputs)
-    before = digest(inputs)
+    before = snapshot(inputs)
     for place, says in places(COMMANDS[name]).items():
         if name == "compare":  # its files are named, in a folder
             says = says.replace("is a file; name a folder", "Not a directory")
         refused(call(*COMMANDS[name].arguments.split(), place), says)
-    assert digest(inputs) == before
+    assert snapshot(inputs) == before
 
 
 def test_a_file_of_the_run_is_no_output(inputs: Path, monkeypatch) -> None:
     monkeypatch.chdir(inputs)
-    before = digest(inputs)
+    before = snapshot(inputs)
     for place in ("run/model.safetensors", "run/new", "link-run/spec.yaml"):
         refused(call("segment", "run", "demos.hdf5", "--csv", place), "lies in run, which this command reads")
-    assert digest(inputs) == before
+    assert snapshot(inputs) == before
 
 
 @pytest.mark.parametrize("second", ["a", "./a", "link"])

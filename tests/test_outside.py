@@ -22,7 +22,7 @@ from ddco_pyro.data.sources import open_source
 
 ELSEWHERE = {
     "raw": (changed(raw), ["actions.raw"]),
-    "link": (changed(linked("/data/demo_0", "data/demo_1")), ["other.hdf5"]),
+    "link": (changed(linked, "/data/demo_0", "data/demo_1"), ["other.hdf5"]),
     "virtual": (changed(virtual), ["other.hdf5"]),
 }
 
@@ -54,11 +54,11 @@ def test_other_files_are_named_and_read_only_where_that_is_allowed(kind: str, tm
 @pytest.mark.parametrize(
     ("make", "says"),
     [
-        (changed(lambda group, folder: raw(group, folder, STEPS * 2 * 8 - 1)), r"actions.raw has to hold 192 bytes"),
-        (changed(lambda group, folder: virtual(group, folder, there=STEPS - 1)), r"has another shape: \(11, 4\)"),
-        (changed(lambda group, folder: virtual(group, folder, rows=STEPS - 1)), r"a part of it has no source"),
-        (changed(lambda group, folder: virtual(group, folder, key="y")), r"other.hdf5: x is missing"),
-        (changed(lambda group, folder: virtual(group, folder, "gone.hdf5")), r"gone.hdf5: there is no such file"),
+        (changed(raw, STEPS * 2 * 8 - 1), r"actions.raw has to hold 192 bytes"),
+        (changed(virtual, there=STEPS - 1), r"has another shape: \(11, 4\)"),
+        (changed(virtual, rows=STEPS - 1), r"a part of it has no source"),
+        (changed(virtual, key="y"), r"other.hdf5: x is missing"),
+        (changed(virtual, "gone.hdf5"), r"gone.hdf5: there is no such file"),
     ],
 )
 def test_a_part_that_another_file_does_not_have(make, says: str, tmp_path: Path) -> None:
@@ -71,7 +71,7 @@ def test_a_part_that_another_file_does_not_have(make, says: str, tmp_path: Path)
 
 
 def test_labels_are_not_written_where_parts_lie_in_other_files(toy_run, tmp_path: Path) -> None:
-    path = changed(linked("/data/demo_0", "data/demo_1"))(tmp_path)
+    path = changed(linked, "/data/demo_0", "data/demo_1")(tmp_path)
     other = (tmp_path / "other.hdf5").read_bytes()
     assert call("segment", toy_run.folder, path, "--csv", tmp_path / "a.csv").status == 2
     assert call("segment", toy_run.folder, path, "--csv", tmp_path / "a.csv", "--allow-external").status == 0
@@ -123,9 +123,6 @@ def test_a_minari_episode_that_is_not_whole(tmp_path: Path) -> None:
         file.create_dataset("episode_1/actions", (9, 2), "f8", chunks=(4, 2))[:4] = 1.0
     with pytest.raises(DemonstrationsError, match=r"episode_1/actions claims 144 bytes, but the file holds 64"):
         Minari(tmp_path, Storage(), False).recording("demo_1")
-
-
-# --- values -----------------------------------------------------------------------------------------------------------
 
 
 def test_a_damaged_file_is_said_by_another_process() -> None:

@@ -14,19 +14,20 @@ import pytest
 import torch
 import yaml
 from command_line import call
+from dots import followed
 from elsewhere import THERE, Device
 from killing import struck
+from odd_files.hdf5 import spoil
 
 import ddco_pyro
 from ddco_pyro.acting.window import ObservationError, Window
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
 from ddco_pyro.data.pictures import Job, Pictures, Readers, Transform, read, shifted
 from ddco_pyro.errors import Failed
-from ddco_pyro.exporting import runner, write_numpy
 from ddco_pyro.fitting.digest import digest
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.encoder import ObservationEncoder
-from ddco_pyro.spec import ObservationSpec, SpecError, parse_spec, with_overrides
+from ddco_pyro.spec import ObservationSpec, SpecError, parse_spec
 from ddco_pyro.training.networks import Dimensions, build_hierarchy
 
 HEIGHT, WIDTH = 12, 10
@@ -68,7 +69,6 @@ def spec_of(path: Path, *observations: Any, **training: Any) -> dict[str, Any]:
 
 
 def bits(fit: ddco_pyro.Fit) -> bytes:
-    """All weights."""
     models = (fit.hierarchy, *(beside.hierarchy for beside in fit.baselines.values()))
     return b"".join(value.numpy().tobytes() for model in models for value in model.state_dict().values())
 
@@ -89,12 +89,6 @@ def test_pictures_of_a_file_are_read_when_asked_for(kept: Path) -> None:
         assert len(pickle.dumps(pictures)) < 1000
     assert read.observation_shapes == made.observation_shapes
     assert digest(read).observations == digest(made).observations
-
-
-def test_what_was_read_is_written_again(kept: Path, tmp_path: Path) -> None:
-    Demonstrations.read(kept).write(tmp_path / "again.hdf5")
-    again = Demonstrations.read(tmp_path / "again.hdf5")
-    assert digest(again).observations == digest(demonstrations()).observations
 
 
 def test_a_file_that_has_changed_since(tmp_path: Path) -> None:
@@ -260,20 +254,6 @@ def test_a_controller_sees_what_networks_were_trained_on(kept: Path) -> None:
         fit.controller().act(seen[0] | {"camera": np.zeros((5, 4, 1), np.uint8)})
 
 
-@pytest.mark.parametrize("cut", [{"crop": [1, 2, 10, 8], "resize": [5, 4], "frames": 3}, {"grey": True}])
-def test_an_exported_controller_takes_the_same_pictures(kept: Path, cut: dict[str, Any], tmp_path: Path) -> None:
-    """Those of the file: it cuts and scales them itself, as the run's controller does."""
-    spec = parse_spec(spec_of(kept, {"key": "camera", **cut}, epochs=1, layerwise=False, initialize="random"))
-    fit = ddco_pyro.fit(with_overrides(spec, {"compare_with": []}))
-    write_numpy(fit, tmp_path)
-    ours, theirs = fit.controller(), runner.Runner(tmp_path)
-    ours.reset(0)
-    demo = demonstrations()[3]
-    for step in range(len(demo)):
-        seen = {key: values[step] for key, values in demo.observations.items()}
-        np.testing.assert_allclose(theirs.act(seen), ours.act(seen), atol=1e-5)
-
-
 def test_what_is_read_ahead_is_what_is_asked_for(kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A plan that is off would be slow, not wrong: so the order is compared, and every reading is a planned one."""
     monkeypatch.setattr("ddco_pyro.model.hierarchy.BYTES_AT_ONCE", 1)
@@ -351,11 +331,7 @@ def test_killed_while_workers_read(kept: Path, tmp_path: Path, whom: str, expect
 def test_a_damaged_picture_is_one_line(kept: Path, tmp_path: Path) -> None:
     path = tmp_path / "damaged.hdf5"
     path.write_bytes(kept.read_bytes())
-    with h5py.File(path) as file:
-        chunk = file["data/demo_2/obs/camera"].id.get_chunk_info(30)
-    content = bytearray(path.read_bytes())
-    content[chunk.byte_offset : chunk.byte_offset + chunk.size] = b"\xff" * chunk.size
-    path.write_bytes(content)
+    spoil(path, "data/demo_2/obs/camera", chunk=30)
     spec = tmp_path / "spec.yaml"
     spec.write_text(yaml.safe_dump(spec_of(path, "camera")))
     ended = call("fit", spec, "--out", tmp_path / "run")
@@ -366,7 +342,6 @@ def test_a_damaged_picture_is_one_line(kept: Path, tmp_path: Path) -> None:
 # --- a policy is learnt from pictures ---------------------------------------------------------------------------------
 
 
-SIZE, STEPS = 24, 12
 CONVOLUTION = {
     "network": "conv",
     "layers": [{"filters": 4, "kernel": 5, "stride": 2, "padding": 2}, {"filters": 4, "kernel": 3, "padding": 1}],
@@ -375,21 +350,8 @@ CONVOLUTION = {
 }
 
 
-def followed(number, seed):
-    """A blob moves along a line through a picture, and the control is its place, from -1 to 1."""
-    random, demos = np.random.default_rng(seed), []
-    rows = columns = np.linspace(-1, 1, SIZE)
-    for n in range(number):
-        ends = random.uniform(-0.8, 0.8, (2, 2))
-        place = np.linspace(*ends, STEPS)
-        distance = (rows[:, None] - place[:, :1, None]) ** 2 + (columns - place[:, 1:, None]) ** 2
-        pictures = (255 * np.exp(-distance / 0.05)).astype(np.uint8)[..., None]
-        demos.append(Demonstration(f"demo_{n}", {"camera": pictures}, place + 0.02 * random.normal(size=place.shape)))
-    return Demonstrations(tuple(demos))
-
-
 @pytest.mark.parametrize("policy", [CONVOLUTION, {"network": "lstm", "over": CONVOLUTION, "hidden": 16}])
-def test_a_blob_is_followed(policy):
+def test_a_dot_is_followed(policy):
     """With less than a fifth of the error of the best control that does not look."""
     spec = parse_spec(
         {
@@ -400,7 +362,7 @@ def test_a_blob_is_followed(policy):
             "training": {"epochs": 60, "batch_size": 4, "optimizer": {"lr": 0.01}},
         }
     )
-    controller, new = ddco_pyro.fit(spec, followed(16, 0)).controller(), followed(8, 1)
+    controller, new = ddco_pyro.fit(spec, followed(16)).controller(), followed(8, seed=1)
     squared = []
     for demo in new:
         controller.reset()

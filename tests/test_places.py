@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import resource
 import shutil
-import signal
-import subprocess
-import sys
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 
+import forked
 import pytest
 import torch
 import toy_task
@@ -22,38 +18,30 @@ from random_demonstrations import demonstrations
 
 from ddco_pyro.data.files import NoSpace, NotWritable, only_one, whole_file, whole_folder, write_text
 from ddco_pyro.data.tensors import read_tensors, write_tensors
+from ddco_pyro.training.data import demonstrations as of
 
 NOBODY = 65534
 
 
-@contextlib.contextmanager
-def room(size: int) -> Iterator[None]:
+def fails_on_a_full_disk(size: int, *command: object) -> None:
     """No file can grow beyond ``size`` bytes: what the system says is what it says when a disk is full."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:
-        yield
+        ended = call(*command)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
-
-
-@pytest.fixture
-def source(tmp_path: Path) -> Path:
-    path = tmp_path / "source.hdf5"
-    demonstrations(20).write(path)
-    return path
+    assert ended.status == 1, ended.err
+    assert "there is no room to write it; free some space, then do the same again" in ended.err.splitlines()[-1]
 
 
 @pytest.mark.parametrize(
     "size", [5000, 60_000, *(pytest.param(size, marks=pytest.mark.slow) for size in (0, 100, 20_000))]
 )
-def test_a_full_disk_while_importing(source: Path, tmp_path: Path, size: int) -> None:
-    out = tmp_path / "out.hdf5"
-    with room(size):
-        ended = call("import", source, "--out", out)
-    last = ended.err.splitlines()[-1]
-    assert ended.status == 1, ended.err
-    assert "there is no room to write it; free some space, then do the same again" in last
+def test_a_full_disk_while_importing(tmp_path: Path, size: int) -> None:
+    source, out = tmp_path / "source.hdf5", tmp_path / "out.hdf5"
+    demonstrations(20).write(source)
+    fails_on_a_full_disk(size, "import", source, "--out", out)
     assert not out.exists()
     assert not list(tmp_path.rglob("*.tmp"))
     assert call("import", source, "--out", out).status == 0
@@ -63,16 +51,11 @@ def test_a_full_disk_while_importing(source: Path, tmp_path: Path, size: int) ->
 
 @pytest.mark.parametrize("size", [0, 3000])
 def test_a_full_disk_while_segmenting(toy_run, toy_spec, tmp_path: Path, size: int) -> None:
-    from ddco_pyro.training.data import demonstrations as of
-
     path = tmp_path / "demos.hdf5"
     of(toy_spec).write(path)
     before = path.read_bytes()
     for more in (["--csv", tmp_path / "a.csv"], ["--html", tmp_path / "a.html"]):
-        with room(size):
-            ended = call("segment", toy_run.folder, path, "--in-place", *more)
-        assert ended.status == 1
-        assert "there is no room to write it" in ended.err.splitlines()[-1]
+        fails_on_a_full_disk(size, "segment", toy_run.folder, path, "--in-place", *more)
     assert path.read_bytes() == before
     assert {one.name for one in tmp_path.iterdir()} <= {"demos.hdf5", "a.csv"}  # whole, or not there
 
@@ -81,27 +64,10 @@ def test_a_full_disk_while_fitting(tmp_path: Path, cache) -> None:
     spec = tmp_path / "toy.yaml"
     spec.write_text(toy_task.SPEC)
     short = ["--set", "training.epochs=2", "--set", "compare_with=[]"]
-    with room(4000):
-        ended = call("fit", spec, "--out", tmp_path / "run", *short)
-    assert ended.status == 1
-    assert "there is no room to write it" in ended.err.splitlines()[-1]
+    fails_on_a_full_disk(4000, "fit", spec, "--out", tmp_path / "run", *short)
     assert call("fit", spec, "--out", tmp_path / "run", *short).status == 0
     assert call("fit", spec, "--out", tmp_path / "other", *short).status == 0
     assert (tmp_path / "run/model.safetensors").read_bytes() == (tmp_path / "other/model.safetensors").read_bytes()
-
-
-AS_NOBODY = """
-import os, sys
-from pathlib import Path
-from ddco_pyro.data.files import NotWritable, only_one, write_text
-os.setuid(int(sys.argv[2])) if os.getuid() == 0 else None
-folder = Path(sys.argv[1])
-for attempt in (lambda: write_text(folder / "file", "x"), lambda: only_one(folder / "run").__enter__()):
-    try:
-        attempt()
-    except NotWritable as error:
-        print(error)
-"""
 
 
 def test_a_read_only_folder(tmp_path: Path) -> None:
@@ -110,11 +76,19 @@ def test_a_read_only_folder(tmp_path: Path) -> None:
     folder.chmod(0o555)
     for above in [tmp_path, *tmp_path.parents][:3]:
         above.chmod(above.stat().st_mode | 0o055)
-    command = [sys.executable, "-c", AS_NOBODY, str(folder), str(NOBODY)]
-    ended = subprocess.run(command, capture_output=True, text=True)
-    lines = ended.stdout.splitlines()
+
+    def as_nobody() -> list[str]:
+        if os.getuid() == 0:
+            os.setuid(NOBODY)
+        said = []
+        for attempt in (lambda: write_text(folder / "file", "x"), lambda: only_one(folder / "run").__enter__()):
+            with pytest.raises(NotWritable) as refused:
+                attempt()
+            said.append(str(refused.value))
+        return said
+
     reason = "cannot be written: Permission denied; choose another place or change this one"
-    assert lines == [f"{folder}/file: {reason}", f"{folder}/run: {reason}"], ended.stderr
+    assert forked.run(as_nobody).value == [f"{folder}/file: {reason}", f"{folder}/run: {reason}"]
 
 
 def test_who_waits_goes_on_when_the_other_has_ended(tmp_path: Path) -> None:
@@ -149,11 +123,10 @@ def test_a_second_process_on_a_run_is_refused(tmp_path: Path) -> None:
 
 def test_what_the_dead_have_left_is_removed(tmp_path: Path) -> None:
     path = tmp_path / "file"
-    dead = subprocess.Popen([sys.executable, "-c", ""])
-    dead.wait()
+    dead = forked.run(os.getpid).value
     with whole_file(path) as temporary:
         name = temporary.name
-        stale = tmp_path / name.replace(f"-{os.getpid()}-", f"-{dead.pid}-")
+        stale = tmp_path / name.replace(f"-{os.getpid()}-", f"-{dead}-")
         stale.touch()
         with whole_file(path) as second:  # it removes what the dead have left, not what is being written
             second.write_text("second")
@@ -221,24 +194,6 @@ def test_a_folder_that_is_cut_off_leaves_what_was_there(tmp_path, error):
     assert (tmp_path / "folder").stat().st_mode & 0o777 == 0o755
 
 
-KILLED = """
-import os, signal
-from pathlib import Path
-from ddco_pyro.data.files import whole_folder
-with whole_folder(Path("folder")) as temporary:
-    (temporary / "file").write_text("half")
-    os.kill(os.getpid(), signal.SIGKILL)
-"""
-
-
-def test_what_a_killed_process_left_of_a_folder_is_removed(tmp_path):
-    ended = subprocess.run([sys.executable, "-c", KILLED], cwd=tmp_path, check=False)
-    assert ended.returncode == -signal.SIGKILL
-    assert [path.name.startswith(".folder-") for path in tmp_path.iterdir()] == [True]
-    write_folder(tmp_path / "folder", "whole")
-    assert [path.name for path in tmp_path.iterdir()] == ["folder"]
-
-
 class Killed(BaseException):
     """Where a process was killed: nothing of it runs after that."""
 
@@ -248,9 +203,7 @@ def test_a_folder_is_there_whole_wherever_its_writer_was_killed(tmp_path, monkey
     """Killed before or after each of the two renames, the folder is the old or the new one once it is written again."""
     path, rename = tmp_path / "folder", Path.rename
     write_folder(path, "old")
-    dead = subprocess.Popen([sys.executable, "-c", ""])
-    dead.wait()
-    renamed = []
+    dead, renamed = forked.run(os.getpid).value, []
 
     def killed(self, target):
         done = {"before the first": 0, "between the two": 1, "after the second": 2}[step]
@@ -260,7 +213,7 @@ def test_a_folder_is_there_whole_wherever_its_writer_was_killed(tmp_path, monkey
             raise Killed
 
     with monkeypatch.context() as patched:
-        patched.setattr("os.getpid", lambda: dead.pid)
+        patched.setattr("os.getpid", lambda: dead)
         patched.setattr(Path, "rename", killed)
         patched.setattr("shutil.rmtree", lambda *_, **__: None)
         patched.setattr("ddco_pyro.data.files._put_back", lambda *_: None)

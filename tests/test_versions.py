@@ -12,7 +12,6 @@ import pytest
 import torch
 import yaml
 from command_line import call
-from dots import followed
 
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
@@ -55,12 +54,6 @@ def spec_of(*observations: Any, **training: Any) -> dict[str, Any]:
 def bits(fit: ddco_pyro.Fit) -> bytes:
     models = (fit.hierarchy, *(beside.hierarchy for beside in fit.baselines.values()))
     return b"".join(value.numpy().tobytes() for model in models for value in model.state_dict().values())
-
-
-def without_versions(demos: Demonstrations) -> Demonstrations:
-    kept = ({key: demo.observations[key] for key in ("place", "other")} for demo in demos)
-    pairs = zip(demos, kept, strict=True)
-    return replace(demos, demonstrations=tuple(replace(demo, observations=own) for demo, own in pairs))
 
 
 # --- what is trained with ---------------------------------------------------------------------------------------------
@@ -106,7 +99,8 @@ def test_versions_are_for_training_alone() -> None:
     assert bits(varied) != bits(plain)
     for name in ("mean", "std"):
         assert torch.equal(getattr(varied.hierarchy.encoder, name), getattr(plain.hierarchy.encoder, name))
-    bare = without_versions(demos)
+    kept = [{key: demo.observations[key] for key in ("place", "other")} for demo in demos]
+    bare = Demonstrations(tuple(replace(demo, observations=own) for demo, own in zip(demos, kept, strict=True)))
     np.testing.assert_array_equal(varied.log_likelihood(bare), varied.log_likelihood(demos))
     controller = varied.controller(seed=0)
     assert controller.act({key: values[0] for key, values in bare[0].observations.items()}).shape == (2,)
@@ -115,17 +109,10 @@ def test_versions_are_for_training_alone() -> None:
 # --- how they are written ---------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("versions") / "dots.hdf5"
-    followed(6).write(path)
-    return path
-
-
-def test_moved_pictures_are_encoded_as_pictures_are(source: Path, tmp_path: Path) -> None:
+def test_moved_pictures_are_encoded_as_pictures_are(few_dots: Path, tmp_path: Path) -> None:
     out, most = tmp_path / "out.hdf5", 2
-    encode(source, out, Encoding("camera", size=5, moved=VERSIONS, shift=most, seed=3))
-    encoder, pictures = load(f"{out}.encoder"), Demonstrations.read(source, ["camera"])
+    encode(few_dots, out, Encoding("camera", size=5, moved=VERSIONS, shift=most, seed=3))
+    encoder, pictures = load(f"{out}.encoder"), Demonstrations.read(few_dots, ["camera"])
     found, moves = Demonstrations.read(out), []
     for demo, original in zip(found, pictures, strict=True):
         versions, frames = demo.observations["camera_features_moved"], original.observations["camera"]
@@ -144,15 +131,15 @@ def test_moved_pictures_are_encoded_as_pictures_are(source: Path, tmp_path: Path
             moves += fits[:1]
     assert len(set(moves)) > 9  # of 18, of 25 that there are
     plain = tmp_path / "plain.hdf5"
-    encode(source, plain, Encoding("camera", size=5, seed=3))
+    encode(few_dots, plain, Encoding("camera", size=5, seed=3))
     for demo, other in zip(found, Demonstrations.read(plain), strict=True):
         np.testing.assert_array_equal(demo.observations["camera_features"], other.observations["camera_features"])
 
 
-def test_from_pictures_to_a_policy_by_commands(source: Path, tmp_path: Path) -> None:
+def test_from_pictures_to_a_policy_by_commands(few_dots: Path, tmp_path: Path) -> None:
     """``init`` finds the versions, a fit trains with them, and pictures without versions are segmented."""
     out, bare, spec, run = (tmp_path / name for name in ("moved.hdf5", "bare.hdf5", "spec.yaml", "run"))
-    given = ("encode", source, "--observation", "camera", "--size", 4)
+    given = ("encode", few_dots, "--observation", "camera", "--size", 4)
     ended = call(*given, "--out", out, "--moved", VERSIONS, "--shift", 2)
     assert ended.status == 0
     assert "; of moved pictures, 3 times: obs/camera_features_moved; " in ended.out

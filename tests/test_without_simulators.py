@@ -6,10 +6,9 @@ import json
 import subprocess
 import sys
 
-import numpy as np
 import pytest
+from random_demonstrations import of_states
 
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.planted import pick_and_place
 
 HIDDEN = ("cv2", "dm_control", "dm_env", "gymnasium", "mujoco", "ompl")
@@ -39,15 +38,8 @@ def call(folder, *commands):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A folder with a small file of demonstrations."""
-    folder, random = tmp_path_factory.mktemp("own"), np.random.default_rng(0)
-    demos = []
-    for number in range(12):
-        state = random.normal(size=(10, 3))
-        phase = (np.arange(10) >= 5)[:, None]
-        action = np.where(phase, state[:, :2], -state[:, :2]) + 0.1 * random.normal(size=(10, 2))
-        demos.append(Demonstration(f"demo_{number}", {"state": state}, action))
-    Demonstrations(tuple(demos)).write(folder / "mine.hdf5")
+    folder = tmp_path_factory.mktemp("own")
+    of_states([10] * 12).write(folder / "mine.hdf5")
     return folder
 
 

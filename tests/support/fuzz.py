@@ -1,22 +1,26 @@
-"""Damaged specs and files of demonstrations, by seed, and a process in which they are tried."""
+"""Damaged specs and files of demonstrations, by seed, and how the files are tried."""
 
 from __future__ import annotations
 
 import contextlib
 import json
 import random
-import select
-import subprocess
-import sys
+import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import forked
 import h5py
 import numpy as np
 import yaml
-from killing import HANGS
 from random_demonstrations import demonstrations
+
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.importing import import_demonstrations
+from ddco_pyro.data.inspection import inspect
+from ddco_pyro.data.starting import starting_spec
+from ddco_pyro.errors import BadInput
 
 SECONDS = 60
 """A spec that keeps the process busy for longer hangs."""
@@ -41,20 +45,19 @@ def damaged_spec(base: dict[str, Any], seed: int) -> bytes:
     return _damage_bytes(text, choose) if choose.random() < 0.25 else text
 
 
-def _places(node: Any) -> Iterator[tuple[Any, Any]]:
-    """Every container with each of its keys."""
+def places(node: Any) -> Iterator[tuple[Any, Any]]:
     for key in list(node) if isinstance(node, dict) else range(len(node)):
         yield node, key
         if isinstance(node[key], dict | list):
-            yield from _places(node[key])
+            yield from places(node[key])
 
 
 def _damage_data(data: dict[str, Any], choose: random.Random) -> None:
-    places = list(_places(data))
-    if not places:
+    known = list(places(data))
+    if not known:
         return
-    node, key = choose.choice(places)
-    other_node, other_key = choose.choice(places)
+    node, key = choose.choice(known)
+    other_node, other_key = choose.choice(known)
     how = choose.randrange(6)
     if how == 0:
         del node[key]
@@ -95,7 +98,6 @@ def _damage_bytes(content: bytes, choose: random.Random) -> bytes:
 
 
 def damaged_file(path: Path, seed: int) -> None:
-    """Write a file of demonstrations with something wrong, or right in another way."""
     choose = random.Random(seed)
     demonstrations(4, {"train": ("demo_0", "demo_1"), "valid": ("demo_2",)}).write(path)
     if choose.random() < 0.3:
@@ -123,7 +125,6 @@ def _anything(file: h5py.File, choose: random.Random) -> str:
 
 
 def _remove(file: h5py.File, choose: random.Random) -> str:
-    """Where something was."""
     place = _anything(file, choose)
     if place in file:
         del file[place]
@@ -183,71 +184,28 @@ EDITS: tuple[Edit, ...] = (
 
 # --- where they are tried ---------------------------------------------------------------------------------------------
 
-WORKER = """
-import json, resource, sys, traceback
-from pathlib import Path
-import ddco_pyro.data.demonstrations, ddco_pyro.data.inspection, ddco_pyro.data.starting, ddco_pyro.data.importing
-from ddco_pyro.errors import BadInput
-from ddco_pyro.data.pictures import BLOCK_BYTES
+GROWN = 3 * 2**29
+"""Bytes of memory beyond those of the process, which together are less than 2 GB."""
 
-def tried(what):
+
+def tried(path: Path) -> list[str]:
+    """How each way to read a file ends: ``fine``, ``refused``, or what went wrong."""
+    out = path.with_suffix(".imported")
+    ways = (
+        lambda: Demonstrations.read(path),
+        lambda: starting_spec(inspect(path), path),
+        lambda: import_demonstrations(path, out),
+    )
+    child = forked.run(lambda: [_end(way) for way in ways])
+    out.unlink(missing_ok=True)
+    return child.value if child.status == 0 and child.grown < GROWN else [f"{child}"]
+
+
+def _end(way: Callable[[], object]) -> str:
     try:
-        what()
+        way()
         return "fine"
     except BadInput as error:
-        return "refused" if "\\n" not in str(error) else f"more than one line: {error!r}"
+        return "refused" if "\n" not in str(error) else f"more than one line: {error!r}"
     except BaseException:
         return traceback.format_exc()
-
-print("ready", flush=True)
-for line in sys.stdin:
-    path = Path(line.strip())
-    out = path.with_suffix(".imported")
-    def started():
-        ddco_pyro.data.starting.starting_spec(ddco_pyro.data.inspection.inspect(path), path)
-    found = [
-        tried(lambda: ddco_pyro.data.demonstrations.Demonstrations.read(path)),
-        tried(started),
-        tried(lambda: ddco_pyro.data.importing.import_demonstrations(path, out)),
-    ]
-    out.unlink(missing_ok=True)
-    print(json.dumps([found, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss]), flush=True)
-"""
-
-
-class Worker:
-    """A process that reads files; one that dies or hangs is the file's fault, and is replaced."""
-
-    def __init__(self) -> None:
-        self.process: subprocess.Popen[str] | None = None
-
-    def try_file(self, path: Path) -> list[str]:
-        """How each way to read a file ended: ``fine``, ``refused``, or what went wrong."""
-        if self.process is None:
-            pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
-            self.process = subprocess.Popen([sys.executable, "-c", WORKER], text=True, **pipes)  # type: ignore[call-overload]
-            assert self._line() == "ready\n"
-        assert self.process is not None
-        assert self.process.stdin is not None
-        self.process.stdin.write(f"{path}\n")
-        self.process.stdin.flush()
-        answer = self._line()
-        if not answer:
-            status = self.process.poll()
-            self.close()
-            return [f"died or hung ({status})"]
-        found, peak = json.loads(answer)
-        return found if peak < 2 * 2**20 else [f"took {peak} KiB of memory"]
-
-    def _line(self) -> str:
-        assert self.process is not None
-        assert self.process.stdout is not None
-        ready, _, _ = select.select([self.process.stdout], [], [], HANGS)
-        return self.process.stdout.readline() if ready else ""
-
-    def close(self) -> None:
-        """End the process."""
-        if self.process is not None:
-            self.process.kill()
-            self.process.communicate()
-            self.process = None

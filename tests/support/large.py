@@ -40,7 +40,6 @@ sys.exit(status)
 
 
 def measured(*arguments: object, **environment: str) -> Ended:
-    """Run a command in a process of its own."""
     command = [sys.executable, "-c", SMALL, COMMAND, *map(str, arguments)]
     ended = subprocess.run(command, capture_output=True, text=True, env={**os.environ, **environment})
     out, _, peak = ended.stdout.rstrip().rpartition("\n")

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import pkgutil
+import stat
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,3 +28,15 @@ def rows() -> dict[str, Row]:
     modules = sorted(module.name for module in pkgutil.iter_modules(__path__))
     tables = {name: importlib.import_module(f"{__name__}.{name}").ROWS for name in modules}
     return {f"{module}: {name}": row for module, table in tables.items() for name, row in table.items()}
+
+
+def snapshot(folder: Path, aside: Path | None = None) -> dict[str, tuple[object, ...]]:
+    """All that there is below a folder, ``aside`` aside: kinds, times, where links lead, and contents."""
+    found = {}
+    for path in folder.rglob("*"):
+        if aside not in (path, *path.parents):
+            about = path.lstat()
+            leads = path.readlink() if path.is_symlink() else None
+            content = hashlib.sha256(path.read_bytes()).digest() if stat.S_ISREG(about.st_mode) else None
+            found[str(path.relative_to(folder))] = (about.st_mode, about.st_mtime_ns, leads, content)
+    return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -34,16 +35,13 @@ def at_bounds(number: int = 8) -> Demonstrations:
     )
 
 
-def _written(make: Callable[[], Demonstrations]) -> Callable[[Path], Path]:
-    def write(folder: Path) -> Path:
-        make().write(folder / "demos.hdf5")
-        return folder / "demos.hdf5"
-
-    return write
+def _written(make: Callable[[], Demonstrations], folder: Path) -> Path:
+    make().write(folder / "demos.hdf5")
+    return folder / "demos.hdf5"
 
 
 ROWS = {
-    "half of the steps are no-ops": Row(_written(no_ops), None),
-    "each dimension rests by itself": Row(_written(lambda: no_ops(at_once=False)), None),
-    "resting, and at bounds": Row(_written(at_bounds), None),
+    "half of the steps are no-ops": Row(partial(_written, no_ops), None),
+    "each dimension rests by itself": Row(partial(_written, partial(no_ops, at_once=False)), None),
+    "resting, and at bounds": Row(partial(_written, at_bounds), None),
 }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import zlib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import h5py
@@ -27,22 +28,30 @@ def demonstrations(path: Path, number: int = 6) -> h5py.File:
     return file
 
 
-def changed(change: Callable[[h5py.Group, Path], None]) -> Callable[[Path], Path]:
-    """Writes such a file, with something odd about ``demo_1``."""
+def changed(change: Callable[..., None], *given: object, **named: object) -> Callable[[Path], Path]:
+    """Writes such a file, with something odd about ``demo_1``: a change of (its group, the folder, what is given)."""
 
     def make(folder: Path) -> Path:
         path = folder / "demos.hdf5"
         with demonstrations(path) as file:
-            change(file["data/demo_1"], folder)
+            change(file["data/demo_1"], folder, *given, **named)
         return path
 
     return make
 
 
 def instead(group: h5py.Group, key: str, item: object) -> None:
-    """Put something in the place of what has this name."""
     del group[key]
     group[key] = item
+
+
+def spoil(path: Path, place: str, chunk: int = 0) -> None:
+    """Flip a bit of a chunk that is stored."""
+    with h5py.File(path) as file:
+        at = file[place].id.get_chunk_info(chunk).byte_offset + 8
+    content = bytearray(path.read_bytes())
+    content[at] ^= 1
+    path.write_bytes(content)
 
 
 # --- parts in other files ---------------------------------------------------------------------------------------------
@@ -57,23 +66,14 @@ def raw(group: h5py.Group, folder: Path, size: int | None = STEPS * 2 * 8) -> No
         path.write_bytes(bytes(size))
 
 
-def linked(place: str, key: str) -> Callable[[h5py.Group, Path], None]:
-    """A link to another file in the place of something."""
-
-    def change(group: h5py.Group, folder: Path) -> None:
-        with demonstrations(folder / "other.hdf5"):
-            pass
-        instead(group.file, key, h5py.ExternalLink("other.hdf5", place))
-
-    return change
+def linked(group: h5py.Group, folder: Path, place: str, key: str) -> None:
+    demonstrations(folder / "other.hdf5").close()
+    instead(group.file, key, h5py.ExternalLink("other.hdf5", place))
 
 
-def link_to(name: str) -> Callable[[h5py.Group, Path], None]:
-    def change(group: h5py.Group, folder: Path) -> None:
-        os.mkfifo(folder / "pipe.hdf5")
-        instead(group, "obs/offsets", h5py.ExternalLink(name, "/x"))
-
-    return change
+def link_to(group: h5py.Group, folder: Path, name: str) -> None:
+    pipe(folder, "pipe.hdf5")
+    instead(group, "obs/offsets", h5py.ExternalLink(name, "/x"))
 
 
 def virtual(
@@ -88,26 +88,11 @@ def virtual(
         file[key] = np.ones((there, 4))
 
 
-def virtual_here(group: h5py.Group, folder: Path) -> None:
-    """Every other row of one dataset of the same file, the rest of another."""
+def virtual_here(group: h5py.Group, folder: Path, *parts: tuple[slice | int, int]) -> None:
+    """An observation whose rows are those of others in the same file: (rows, number of the demonstration)."""
     layout = h5py.VirtualLayout((STEPS, 4), "f8")
-    layout[::2] = h5py.VirtualSource(".", "/data/demo_0/obs/offsets", (STEPS, 4))[::2]
-    layout[1::2] = h5py.VirtualSource(".", "/data/demo_2/obs/offsets", (STEPS, 4))[1::2]
-    del group["obs/offsets"]
-    group.create_virtual_dataset("obs/offsets", layout)
-
-
-def virtual_of_itself(group: h5py.Group, folder: Path) -> None:
-    layout = h5py.VirtualLayout((STEPS, 4), "f8")
-    layout[:] = h5py.VirtualSource(".", "/data/demo_1/obs/offsets", (STEPS, 4))
-    del group["obs/offsets"]
-    group.create_virtual_dataset("obs/offsets", layout)
-
-
-def virtual_in_part(group: h5py.Group, folder: Path) -> None:
-    layout = h5py.VirtualLayout((STEPS, 4), "f8")
-    for step in (0, 0, *range(2, STEPS)):  # as many rows as there are, the first twice
-        layout[step] = h5py.VirtualSource(".", "/data/demo_0/obs/offsets", (STEPS, 4))[step]
+    for rows, number in parts:
+        layout[rows] = h5py.VirtualSource(".", f"/data/demo_{number}/obs/offsets", (STEPS, 4))[rows]
     del group["obs/offsets"]
     group.create_virtual_dataset("obs/offsets", layout)
 
@@ -115,19 +100,17 @@ def virtual_in_part(group: h5py.Group, folder: Path) -> None:
 # --- links ------------------------------------------------------------------------------------------------------------
 
 
-def soft(key: str, target: str) -> Callable[[h5py.Group, Path], None]:
-    return lambda group, folder: instead(group.file, key, h5py.SoftLink(target))
+def soft(group: h5py.Group, folder: Path, key: str, target: str) -> None:
+    instead(group.file, key, h5py.SoftLink(target))
 
 
 def soft_and_external(group: h5py.Group, folder: Path) -> None:
-    """A link to what a link to another file leads to."""
-    linked("/data/demo_0/obs", "data/demo_1/obs")(group, folder)
+    linked(group, folder, "/data/demo_0/obs", "data/demo_1/obs")
     group["obs_again"] = h5py.SoftLink("obs")
-    soft("data/demo_0/obs/offsets", "/data/demo_1/obs_again/offsets")(group, folder)
+    soft(group, folder, "data/demo_0/obs/offsets", "/data/demo_1/obs_again/offsets")
 
 
 def twice(group: h5py.Group, folder: Path) -> None:
-    """One array under two names."""
     instead(group, "obs/offsets", group.file["data/demo_0/obs/offsets"])
 
 
@@ -188,17 +171,13 @@ def chunks(group: h5py.Group, folder: Path) -> None:
 # --- values -----------------------------------------------------------------------------------------------------------
 
 
-def half(value: float) -> Callable[[h5py.Group, Path], None]:
+def half(group: h5py.Group, folder: Path, value: float) -> None:
     """Numbers of 16 bits in all demonstrations; one of ``demo_1`` is this."""
-
-    def change(group: h5py.Group, folder: Path) -> None:
-        for demo in group.file["data"].values():
-            for key in ("obs/offsets", "actions"):
-                instead(demo, key, demo[key][:].astype(np.float16))
-        with np.errstate(over="ignore"):
-            group["obs/offsets"][3, 2] = np.float16(value)
-
-    return change
+    for demo in group.file["data"].values():
+        for key in ("obs/offsets", "actions"):
+            instead(demo, key, demo[key][:].astype(np.float16))
+    with np.errstate(over="ignore"):
+        group["obs/offsets"][3, 2] = np.float16(value)
 
 
 def discrete(group: h5py.Group, folder: Path) -> None:
@@ -209,9 +188,9 @@ def discrete(group: h5py.Group, folder: Path) -> None:
 # --- specs ------------------------------------------------------------------------------------------------------------
 
 
-def pipe(folder: Path) -> Path:
-    os.mkfifo(folder / "spec.yaml")
-    return folder / "spec.yaml"
+def pipe(folder: Path, name: str = "spec.yaml") -> Path:
+    os.mkfifo(folder / name)
+    return folder / name
 
 
 def endless(folder: Path) -> Path:
@@ -220,96 +199,76 @@ def endless(folder: Path) -> Path:
 
 
 def text(content: str) -> Callable[[Path], Path]:
+    """A spec; PIPE in it is the path of a pipe."""
+
     def make(folder: Path) -> Path:
-        (folder / "spec.yaml").write_text(content)
+        (folder / "spec.yaml").write_text(content.replace("PIPE", str(pipe(folder, "pipe"))))
         return folder / "spec.yaml"
 
     return make
-
-
-def demonstrations_in(name: str) -> Callable[[Path], Path]:
-    """A spec whose demonstrations are a pipe or a device."""
-
-    def make(folder: Path) -> Path:
-        os.mkfifo(folder / "pipe")
-        path = name.replace("PIPE", str(folder / "pipe"))
-        return text(f"demonstrations: {{path: {path}}}\nobservations: [x]\nbaseline: {{kind: flat}}\n")(folder)
-
-    return make
-
-
-def data_pipe(folder: Path) -> Path:
-    os.mkfifo(folder / "demos.hdf5")
-    return folder / "demos.hdf5"
 
 
 BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]\n" for n in range(1, 12)
 )
 ELSEWHERE = r"demo_.* lies in another file: \S+/{}; where you trust that, .*import \S+ --allow-external"
+SPEC = "demonstrations: {{path: {}}}\nobservations: [x]\nbaseline: {{kind: flat}}\n"
+RAW, OTHER = ELSEWHERE.format("actions.raw"), ELSEWHERE.format("other.hdf5")
+EVEN_AND_ODD = (slice(0, None, 2), 0), (slice(1, None, 2), 2)
+FIRST_TWICE = tuple((step, 0) for step in (0, 0, *range(2, STEPS)))
+"""As many rows as there are."""
 
 ROWS: dict[str, Row] = {
-    "ordinary": Row(changed(lambda group, folder: None), None),
-    "external storage": Row(changed(raw), ELSEWHERE.format("actions.raw")),
-    "external storage that is missing": Row(
-        changed(lambda group, folder: raw(group, folder, None)), ELSEWHERE.format("actions.raw")
-    ),
-    "external link to an array": Row(
-        changed(linked("/data/demo_0/obs/offsets", "data/demo_1/obs/offsets")), ELSEWHERE.format("other.hdf5")
-    ),
-    "external link to a group": Row(
-        changed(linked("/data/demo_0/obs", "data/demo_1/obs")), ELSEWHERE.format("other.hdf5")
-    ),
-    "external link to a demonstration": Row(
-        changed(linked("/data/demo_0", "data/demo_1")), ELSEWHERE.format("other.hdf5")
-    ),
-    "external link to all": Row(changed(linked("/data", "data")), r"data lies in another file: \S+/other.hdf5"),
-    "soft link to an external link": Row(changed(soft_and_external), ELSEWHERE.format("other.hdf5")),
-    "external link to a pipe": Row(changed(link_to("pipe.hdf5")), ELSEWHERE.format("pipe.hdf5")),
-    "external link to a device": Row(changed(link_to("/dev/zero")), r"demo_1.* lies in another file: /dev/zero"),
-    "virtual, of another file": Row(changed(virtual), ELSEWHERE.format("other.hdf5")),
-    "virtual, of this file": Row(changed(virtual_here), None),
-    "virtual, of itself": Row(changed(virtual_of_itself), r"demo_1: obs/offsets is virtual.* in a circle"),
+    "ordinary": Row(changed(lambda *_: None), None),
+    "external storage": Row(changed(raw), RAW),
+    "external storage that is missing": Row(changed(raw, None), RAW),
+    "external link to an array": Row(changed(linked, "/data/demo_0/obs/offsets", "data/demo_1/obs/offsets"), OTHER),
+    "external link to a group": Row(changed(linked, "/data/demo_0/obs", "data/demo_1/obs"), OTHER),
+    "external link to a demonstration": Row(changed(linked, "/data/demo_0", "data/demo_1"), OTHER),
+    "external link to all": Row(changed(linked, "/data", "data"), r"data lies in another file: \S+/other.hdf5"),
+    "soft link to an external link": Row(changed(soft_and_external), OTHER),
+    "external link to a pipe": Row(changed(link_to, "pipe.hdf5"), ELSEWHERE.format("pipe.hdf5")),
+    "external link to a device": Row(changed(link_to, "/dev/zero"), r"demo_1.* lies in another file: /dev/zero"),
+    "virtual, of another file": Row(changed(virtual), OTHER),
+    "virtual, of this file": Row(changed(virtual_here, *EVEN_AND_ODD), None),
+    "virtual, of itself": Row(changed(virtual_here, (slice(None), 1)), r"demo_1: obs/offsets is virtual.* in a circle"),
     "virtual, with a row of no source": Row(
-        changed(virtual_in_part), r"demo_1: obs/offsets is virtual, and a part of it has no source"
+        changed(virtual_here, *FIRST_TWICE), r"demo_1: obs/offsets is virtual, and a part of it has no source"
     ),
-    "virtual, of nothing in this file": Row(
-        changed(lambda group, folder: virtual(group, folder, ".")), r"demo_1: obs/offsets is virtual: x is missing"
-    ),
+    "virtual, of nothing in this file": Row(changed(virtual, "."), r"demo_1: obs/offsets is virtual: x is missing"),
     "dangling array": Row(
-        changed(soft("data/demo_1/obs/offsets", "/nowhere")),
+        changed(soft, "data/demo_1/obs/offsets", "/nowhere"),
         r"demo_1: obs/offsets is a link to /nowhere, which leads nowhere",
     ),
     "dangling demonstration": Row(
-        changed(soft("data/demo_1", "demo_9")), r"demo_1 is a link to demo_9, which leads nowhere"
+        changed(soft, "data/demo_1", "demo_9"), r"demo_1 is a link to demo_9, which leads nowhere"
     ),
     "soft link to itself": Row(
-        changed(soft("data/demo_1/obs/offsets", "/data/demo_1/obs/offsets")), r"demo_1: obs/offsets is a link to"
+        changed(soft, "data/demo_1/obs/offsets", "/data/demo_1/obs/offsets"), r"demo_1: obs/offsets is a link to"
     ),
-    "soft link": Row(changed(soft("data/demo_1/obs/offsets", "/data/demo_0/obs/offsets")), None),
+    "soft link": Row(changed(soft, "data/demo_1/obs/offsets", "/data/demo_0/obs/offsets"), None),
     "hard link": Row(changed(twice), None),
     "a group in itself": Row(changed(circle), r"demo_1: obs/again/.*: its groups go in a circle"),
     "thirty groups of two links": Row(changed(diamonds), r"demo_1: obs/.*: its groups go in a circle"),
     "3000 groups": Row(changed(nested), r"demo_1: obs/in/in/.* nested more than 32 deep"),
     "1e12 rows": Row(changed(rows_claimed), r"demo_1: actions claims 16000000000000 bytes, but the file holds \d+"),
     "a million rows": Row(
-        changed(lambda group, folder: rows_claimed(group, folder, 10**6)),
-        r"demo_1: actions claims 100 chunks, but the file holds 1; write it again",
+        changed(rows_claimed, 10**6), r"demo_1: actions claims 100 chunks, but the file holds 1; write it again"
     ),
     "a chunk missing": Row(changed(chunk_missing), r"demo_1: obs/offsets claims 4 chunks, but the file holds 2"),
     "chunks": Row(changed(chunks), None),
-    "16 bits": Row(changed(half(1.0)), None),
+    "16 bits": Row(changed(half, 1.0), None),
     "16 bits, infinite": Row(
-        changed(half(1e30)), r"demo_1: obs/offsets is inf at step 3, index \[2\]|the first in demo_1 at step 3"
+        changed(half, 1e30), r"demo_1: obs/offsets is inf at step 3, index \[2\]|the first in demo_1 at step 3"
     ),
     "discrete actions": Row(changed(discrete), None),
-    "a pipe": Row(data_pipe, r"is neither a regular file nor a folder"),
+    "a pipe": Row(partial(pipe, name="demos.hdf5"), r"is neither a regular file nor a folder"),
     "spec: a pipe": Row(pipe, r"is no file of at most 256 kB"),
     "spec: a device": Row(endless, r"is no file of at most 256 kB"),
     "spec: large": Row(text("a: [" + "1, " * 500_000 + "]"), r"is no file of at most 256 kB"),
     "spec: many values": Row(text("a: [" + "1, " * 12_000 + "]"), r"holds more than 10000 values"),
     "spec: aliases of aliases": Row(text(BOMB), r"holds more than 10000 values where its aliases are written out"),
     "spec: nested": Row(text("[" * 2_000), r"nested too deeply"),
-    "spec: of a pipe": Row(demonstrations_in("PIPE"), r"is no regular file"),
-    "spec: of a device": Row(demonstrations_in("/dev/zero"), r"is no regular file"),
+    "spec: of a pipe": Row(text(SPEC.format("PIPE")), r"is no regular file"),
+    "spec: of a device": Row(text(SPEC.format("/dev/zero")), r"is no regular file"),
 }

@@ -16,6 +16,8 @@ NUMBER = 5
 """Demonstrations of a file."""
 
 Arrays = dict[str, Any]
+Change = Callable[[Arrays, int], None]
+Masks = dict[str, list[bytes]]
 
 
 def arrays(number: int) -> Arrays:
@@ -26,17 +28,13 @@ def arrays(number: int) -> Arrays:
     return {"actions": -pose[:, :2] + 0.1 * noise.normal(size=(steps, 2)), "obs/pose": pose}
 
 
-def write(
-    path: Path,
-    change: Callable[[Arrays, int], None] = lambda made, number: None,
-    masks: dict[str, list[bytes]] | None = None,
-    number: int = NUMBER,
-) -> Path:
+def write(path: Path, change: Change | None = None, masks: Masks | None = None, number: int = NUMBER) -> Path:
     """A file of demonstrations ``demo_0``, ``demo_1``, ..., each of them changed."""
     with h5py.File(path, "w") as file:
         for index in range(number):
             made = arrays(index)
-            change(made, index)
+            if change is not None:
+                change(made, index)
             for place, values in made.items():
                 file[f"data/demo_{index}/{place}"] = values
         for mask, names in (masks or {}).items():
@@ -44,13 +42,11 @@ def write(
     return path
 
 
-def _row(
-    change: Callable[[Arrays, int], None] = lambda made, number: None, says: str | None = None, **more: Any
-) -> Row:
+def _row(change: Change | None = None, says: str | None = None, **more: Any) -> Row:
     return Row(lambda folder: write(folder / "demos.hdf5", change, **more), says)
 
 
-def put(place: str, values: Callable[[int, int], Any]) -> Callable[[Arrays, int], None]:
+def put(place: str, values: Callable[[int, int], Any]) -> Change:
     """A change: at ``place`` are these values of (steps, number of the demonstration)."""
 
     def change(made: Arrays, number: int) -> None:
@@ -59,7 +55,7 @@ def put(place: str, values: Callable[[int, int], Any]) -> Callable[[Arrays, int]
     return change
 
 
-def alone(place: str, values: Callable[[int, int], Any]) -> Callable[[Arrays, int], None]:
+def alone(place: str, values: Callable[[int, int], Any]) -> Change:
     """The same, and no other observation."""
 
     def change(made: Arrays, number: int) -> None:
@@ -70,29 +66,25 @@ def alone(place: str, values: Callable[[int, int], Any]) -> Callable[[Arrays, in
 
 
 def padded(made: Arrays, number: int) -> None:
-    """Repeat the last step four times."""
     for place, values in made.items():
         made[place] = np.concatenate([values, np.repeat(values[-1:], 4, axis=0)])
 
 
 def twins(made: Arrays, number: int) -> None:
-    """The last demonstration is the first again."""
     if number == NUMBER - 1:
         made.update(arrays(0))
 
 
 def leaked(made: Arrays, number: int) -> None:
-    """An observation is the control."""
     made["obs/command"] = made["actions"].astype(np.float32)
 
 
 def only_leaked(made: Arrays, number: int) -> None:
-    """Nothing is observed but the control."""
     leaked(made, number)
     del made["obs/pose"]
 
 
-def with_switch(values: Callable[[int, int], Any]) -> Callable[[Arrays, int], None]:
+def with_switch(values: Callable[[int, int], Any]) -> Change:
     """A third control dimension with these values of (steps, number of the demonstration)."""
 
     def change(made: Arrays, number: int) -> None:
@@ -124,7 +116,8 @@ def one_step(made: Arrays, number: int) -> None:
 def _integers(steps: int, number: int, least: int, most: int, columns: int | None = 1) -> np.ndarray:
     size = steps if columns is None else (steps, columns)
     drawn = np.random.default_rng(number).integers(least, most + 1, size)
-    drawn[: most + 1 - least] = np.arange(least, most + 1)[:steps] if columns is None else drawn[: most + 1 - least]
+    if columns is None:
+        drawn[: most + 1 - least] = np.arange(least, most + 1)[:steps]
     return drawn
 
 
@@ -133,7 +126,8 @@ def _bytes(*shape: int, dtype: str = "u1") -> Callable[[int, int], np.ndarray]:
     return lambda steps, number: np.random.default_rng(number).integers(0, high, (steps, *shape)).astype(dtype)
 
 
-MASK_ROWS: dict[str, Row] = {
+ROWS: dict[str, Row] = {
+    # --- which demonstrations there are to train with and to validate with
     "masks overlap": _row(
         says="demo_1 is in mask/train and in mask/valid",
         masks={"train": [b"demo_0", b"demo_1", b"demo_2"], "valid": [b"demo_1", b"demo_3"]},
@@ -156,10 +150,7 @@ MASK_ROWS: dict[str, Row] = {
     ),
     "one demonstration": _row(says="holds 1 demonstration", number=1),
     "two demonstrations": _row(says="holds 2 demonstrations", number=2),
-}
-"""Which demonstrations there are to train with and to validate with."""
-
-LABEL_ROWS: dict[str, Row] = {
+    # --- labels
     "labels of a column": _row(put("labels/phase", lambda steps, number: _half(steps)[:, None].astype(int))),
     "labels of text": _row(put("labels/phase", lambda steps, number: [b"reach"] * steps)),
     "labels of floats": _row(put("labels/phase", lambda steps, number: np.ones(steps))),
@@ -169,9 +160,7 @@ LABEL_ROWS: dict[str, Row] = {
             put("labels/phase", lambda steps, n: _half(steps).astype(int))(made, number) if number else None
         )
     ),
-}
-
-PICTURE_ROWS: dict[str, Row] = {
+    # --- pictures
     "channels first": _row(put("obs/camera", _bytes(3, 12, 10))),
     "channels first alone": _row(alone("obs/camera", _bytes(3, 12, 10))),
     "grey": _row(put("obs/camera", _bytes(12, 10))),
@@ -179,9 +168,7 @@ PICTURE_ROWS: dict[str, Row] = {
     "16-bit depth": _row(put("obs/depth", _bytes(12, 10, dtype="u2"))),
     "16-bit depth alone": _row(alone("obs/depth", _bytes(12, 10, dtype="u2")), says="no observation can be used"),
     "16-bit depth with a channel": _row(put("obs/depth", _bytes(12, 10, 1, dtype="u2"))),
-}
-
-CONTROL_ROWS: dict[str, Row] = {
+    # --- controls
     "integers -1, 0, 1": _row(put("actions", lambda steps, number: _integers(steps, number, -1, 1))),
     "integers [T]": _row(put("actions", lambda steps, number: _integers(steps, number, 0, 3, None))),
     "integers of two columns": _row(put("actions", lambda steps, number: _integers(steps, number, -1, 2, 2))),
@@ -198,16 +185,13 @@ CONTROL_ROWS: dict[str, Row] = {
         with_switch(lambda steps, number: np.where(_half(steps), -1 if number < 3 else 0, 1))
     ),
     "controls of another size in one": _row(
-        _another_size,
-        says=r"actions (is in 4 of 5 demonstrations|has shape \(1,\))",
+        _another_size, says=r"actions (is in 4 of 5 demonstrations|has shape \(1,\))"
     ),
     "a number that single precision does not hold": _row(_huge),
     "no control that moves": _row(
         put("actions", lambda steps, number: np.ones((steps, 2))), says="every dimension is constant"
     ),
-}
-
-SAME_ROWS: dict[str, Row] = {
+    # --- what is there twice
     "equal tails": _row(padded),
     "a demonstration twice": _row(twins),
     "an observation that is the control": _row(leaked),
@@ -215,7 +199,7 @@ SAME_ROWS: dict[str, Row] = {
     "demonstrations of one step": _row(one_step),
 }
 
-CHANGES: tuple[Callable[[Arrays, int], None], ...] = (
+CHANGES: tuple[Change, ...] = (
     put("labels/phase", lambda steps, number: _half(steps)[:, None].astype(int)),
     put("labels/step", lambda steps, number: [b"reach"] * steps),
     put("labels/half", lambda steps, number: _half(steps).astype(int)),
@@ -237,7 +221,7 @@ CHANGES: tuple[Callable[[Arrays, int], None], ...] = (
 )
 """What may be odd in a file, all at once."""
 
-MASKS: tuple[dict[str, list[bytes]], ...] = (
+MASKS: tuple[Masks, ...] = (
     {},
     {"valid": [b"demo_0"]},
     {"train": [b"demo_1", b"demo_2"], "better": [b"demo_0"]},
@@ -259,6 +243,3 @@ def drawn(path: Path, seed: int) -> Path:
 
     masks = choose.choice(MASKS) if choose.random() < 0.5 else {}
     return write(path, change, masks, choose.choice([2, 3, NUMBER, NUMBER]))
-
-
-ROWS: dict[str, Row] = {**MASK_ROWS, **LABEL_ROWS, **PICTURE_ROWS, **CONTROL_ROWS, **SAME_ROWS}

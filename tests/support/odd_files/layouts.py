@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -34,27 +34,23 @@ def pictures(number: int) -> np.ndarray:
     return np.broadcast_to(colours[:, None, None], (LENGTHS[number], 16, 24, 3)).astype(np.uint8)
 
 
-def maniskill(obs: str) -> Callable[[Path], Path]:
+def maniskill(folder: Path, obs: str) -> Path:
     """A file as ManiSkill's ``RecordEpisode`` writes it, with observations as one array, as a tree, or without."""
-
-    def make(folder: Path) -> Path:
-        path = folder / "trajectory.h5"
-        with h5py.File(path, "w") as file:
-            for number, steps in enumerate(LENGTHS):
-                group = file.create_group(f"traj_{number}", track_order=True)
-                group["actions"] = control(number)
-                for name in ("terminated", "truncated", "success"):
-                    group[name] = np.arange(steps) == steps - 1
-                group["env_states/actors/cube"] = state(number, 1)
-                if obs == "array":
-                    group["obs"] = state(number, 1)
-                if obs == "tree":
-                    group["obs/agent/qpos"] = state(number, 1)
-                    group["obs/extra/is_grasped"] = np.arange(steps + 1) > 1
-        path.with_suffix(".json").write_text(json.dumps({"env_info": {"env_id": "PickCube-v1"}, "episodes": []}))
-        return path
-
-    return make
+    path = folder / "trajectory.h5"
+    with h5py.File(path, "w") as file:
+        for number, steps in enumerate(LENGTHS):
+            group = file.create_group(f"traj_{number}", track_order=True)
+            group["actions"] = control(number)
+            for name in ("terminated", "truncated", "success"):
+                group[name] = np.arange(steps) == steps - 1
+            group["env_states/actors/cube"] = state(number, 1)
+            if obs == "array":
+                group["obs"] = state(number, 1)
+            if obs == "tree":
+                group["obs/agent/qpos"] = state(number, 1)
+                group["obs/extra/is_grasped"] = np.arange(steps + 1) > 1
+    path.with_suffix(".json").write_text(json.dumps({"env_info": {"env_id": "PickCube-v1"}, "episodes": []}))
+    return path
 
 
 def act_file(path: Path, number: int, encoded: bool = False, base: bool = False) -> None:
@@ -74,71 +70,56 @@ def act_file(path: Path, number: int, encoded: bool = False, base: bool = False)
         file["observations/images/top"] = seen
 
 
-def act(encoded: bool = False, base: bool = False) -> Callable[[Path], Path]:
-    """A folder of such episodes."""
-
-    def make(folder: Path) -> Path:
-        dataset = folder / "episodes"
-        dataset.mkdir()
-        for number in range(len(LENGTHS)):
-            act_file(dataset / f"episode_{number}.hdf5", number, encoded, base)
-        return dataset
-
-    return make
+def act(folder: Path, encoded: bool = False, base: bool = False) -> Path:
+    dataset = folder / "episodes"
+    dataset.mkdir()
+    for number in range(len(LENGTHS)):
+        act_file(dataset / f"episode_{number}.hdf5", number, encoded, base)
+    return dataset
 
 
 def act_linked(folder: Path) -> Path:
-    """A folder with an episode that lies elsewhere."""
-    dataset = act()(folder)
+    dataset = act(folder)
     (dataset / "episode_1.hdf5").rename(folder / "elsewhere.hdf5")
     (dataset / "episode_1.hdf5").symlink_to(folder / "elsewhere.hdf5")
     return dataset
 
 
 def act_twice(folder: Path) -> Path:
-    """A folder with two files of the same number."""
-    dataset = act()(folder)
+    dataset = act(folder)
     act_file(dataset / "episode_01.hdf5", 1)
     return dataset
 
 
-def d4rl(*without: str) -> Callable[[Path], Path]:
+def d4rl(folder: Path, *without: str) -> Path:
     """A flat file: the first demonstration reaches its goal, the second runs out of time, the last is cut."""
-
-    def make(folder: Path) -> Path:
-        path = folder / "kitchen.hdf5"
-        ends = np.cumsum(LENGTHS) - 1
-        steps = np.arange(sum(LENGTHS))
-        arrays = {
-            "observations": np.concatenate([state(number) for number in range(len(LENGTHS))]),
-            "actions": np.concatenate([control(number) for number in range(len(LENGTHS))]),
-            "rewards": np.zeros(len(steps), np.float32),
-            "terminals": steps == ends[0],
-            "timeouts": steps == ends[1],
-        }
-        with h5py.File(path, "w") as file:
-            for name in arrays.keys() - set(without):
-                file[name] = arrays[name]
-        return path
-
-    return make
+    path = folder / "kitchen.hdf5"
+    ends = np.cumsum(LENGTHS) - 1
+    steps = np.arange(sum(LENGTHS))
+    arrays = {
+        "observations": np.concatenate([state(number) for number in range(len(LENGTHS))]),
+        "actions": np.concatenate([control(number) for number in range(len(LENGTHS))]),
+        "rewards": np.zeros(len(steps), np.float32),
+        "terminals": steps == ends[0],
+        "timeouts": steps == ends[1],
+    }
+    with h5py.File(path, "w") as file:
+        for name in arrays.keys() - set(without):
+            file[name] = arrays[name]
+    return path
 
 
-def robosuite(prepared: bool) -> Callable[[Path], Path]:
+def robosuite(folder: Path, attribute: str) -> Path:
     """What robosuite records, and what robomimic's ``convert_robosuite`` makes of it: states and controls alone."""
-
-    def make(folder: Path) -> Path:
-        path = folder / "demo.hdf5"
-        with h5py.File(path, "w") as file:
-            data = file.create_group("data")
-            data.attrs["env_args" if prepared else "env_info"] = "{}"
-            for number in range(len(LENGTHS)):
-                demo = data.create_group(f"demo_{number + 1}")
-                demo.attrs["model_file"] = "<mujoco/>"
-                demo["states"], demo["actions"] = state(number), control(number)
-        return path
-
-    return make
+    path = folder / "demo.hdf5"
+    with h5py.File(path, "w") as file:
+        data = file.create_group("data")
+        data.attrs[attribute] = "{}"
+        for number in range(len(LENGTHS)):
+            demo = data.create_group(f"demo_{number + 1}")
+            demo.attrs["model_file"] = "<mujoco/>"
+            demo["states"], demo["actions"] = state(number), control(number)
+    return path
 
 
 def zarr(folder: Path) -> Path:
@@ -162,7 +143,6 @@ def tfds(folder: Path) -> Path:
 
 
 def lerobot_v2(folder: Path) -> Path:
-    """A LeRobot dataset with a file for each episode."""
     dataset = folder / "pusht"
     (dataset / "meta").mkdir(parents=True)
     path = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
@@ -171,40 +151,44 @@ def lerobot_v2(folder: Path) -> Path:
     return dataset
 
 
-def strange(name: str) -> Callable[[Path], Path]:
+def strange(folder: Path) -> Path:
     """A folder of nothing known, whose name would do something to a terminal."""
-
-    def make(folder: Path) -> Path:
-        (folder / name).mkdir()
-        return folder / name
-
-    return make
+    path = folder / "\x1b[2J\nx"
+    path.mkdir()
+    return path
 
 
 IMPORT = "ddco-pyro import"
 """What ``inspect`` and ``init`` say of a file that can be imported."""
 
 ROWS = {
-    "maniskill array": Row(maniskill("array"), IMPORT),
-    "maniskill tree": Row(maniskill("tree"), IMPORT),
+    "maniskill array": Row(partial(maniskill, obs="array"), IMPORT),
+    "maniskill tree": Row(partial(maniskill, obs="tree"), IMPORT),
     "maniskill without observations": Row(
-        maniskill("none"),
+        partial(maniskill, obs="none"),
         r"python -m mani_skill\.trajectory\.replay_trajectory --traj-path .* --save-traj -o state",
     ),
-    "act": Row(act(), None),
-    "act encoded": Row(act(encoded=True), None),
+    "act": Row(act, None),
+    "act encoded": Row(partial(act, encoded=True), None),
     "act link": Row(act_linked, "episode_1.hdf5 leads out of the dataset"),
     "act twice": Row(
         act_twice, r"episode_1\.hdf5: has the number of episode_01\.hdf5|episode_01\.hdf5: has the number"
     ),
-    "d4rl": Row(d4rl(), IMPORT),
-    "d4rl without timeouts": Row(d4rl("timeouts"), "has no timeouts, which mark the ends of demonstrations"),
-    "robosuite": Row(
-        robosuite(False), r"conversion\.convert_robosuite --dataset .* && .*dataset_states_to_obs --dataset"
+    "d4rl": Row(d4rl, IMPORT),
+    "d4rl without timeouts": Row(
+        lambda folder: d4rl(folder, "timeouts"), "has no timeouts, which mark the ends of demonstrations"
     ),
-    "robosuite prepared": Row(robosuite(True), r"makes them: python -m robomimic\.scripts\.dataset_states_to_obs"),
+    "robosuite": Row(
+        partial(robosuite, attribute="env_info"),
+        r"conversion\.convert_robosuite --dataset .* && .*dataset_states_to_obs --dataset",
+    ),
+    "robosuite prepared": Row(
+        partial(robosuite, attribute="env_args"), r"makes them: python -m robomimic\.scripts\.dataset_states_to_obs"
+    ),
     "zarr": Row(zarr, r"is a zarr store, as diffusion policy writes them; .*docs/own\.md"),
     "tfds": Row(tfds, r"is a TensorFlow dataset \(RLDS\); .*docs/own\.md"),
-    "lerobot v2": Row(lerobot_v2, r"python -m lerobot\.scripts\.convert_dataset_v21_to_v30"),
-    "strange name": Row(strange("\x1b[2J\nx"), "is a folder of no known format"),
+    "lerobot v2": Row(
+        lerobot_v2, r"v2\.1, and v3\.x can be read; .*: python -m lerobot\.scripts\.convert_dataset_v21_to_v30"
+    ),
+    "strange name": Row(strange, "is a folder of no known format"),
 }

@@ -35,7 +35,6 @@ def changed(*changes: Change) -> Callable[[Path], Path]:
 
 
 def info(**values: object) -> Change:
-    """Sets values of ``meta/info.json``."""
 
     def change(dataset: Path) -> None:
         path = dataset / "meta" / "info.json"
@@ -55,7 +54,6 @@ def feature(name: str, **values: object) -> Change:
 
 
 def rewritten(place: Path, change: Callable[[pyarrow.Table], pyarrow.Table]) -> Change:
-    """Changes a table."""
     return lambda dataset: parquet.write_table(change(parquet.read_table(dataset / place)), dataset / place)
 
 
@@ -77,7 +75,6 @@ def without_rows(*rows: int) -> Change:
 
 
 def reversed_rows(start: int, stop: int) -> Change:
-    """Turns these rows of the data file around."""
 
     def change(table: pyarrow.Table) -> pyarrow.Table:
         return table.take([*range(start), *reversed(range(start, stop)), *range(stop, len(table))])
@@ -97,7 +94,6 @@ def renumbered(table: pyarrow.Table) -> pyarrow.Table:
 
 
 def moved_out(place: Path) -> Change:
-    """Moves a file or folder of the dataset out of it, and leaves a link."""
 
     def change(dataset: Path) -> None:
         outside = dataset.parent / "outside" / place.name
@@ -110,20 +106,17 @@ def moved_out(place: Path) -> Change:
 
 def climbing(dataset: Path) -> None:
     """Another dataset's data outside, and a path through a folder of this one that leads there."""
-    outside = dataset.parent / "outside.parquet"
-    shutil.copy(dataset / DATA, outside)
+    shutil.copy(dataset / DATA, dataset.parent / "outside.parquet")
     (dataset / "data" / "l").mkdir()
     info(data_path="data/l/../../../outside.parquet")(dataset)
 
 
 def absolute(dataset: Path) -> None:
-    outside = dataset.parent / "outside.parquet"
-    shutil.copy(dataset / DATA, outside)
+    outside = shutil.copy(dataset / DATA, dataset.parent / "outside.parquet")
     info(data_path=str(outside))(dataset)
 
 
 def twice(table: pyarrow.Table) -> pyarrow.Table:
-    """Episode 2 named once more."""
     return pyarrow.concat_tables([table, table.slice(2, 1)])
 
 
@@ -189,20 +182,17 @@ PATHS = {
 }
 """Paths and links that are refused before anything is read."""
 
+DROPPED = without_rows(7), episode(1, "length", 5), episode(1, "dataset_to_index", 10), info(total_frames=25)
+"""A frame of episode 1 is gone, and everything that counts says so."""
+
 EPISODES_NOT_WHOLE = {
     "lerobot dropped frame": (changed(without_rows(7)), "demo_1: length in meta/episodes is 6, and .* has 5 rows"),
     "lerobot dropped frame, length corrected": (
-        changed(without_rows(7), episode(1, "length", 5), episode(1, "dataset_to_index", 10), info(total_frames=25)),
+        changed(*DROPPED),
         "demo_1: frame_index is 3 in row 2, not 2: frames are missing or out of order",
     ),
     "lerobot dropped frame, counted anew": (
-        changed(
-            without_rows(7),
-            rewritten(DATA, renumbered),
-            episode(1, "length", 5),
-            episode(1, "dataset_to_index", 10),
-            info(total_frames=25),
-        ),
+        changed(*DROPPED, rewritten(DATA, renumbered)),
         r"demo_1: timestamp is 0\.3 in row 2, not 0\.2: frames are missing",
     ),
     "lerobot reversed": (changed(reversed_rows(5, 11)), "demo_1: frame_index is 5 in row 0, not 0"),
