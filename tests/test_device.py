@@ -14,7 +14,8 @@ import torch
 import yaml
 from command_line import call
 from elsewhere import THERE, Device, Elsewhere
-from planted import numbered, small_spec
+from planted import small_spec
+from random_demonstrations import numbered
 
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstrations

@@ -8,7 +8,8 @@ from collections import Counter
 import numpy as np
 import pytest
 import torch
-from planted import LINEAR, make_trainer, numbered, small_spec
+from planted import LINEAR, make_trainer, small_spec
+from random_demonstrations import numbered
 from sklearn.metrics import adjusted_rand_score
 
 from ddco_pyro.model.batch import Batch

@@ -21,8 +21,7 @@ import selecting
 import toy_task
 import yaml
 from killing import COMMAND, Kept, answered, started, until_done, whole
-from planted import numbered
-from random_demonstrations import demonstrations
+from random_demonstrations import demonstrations, numbered
 
 from ddco_pyro.data.importing import import_demonstrations
 from ddco_pyro.data.tensors import read_tensors

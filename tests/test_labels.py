@@ -12,7 +12,8 @@ import pytest
 import torch
 from command_line import call
 from oracle import paths
-from planted import CONTROL, make_spec, make_trainer, make_truth, numbered, plant, small_spec, tabulated
+from planted import CONTROL, make_spec, make_trainer, make_truth, plant, small_spec, tabulated
+from random_demonstrations import numbered
 from sklearn.metrics import normalized_mutual_info_score
 
 import ddco_pyro

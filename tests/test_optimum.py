@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from planted import numbered, small_spec
+from planted import small_spec
+from random_demonstrations import numbered
 from scipy import stats
 
 from ddco_pyro.fitting.fit import fit

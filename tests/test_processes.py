@@ -31,7 +31,7 @@ from ddco_pyro.model.batch import STEPS_AT_ONCE
 from ddco_pyro.spec import dump_spec
 from ddco_pyro.training import restarts as restarting
 from ddco_pyro.training.checkpoint import Progress, Restart
-from ddco_pyro.training.jobs import beside, early_process
+from ddco_pyro.training.jobs import beside, early_process, end_pool, pool, results
 from ddco_pyro.training.launching import check_processes, launched, requested, together
 from ddco_pyro.training.loop import StageTraining
 from ddco_pyro.training.networks import Dimensions
@@ -376,6 +376,16 @@ def test_a_process_ends_at_sigterm_whatever_this_one_does() -> None:
             assert list(results) == [signal.SIG_DFL]
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+def test_a_pool_that_has_nothing_to_do_is_ended() -> None:
+    with pool(2) as parallel:
+        (process,) = results(parallel, [os.getpid], "dead")
+    assert process != os.getpid()
+    assert alive(process)
+    end_pool()
+    assert not alive(process)
+    end_pool()  # there is none any more
 
 
 KILLED = """

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import call
-from planted import numbered
+from random_demonstrations import numbered
 
 from ddco_pyro.data.checks import rounding
 from ddco_pyro.data.demonstrations import Demonstrations

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 import yaml
 from command_line import call, with_set
-from planted import LINEAR, numbered, small_spec
+from planted import LINEAR, small_spec
+from random_demonstrations import numbered
 from scipy import stats
 
 import ddco_pyro

@@ -12,8 +12,7 @@ import pytest
 from command_line import call
 from gripper import planted
 from odd_files.kinds import ROWS, drawn
-from planted import numbered
-from random_demonstrations import demonstration, demonstrations
+from random_demonstrations import demonstration, demonstrations, numbered
 from scipy import stats
 
 import ddco_pyro

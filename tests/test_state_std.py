@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 from hierarchies import make_batch, make_hierarchy, varied
-from planted import LINEAR, numbered, small_spec
+from planted import LINEAR, small_spec
+from random_demonstrations import numbered
 from scipy import stats
 
 import ddco_pyro

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from planted import CONTROL, TRAINING, make_spec, make_trainer, make_truth, numbered, per_step, plant, recovered
-from random_demonstrations import of_states
+from planted import CONTROL, TRAINING, make_spec, make_trainer, make_truth, per_step, plant, recovered
+from random_demonstrations import numbered, of_states
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.inference import log_likelihood

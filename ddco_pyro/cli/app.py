@@ -75,6 +75,8 @@ def main() -> None:
     """Run the command line; ends the process with 0, 1 or 2."""
     with _interruptible():
         status = _run()
+    if jobs := sys.modules.get("ddco_pyro.training.jobs"):
+        jobs.end_pool()
     sys.exit(status)
 
 

@@ -38,6 +38,7 @@ def write_report(fit: Fit, demos: Demonstrations) -> Path:
         follows = followed(ordered, shown, segmented, fit, options.MOST_STEPS)
         drawn = timelines(segmented, follows, options.MOST_STEPS)
     with style():
+        learning = training.learning(fit)  # or a history is damaged, and no figure is written
         sections = [
             skills.section(fit, ordered, shown, segmented) if segmented else None,
             options.segments(drawn, len(metrics.demonstrations_by_likelihood)) if segmented else None,
@@ -46,7 +47,7 @@ def write_report(fit: Fit, demos: Demonstrations) -> Path:
             likelihood.demonstrations(metrics, {track.anchor for track in drawn.tracks} if segmented else ()),
             likelihood.dimensions(fit),
             rollouts.success(fit),
-            training.learning(fit),
+            learning,
             options.section(fit, demos, active) if active else None,
             agreement.section(fit),
             inputs.saliency(fit, demos),

@@ -6,6 +6,7 @@ import gc
 import importlib
 import os
 import sys
+import threading
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import as_completed
@@ -16,7 +17,7 @@ from typing import TypeVar
 
 import joblib
 from joblib import Parallel, delayed
-from joblib.externals.loky import ProcessPoolExecutor
+from joblib.externals.loky import ProcessPoolExecutor, get_reusable_executor
 
 from ddco_pyro.data.pictures import end_with_parent
 from ddco_pyro.errors import BadInput, Failed
@@ -27,6 +28,9 @@ ALL_CORES = -1
 """The number of ``jobs`` that stands for one for each core."""
 LONG = 1000
 """Gradient steps, at least, of a training that takes longer than starting a process."""
+
+
+_POOLED = threading.Event()  # :func:`pool` has been called
 
 
 class BackendError(BadInput):
@@ -49,8 +53,17 @@ def useful_jobs(jobs: int, calls: int) -> int:
 
 def pool(jobs: int) -> Parallel:
     """Processes for :func:`results`, to be used in a ``with`` statement."""
+    if jobs > 1:
+        _POOLED.set()
     # one call at a time: each takes long, and each result is kept at once; no read-only maps of arrays
     return Parallel(n_jobs=jobs, return_as="generator_unordered", batch_size=1, max_nbytes=None)
+
+
+def end_pool() -> None:
+    """End the processes of :func:`pool`, which wait for more calls: two seconds sooner than at the end of this one."""
+    if _POOLED.is_set():
+        get_reusable_executor(reuse=True).shutdown(kill_workers=True)
+        _POOLED.clear()
 
 
 @contextmanager

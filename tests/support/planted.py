@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import torch
+from random_demonstrations import numbered
 from sklearn.metrics import normalized_mutual_info_score
 
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.events import ignore
 from ddco_pyro.inference import log_likelihood, segment
 from ddco_pyro.model.ahmm import Acting, choose
@@ -19,11 +19,6 @@ from ddco_pyro.training.restarts import Trainer
 LINEAR = {"network": "linear"}
 CONTROL = {"std": 0.05, "scale": "none"}
 TRAINING = {"epochs": 900, "restarts": 3, "patience": 25, "initialize": "vq_controls"}
-
-
-def numbered(each):
-    """Demonstrations ``demo_0``, ``demo_1``, ... of (observations, actions) or (observations, actions, labels)."""
-    return Demonstrations(tuple(Demonstration(f"demo_{n}", *one) for n, one in enumerate(each)))
 
 
 def small_spec(counts=(2,), policy=LINEAR, **sections):
