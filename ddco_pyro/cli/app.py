@@ -6,6 +6,7 @@ The exit status is 0 (done), 1 (failed) or 2 (bad input). An error is one line: 
 
 from __future__ import annotations
 
+import gc
 import io
 import os
 import signal
@@ -77,6 +78,7 @@ def main() -> None:
         status = _run()
     if jobs := sys.modules.get("ddco_pyro.training.jobs"):
         jobs.end_pool()
+    gc.freeze()  # what is left goes with the process
     sys.exit(status)
 
 
