@@ -115,9 +115,12 @@ def stored_pictures(source: Source, lengths: Mapping[str, int]) -> list[Observed
 
 
 def _every(found: Iterable[Observed | None]) -> list[Observed]:
-    listed = list(found)
-    there = [array for array in listed if array is not None]
-    return there if len(there) == len(listed) else []
+    there = []
+    for array in found:
+        if array is None:
+            return []
+        there.append(array)
+    return there
 
 
 def frames(observed: Observed, steps: Sequence[int] | np.ndarray, height: int) -> np.ndarray:
