@@ -22,6 +22,7 @@ from ddco_pyro.model.elementary import (
     LANES,
     Array,
     Plane,
+    apart,
     at,
     exponential,
     jit,
@@ -191,6 +192,7 @@ def _cumulative(rows: Plane, t: int, first: int, number: int, best: int) -> Any:
 
     A number uniform in [0, 1) draws the first entry above it. Zero draws the first of the largest, for ``best``.
     """
+    apart()
     total = lanes(-np.inf)
     for i in range(first, first + number):
         total, _ = _merged(total, at(rows, t, i), best)
@@ -207,6 +209,7 @@ def _up(t: int, i: int, own: Trace) -> None:
 
     :param i: the row of the block.
     """
+    apart()
     of, messages, ways = own.of, own.messages, own.ways
     for d in range(of.depth):
         c, below = whole(of.sizes, d), whole(of.starts, d)
@@ -222,6 +225,7 @@ def _up(t: int, i: int, own: Trace) -> None:
 @jit
 def _down(t: int, i: int, own: Trace) -> None:
     """Fill row t of ``keeps``, and ``spread``."""
+    apart()
     of, messages, spread, keeps, rows = own.of, own.messages, own.spread, own.keeps, own.rows
     put(spread, 0, whole(of.starts, of.depth), at(messages, 0, whole(of.starts, of.depth)))
     for d in range(of.depth - 1, -1, -1):
@@ -262,6 +266,7 @@ def _act(lot: Lot, t: int, i: int, own: Trace) -> None:
 @jit
 def _forward(lot: Lot, own: Trace) -> None:
     """Go forward through a block."""
+    apart()
     columns = np.intp(1)
     take(own.tables.selection, lot, own.rows.selection.columns, columns, own.rows.selection)
     take(own.tables.termination, lot, own.rows.termination.columns, columns, own.rows.termination)
