@@ -214,7 +214,7 @@ def inference() -> Iterator[Row]:
 def growth() -> Iterator[Row]:
     """Our pass and a gradient step as the problem grows; the most likely path beside a gradient step."""
     base, short = kernel(*tables_of(50, 2000)), kernel(*tables_of(50, 200))
-    yield side_by_side(("4000 steps", "2000 steps"), kernel(*tables_of(50, 4000)), base)
+    yield side_by_side(("4000 steps", "2000 steps"), kernel(*tables_of(50, 4000)), base, 63)
     yield side_by_side(("20 options", "5 options"), kernel(*tables_of(50, 2000, (20,))), base)
     for levels, choices in ((2, 36), (3, 216)):
         names = f"{levels} levels of 5 options ({choices} joint choices)", "one level (6 choices)"
