@@ -33,7 +33,7 @@ demo: opengl $(DEMO)
 test: lint
 	$(BIN)/pytest -n 2 --dist worksteal -q
 
-# 45 minutes on two cores: planted recoveries, many kills, more processes, every notebook, dynamax, and the site besides.
+# 25 minutes on two cores: planted recoveries, many kills, more processes, every notebook, dynamax, and the site besides.
 test-all: lint
 	$(BIN)/pytest -n 2 --dist worksteal -q -m ''
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
@@ -44,6 +44,7 @@ test-all: lint
 bench: $(DEMO)
 	$(PIP) -e '.[bench,segments]'
 	$(BIN)/python benchmarks/performance.py
+	$(BIN)/ddco-pyro study render README.md docs/results/*.md
 
 # What reads the formats of segments, in an environment of its own: LeRobot needs Python 3.12. About 8 GB with CUDA.
 tools:
