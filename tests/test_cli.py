@@ -147,6 +147,20 @@ def test_version_is_the_packages():
     assert (ended.status, ended.out, ended.err) == (0, f"ddco-pyro {declared}\n", "")
 
 
+WITH_PLANNERS = """
+import sys
+from ompl import base, geometric
+from ddco_pyro.cli.app import main
+sys.argv[1:] = ["--version"]
+main()
+"""
+
+
+def test_the_bindings_of_planners_say_nothing_at_the_end():
+    ended = subprocess.run([sys.executable, "-c", WITH_PLANNERS], capture_output=True, text=True)
+    assert (ended.returncode, ended.stderr) == (0, "")
+
+
 def test_nothing_at_all_is_help():
     ended = call()
     assert ended == call("--help")

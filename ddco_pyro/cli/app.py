@@ -78,7 +78,8 @@ def main() -> None:
         status = _run()
     if jobs := sys.modules.get("ddco_pyro.training.jobs"):
         jobs.end_pool()
-    gc.freeze()  # what is left goes with the process
+    if not ("ompl" in sys.modules or "--allow-code" in sys.argv):  # bindings may report what Python leaves
+        gc.freeze()  # so that it goes with the process
     sys.exit(status)
 
 
