@@ -171,7 +171,10 @@ def _buffer(size: int) -> Array:
 
 
 def lots_of(lengths: Array) -> tuple[Array, Array]:
-    """The trajectories of each lot and their lengths, int64 [lots, lanes]. Lengths [N] ascend; 0 is no trajectory."""
+    """The trajectories of each lot and their lengths, int64 [lots, lanes], the shortest first; 0 is no trajectory.
+
+    :param lengths: steps of each trajectory, [N].
+    """
     order = np.argsort(lengths, kind="stable")
     trajectories, each = np.zeros((2, -(-len(lengths) // LANES), LANES), dtype=np.int64)
     trajectories.reshape(-1)[-len(lengths) :], each.reshape(-1)[-len(lengths) :] = order, lengths[order]

@@ -187,17 +187,17 @@ def _merged(first: Any, second: Any, best: int) -> Any:
 
 
 @jit
-def _cumulative(rows: Plane, t: int, first: int, number: int, best: int) -> Any:
+def _cumulative(rows: Plane, t: int, first: int, many: int, best: int) -> Any:
     """Make logarithms a distribution function, and return the logarithm of their sum; of the maximum, for ``best``.
 
     A number uniform in [0, 1) draws the first entry above it. Zero draws the first of the largest, for ``best``.
     """
     apart()
     total = lanes(-np.inf)
-    for i in range(first, first + number):
+    for i in range(first, first + many):
         total, _ = _merged(total, at(rows, t, i), best)
         put(rows, t, i, total)
-    for i in range(first, first + number):
+    for i in range(first, first + many):
         value = at(rows, t, i)
         put(rows, t, i, where(value == total, 1.0, 0.0) if best != 0 else exponential(value - total))
     return total

@@ -53,7 +53,7 @@ def useful_jobs(jobs: int, calls: int) -> int:
 
 def pool(jobs: int) -> Parallel:
     """Processes for :func:`results`, to be used in a ``with`` statement."""
-    if jobs > 1:
+    if jobs != 1:
         _POOLED.set()
     # one call at a time: each takes long, and each result is kept at once; no read-only maps of arrays
     return Parallel(n_jobs=jobs, return_as="generator_unordered", batch_size=1, max_nbytes=None)

@@ -37,9 +37,9 @@ class DDCOConfig(PreTrainedConfig):
     def get_optimizer_preset(self) -> None:
         """Refuse to train.
 
-        :raises NotImplementedError: always.
+        :raises RuntimeError: always.
         """
-        raise NotImplementedError("a ddco policy is fitted with: ddco-pyro fit SPEC")
+        raise RuntimeError("a ddco policy is fitted with: ddco-pyro fit SPEC")
 
     def get_scheduler_preset(self) -> None:
         """No schedule: LeRobot does not train this policy."""

@@ -87,9 +87,9 @@ class DDCOPolicy(PreTrainedPolicy):
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, Any] | None]:
         """Refuse to train.
 
-        :raises NotImplementedError: always.
+        :raises RuntimeError: always.
         """
-        raise NotImplementedError("a ddco policy is fitted with: ddco-pyro fit SPEC")
+        raise RuntimeError("a ddco policy is fitted with: ddco-pyro fit SPEC")
 
 
 def _own(value: np.ndarray, spec: dict[str, Any]) -> np.ndarray:
