@@ -1,4 +1,4 @@
-"""Parts of the benchmark about pictures: reading, encoding, training on them, in chunks of time, in two processes.
+"""Parts of the benchmark about pictures: reading, encoding, training on them, in chunks of time.
 
 Reading goes on in other processes and is compared by the clock; the rest by the time of this process's processor, which
 other work on the machine changes little.
@@ -30,14 +30,10 @@ from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.model import hierarchy as networks
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.spec import parse_spec
-from ddco_pyro.training.launching import together
 from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.restarts import Trainer
 
-AIMS = {
-    "epoch of pictures in a file / pictures in memory": ("≤", 1.15),
-    "epoch in one process / in two": ("≥", 1.7),
-}
+AIMS = {"epoch of pictures in a file / pictures in memory": ("≤", 1.15)}
 FF = {"network": "conv", "filters": 64, "kernel": 5, "hidden": [64]}
 """The paper's: a convolution of 64 filters of 5 × 5 and a fully connected layer (SM 1.2)."""
 
@@ -154,45 +150,35 @@ def training() -> Iterator[Row]:
         yield measured(("epoch of pictures in a file", "pictures in memory"), read, held)
         yield measured(("epoch of pictures in a file, two workers", "pictures in memory"), ahead, held)
         yield measured(("epoch of pictures in memory", "networks alone"), held, networks_alone(memory))
-        eight = made(10, SHORT)
-        pair = [epoch(eight, processes=number, clock=time.perf_counter) for number in (1, 2)]
-        yield of_pairs(("epoch in one process", "in two"), [(1e3 * pair[0], 1e3 * pair[1])])
 
 
-def trainer(demos: Demonstrations, workers: int = 0, shards: int = 1, epochs: int = 2) -> Trainer:
+def trainer(demos: Demonstrations, workers: int = 0) -> Trainer:
     """The paper's FF networks, three options, a few epochs; the last demonstration tunes."""
     level = {"count": 3, "policy": FF, "termination": {"network": "linear", "inputs": ["pose"]}}
     train, tune = demos.select(demos.names[:-1]), demos.select(demos.names[-1:])
-    budget = {"epochs": epochs, "patience": None, "batch_size": len(train) // (1 if shards > 1 else 2)}
+    budget = {"epochs": 2, "patience": None, "batch_size": len(train) // 2}
     spec = parse_spec(
         {
             "demonstrations": {"path": "unused.hdf5"},
             "observations": ["pose", "camera"],
             "hierarchy": {"levels": [level], "meta_policy": FF},
-            "training": {"initialize": "random", "layerwise": False, "workers": workers, "shards": shards, **budget},
+            "training": {"initialize": "random", "layerwise": False, "workers": workers, **budget},
         }
     )
     return Trainer(spec, Dimensions.of(demos), train, tune)
 
 
-def epoch(
-    demos: Demonstrations,
-    workers: int = 0,
-    processes: int | None = None,
-    clock: Callable[[], float] = time.process_time,
-) -> float:
-    """Seconds of an epoch by a clock, the first epoch left out; of this process's processor unless told otherwise."""
+def epoch(demos: Demonstrations, workers: int = 0) -> float:
+    """Seconds of an epoch of this process's processor, the first epoch left out."""
     clocks: list[float] = []
 
     def tell(event: Event) -> None:
         if isinstance(event, EpochEnded):
-            clocks.append(clock())
+            clocks.append(time.process_time())
 
-    made_for = trainer(demos, workers) if processes is None else trainer(demos, shards=2, epochs=4)
+    made_for = trainer(demos, workers)
     made_for.on_event = tell
-    with together(processes or 1) as ranks:
-        made_for.ranks = ranks
-        made_for.run()
+    made_for.run()
     return statistics.median(after - before for before, after in pairwise(clocks))
 
 

@@ -8,8 +8,6 @@ from __future__ import annotations
 import json
 import shutil
 import signal
-import tempfile
-import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +18,7 @@ import pytest
 import selecting
 import toy_task
 import yaml
-from killing import COMMAND, Kept, answered, started, until_done, whole
+from killing import Kept, until_done, whole
 from random_demonstrations import demonstrations, numbered
 
 from ddco_pyro.data.importing import import_demonstrations
@@ -147,7 +145,7 @@ COMMANDS = {
     "import": "import {inputs}/source.hdf5 --out imported.hdf5",
     "fit": "fit {inputs}/toy.yaml --out fitted --resume --allow-code --set training.epochs=100 "
     "--set compare_with=[flat]",
-    "fit to pictures": "fit {inputs}/pictures.yaml --out seen --resume --processes 2",
+    "fit to pictures": "fit {inputs}/pictures.yaml --out seen --resume",
     "select": "select {inputs}/grid.yaml --out selected --jobs 2",
     "segment": "segment {inputs}/run {inputs}/toy.hdf5 --out labelled.hdf5 --csv a.csv --html a.html",
     "segment in place": "segment {inputs}/run toy.hdf5 --in-place --csv a.csv --html a.html",
@@ -209,23 +207,6 @@ def check(name: str, inputs: Path, tmp_path: Path, kills: int, seed: int, by: si
 def test_terminated_and_called_again(inputs: Path, tmp_path: Path, name: str) -> None:
     """A scheduler's preemption, five times: each ends with a line, without helpers left behind, and goes on."""
     assert check(name, inputs, tmp_path, kills=5, seed=11, by=signal.SIGTERM) > 0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("number", range(4))
-def test_a_terminated_fit_in_two_processes_says_that_last(tmp_path: Path, number: int) -> None:
-    """In training, while each process may have one that reads pictures: what the second leaves behind is no news."""
-    write_pictures(tmp_path)
-    fit = "fit pictures.yaml --out seen --processes 2 --set training.epochs=2000"
-    with tempfile.TemporaryFile("w+") as err:
-        process = started([COMMAND, *fit.split()], err, tmp_path)
-        while not list(tmp_path.glob("seen/checkpoints/*")):
-            assert process.poll() is None
-            time.sleep(0.05)
-        time.sleep(0.1 * number)
-        process.terminate()
-        process.wait(timeout=60)
-        answered(process, err, signal.SIGTERM)
 
 
 @pytest.mark.slow

@@ -20,23 +20,18 @@ import numpy as np
 import pytest
 import torch
 from command_line import Ended, call
-from killing import struck
 from planted import small_spec
 from random_demonstrations import of_states
 
 from ddco_pyro.data.files import only_one
-from ddco_pyro.errors import BadInput, Failed
+from ddco_pyro.errors import Failed
 from ddco_pyro.fitting.fit import fit
-from ddco_pyro.model.batch import STEPS_AT_ONCE
 from ddco_pyro.spec import dump_spec
 from ddco_pyro.training import restarts as restarting
 from ddco_pyro.training.checkpoint import Progress, Restart
 from ddco_pyro.training.jobs import beside, early_process, end_pool, pool, results
-from ddco_pyro.training.launching import check_processes, launched, requested, together
 from ddco_pyro.training.loop import StageTraining
 from ddco_pyro.training.networks import Dimensions
-from ddco_pyro.training.objective import TrainingError
-from ddco_pyro.training.processes import ALONE, Ranks
 from ddco_pyro.training.restarts import Trainer
 from ddco_pyro.training.stages import plan
 
@@ -72,7 +67,7 @@ def test_the_gradient_of_four_shards_is_that_of_one(demos, rows, dtype, close):
             for batch in (data.train, data.tune)
         ]
         data, model = replace(data, train=batches[0], tune=batches[1]), model.to(dtype)
-        stage = StageTraining(data, model, plan(data.spec, 1)[-1], Restart(Progress(0)), ALONE, last=True)
+        stage = StageTraining(data, model, plan(data.spec, 1)[-1], Restart(Progress(0)), last=True)
         assert [len(shard) > 0 for shard in stage._shards(minibatch)] == [True] * min(count, rows)
         assert torch.cat(stage._shards(minibatch)).tolist() == minibatch.tolist()
         value = stage.step(data.train, minibatch, 0)
@@ -83,59 +78,6 @@ def test_the_gradient_of_four_shards_is_that_of_one(demos, rows, dtype, close):
     assert largest > 0.01
     for gradient, shared in zip(gradients, others, strict=True):
         torch.testing.assert_close(shared, gradient, rtol=close, atol=close * largest)
-
-
-# --- the same bits ----------------------------------------------------------------------------------------------------
-
-
-def make(spec, demos, long, folder=None, **processes):
-    """A trainer that tunes on two demonstrations, ``long`` ones in two pieces."""
-    train, tune = demos.split(0.2, 0)
-    if long:
-        tune = of_states([STEPS_AT_ONCE // 2 + 1] * 2, seed=1)
-    return Trainer(spec, Dimensions.of(demos), train, tune, folder, **processes)
-
-
-def trained(trainer):
-    """The history, the summary, the model, and the checkpoints."""
-    state = {name: value.tolist() for name, value in trainer.run().state_dict().items()}
-    return trainer.history, trainer.summary, state, contents(trainer.checkpoints)
-
-
-def contents(folder):
-    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
-
-
-MODELS = [{}, {"optimizer": {"name": "momentum"}, "clip_gradient": 0.1, "average": 0.9, "duration": {"mean": 4}}]
-
-
-@pytest.mark.slow
-def test_three_processes_give_the_same_bits(demos, tmp_path):
-    """Two models in turn, trained by the same processes; then one with a demonstration that is spoilt in the shard of
-    another process, which raises what is raised here.
-    """
-    spoilt = {}
-    for name in ("alone", "shared"):
-        spoilt[name] = make(make_spec(shards=3, batch_size=8), demos, False)
-        train = spoilt[name].data.train
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(spoilt[name].data.seed(0, 0, 0))  # restart, stage, epoch
-            train.actions[torch.randperm(len(train))[-1]] = torch.nan
-
-    def share():
-        with together(3) as ranks:
-            for number, training in enumerate(MODELS):
-                folders = [tmp_path / f"{number}-{name}" for name in ("alone", "shared")]
-                alone = trained(make(make_spec(**training), demos, number == 1, folders[0]))
-                assert trained(make(make_spec(**training), demos, number == 1, folders[1], ranks=ranks)) == alone
-            spoilt["shared"].ranks = ranks
-            spoilt["shared"].run()
-
-    with pytest.raises(TrainingError) as shared:
-        share()
-    with pytest.raises(TrainingError, match=r"the log-likelihood of demo_\d is not finite") as alone:
-        spoilt["alone"].run()
-    assert str(shared.value) == str(alone.value)
 
 
 # --- the command line -------------------------------------------------------------------------------------------------
@@ -155,38 +97,6 @@ def whole(demos, tmp_path_factory):
 def assert_same_run(folder, run):
     for name in ("spec.yaml", "model.safetensors", "history.csv", "checkpoints/restart-0.safetensors"):
         assert (folder / name).read_bytes() == (run / name).read_bytes(), name
-
-
-KILL_THE_OTHER = (
-    "import multiprocessing, time; os.kill(multiprocessing.active_children()[0].pid, signal.SIGKILL); "
-    "open('killed', 'w').write(str(time.monotonic()))"
-)
-KILL_THE_FIRST = (
-    "import multiprocessing, sys; print(multiprocessing.active_children()[0].pid, file=sys.stderr, flush=True); "
-    "os.kill(os.getpid(), signal.SIGKILL)"
-)
-
-
-@pytest.mark.slow
-def test_killed_on_two_processes_and_resumed_on_one(whole, tmp_path):
-    """First another process dies, which is said; then the first, which the other does not outlive."""
-    spec, run = whole
-    folder = tmp_path / "run"
-    command = ["fit", spec, "--out", folder, "--processes", "2"]
-    status, err = struck(command, tmp_path, "EpochEnded", 5, KILL_THE_OTHER)
-    assert time.monotonic() - float((tmp_path / "killed").read_text()) < 60  # seconds, where the machine is idle
-    assert status == 1
-    said = [line for line in err.splitlines() if line.startswith("ddco-pyro: ")]
-    assert len(said) == 1
-    assert said[0].startswith("ddco-pyro: a process that trained together with this one was ended from outside")
-    assert "Traceback" not in err
-    assert (folder / "checkpoints" / "restart-0.safetensors").exists()
-    status, err = struck(command, tmp_path, "EpochEnded", 5, KILL_THE_FIRST)
-    assert status == -signal.SIGKILL
-    assert_ends(int(next(line for line in err.splitlines() if line.isdigit())), 60)
-    assert not (folder / "model.safetensors").exists()
-    fit(spec, out=folder)
-    assert_same_run(folder, run)
 
 
 def alive(process):
@@ -266,39 +176,49 @@ def test_what_is_refused_under_torchrun_is_one_line_of_one_process(whole, tmp_pa
     assert other == (0, "", "")
 
 
+LOST = "ddco-pyro: a process that trained together with this one was ended from outside"
+
+
 def with_training_of_the_other(train, spec, folder):
     """What two processes end with, where the second trains in another way."""
     command = ("fit", spec, "--out", folder / "run")
     return under_torchrun(folder, *command, other=lambda: setattr(restarting, "train", train))
 
 
-def test_what_went_wrong_in_another_process_is_said_by_the_first(whole, tmp_path):
-    """It was not killed: its own error is the reason."""
-
+def test_what_goes_wrong_in_one_process_alone_is_said_by_itself(whole, tmp_path):
     def fails(*_, **__):
         raise RuntimeError("no room on this device")
 
     first, other = with_training_of_the_other(fails, whole[0], tmp_path)
-    said = "process 1, which trained together with this one, has failed: RuntimeError: no room on this device"
-    assert (first.status, first.err) == (1, f"ddco-pyro: {said}\n")
-    assert other == (0, "", "")
+    assert (first.status, first.err.count("\n"), first.err.startswith(LOST)) == (1, 1, True)
+    assert (other.status, other.err.count("no room on this device")) == (1, 1)
 
 
-def test_a_process_that_is_killed_is_not_said_to_have_failed(whole, tmp_path):
-    def dies(*_, **__):
+def test_after_another_process_is_killed_one_process_goes_on_to_the_same_bits(whole, tmp_path):
+    spec, run = whole
+    real = restarting.train
+
+    def dies(data, restart, *rest):
         (tmp_path / "other.json").write_text('[1, "", ""]')
+        real(data, restart, restart.progress.epoch + 1, *rest[1:])
         os.kill(os.getpid(), signal.SIGKILL)
 
-    first, _ = with_training_of_the_other(dies, whole[0], tmp_path)
-    assert (first.status, first.err.count("\n")) == (1, 1)
-    assert first.err.startswith("ddco-pyro: a process that trained together with this one was ended from outside")
+    first, _ = with_training_of_the_other(dies, spec, tmp_path)
+    assert (first.status, first.err.count("\n"), first.err.startswith(LOST)) == (1, 1, True)
+    assert (tmp_path / "run" / "checkpoints" / "restart-0.safetensors").exists()
+    fit(spec, out=tmp_path / "run")
+    assert_same_run(tmp_path / "run", run)
 
 
-def test_two_processes_of_torchrun_give_the_bits_of_one(demos, tmp_path):
+MOMENTUM = {"optimizer": {"name": "momentum"}, "clip_gradient": 0.1, "average": 0.9, "duration": {"mean": 4}}
+
+
+@pytest.mark.parametrize(("number", "training"), [(2, {}), pytest.param(3, MOMENTUM, marks=pytest.mark.slow)])
+def test_processes_of_torchrun_give_the_bits_of_one(demos, tmp_path, number, training):
     demos.write(tmp_path / "demos.hdf5")
-    short = make_spec(tmp_path / "demos.hdf5", patience=None, epochs=4, restarts=1)
+    short = make_spec(tmp_path / "demos.hdf5", patience=None, epochs=4, restarts=1, **training)
     (tmp_path / "spec.yaml").write_text(dump_spec(short))
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(number)]
     command += ["-m", "ddco_pyro.cli", "fit", "spec.yaml", "--out", "run"]
     ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600)
     assert ended.returncode == 0, ended.stderr
@@ -307,30 +227,13 @@ def test_two_processes_of_torchrun_give_the_bits_of_one(demos, tmp_path):
     assert_same_run(tmp_path / "run", tmp_path / "alone")
 
 
-# --- what is refused --------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("given", "problem"),
-    [
-        ((0, 1, 4), "--processes 0: give a number of processes"),
-        ((2, -1, 4), "--jobs trains restarts side by side, --processes shares the work of each gradient step"),
-        ((3, 1, 2), "--processes 3: a minibatch is cut into training.shards=2, .* add --set training.shards=3 "),
-    ],
-)
-def test_what_cannot_be_shared_is_refused(given, problem):
-    with pytest.raises(BadInput, match=f"^{problem}"):
-        check_processes(*given)
-
-
-def test_torchrun_decides_how_many_there_are(monkeypatch):
-    for name, value in {"RANK": 1, "WORLD_SIZE": 2, "MASTER_ADDR": "here", "MASTER_PORT": 1}.items():
-        monkeypatch.setenv(name, str(value))
-    assert launched() == Ranks(1, 2)
-    assert requested(None, launched()) == requested(2, launched()) == 2
-    assert (requested(None, None), requested(3, None)) == (1, 3)
-    with pytest.raises(BadInput, match=r"^--processes 3: torchrun started 2; leave it out$"):
-        requested(3, launched())
+def test_more_processes_than_shards_are_refused(whole, tmp_path):
+    first, other = under_torchrun(tmp_path, "fit", whole[0], "--set", "training.shards=1", "--out", tmp_path / "run")
+    said = "torchrun started 2 processes, but a minibatch is cut into training.shards=1; add --set training.shards=2"
+    assert (first.status, first.err.count("\n")) == (2, 1)
+    assert first.err.startswith(f"ddco-pyro: {said}")
+    assert other == (0, "", "")
+    assert not (tmp_path / "run").exists()
 
 
 # --- processes beside this one ----------------------------------------------------------------------------------------

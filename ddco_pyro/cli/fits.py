@@ -6,23 +6,23 @@ import json
 import sys
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from enum import StrEnum
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from ddco_pyro.cli import AllowCode, Overrides, RunPath, SpecPath, out_folder, written
 from ddco_pyro.data.files import Output, check_outputs
-from ddco_pyro.errors import command
+from ddco_pyro.errors import BadInput, Failed, command
 from ddco_pyro.events import Event
 from ddco_pyro.logs import Logged, MakeLog, find_log
 from ddco_pyro.spec import Spec, SpecError, dump_spec, load_spec, spec_schema, user_code
 
 if TYPE_CHECKING:
     from ddco_pyro.fitting.fitted import Fit
+    from ddco_pyro.training.processes import Ranks
 
 
 class Backend(StrEnum):
@@ -74,10 +74,6 @@ def fit(
             "core, 1 is this process alone."
         ),
     ] = None,
-    processes: Annotated[
-        int | None,
-        typer.Option(help="Processes that share each gradient step, at most training.shards; under torchrun its own."),
-    ] = None,
     seeds: Annotated[
         int | None,
         typer.Option(min=2, help="Fit with so many training seeds in all, and report their variation."),
@@ -97,41 +93,33 @@ def fit(
 ) -> None:
     """Fit the spec's hierarchy and its baselines; write the run folder with its report.
 
-    An unfinished run of the same spec in --out is continued, with any number of processes.
+    An unfinished run of the same spec in --out is continued, with any number of processes. Under torchrun processes
+    share each gradient step, at most training.shards of them.
 
     With --seeds the fit and its baselines are repeated, in --jobs processes, with other training seeds: other first
     weights, clusters and orders of the same demonstrations. RUN/seeds has a run for each.
     """
-    from ddco_pyro.training.launching import follow_torchrun, launched, leading, requested
+    from ddco_pyro.training.processes import together
 
-    ranks = launched()
-    if ranks and ranks.rank > 0:
-        follow_torchrun(ranks)
-        return
-    with leading(ranks):
+    with together() as ranks:
+        if ranks.rank > 0:
+            _follow(ranks)
+            return
         loaded = load_spec(spec, overrides, allow_code)
         logs = {name: find_log(name, allow_code) for name in log}
-        _fit(loaded, spec, out, (jobs, requested(processes, ranks)), seeds, resume, logs)
+        if ranks.size > 1 and jobs not in (None, 1):
+            raise SpecError(f"--jobs {jobs}: the processes of torchrun train together; leave --jobs out")
+        jobs = 1 if ranks.size > 1 else -1 if jobs is None else jobs
+        with _ready(loaded, jobs):
+            _fit_and_report(loaded, spec, out, jobs, seeds, resume, logs)
 
 
-def _fit(
-    loaded: Spec,
-    spec: Path,
-    out: Path | None,
-    workers: tuple[int | None, int] = (None, 1),
-    seeds: int | None = None,
-    resume: bool = False,
-    logs: Mapping[str, MakeLog] = MappingProxyType({}),
-) -> None:
-    """The fit once the spec is read.
+def _follow(ranks: Ranks) -> None:
+    """Train along with the first process of ``torchrun``, which alone reports an error that both have."""
+    from ddco_pyro.training.restarts import follow
 
-    :param workers: jobs, None for the default, and processes that share each gradient step.
-    """
-    jobs, processes = workers
-    if jobs is None:
-        jobs = -1 if processes == 1 else 1
-    with _ready(loaded, jobs):
-        _fit_and_report(loaded, spec, out, (jobs, processes), seeds, resume, logs)
+    with suppress(BadInput, Failed):
+        follow(ranks)
 
 
 @contextmanager
@@ -152,12 +140,11 @@ def _fit_and_report(
     loaded: Spec,
     spec: Path,
     out: Path | None,
-    workers: tuple[int, int],
+    jobs: int,
     seeds: int | None,
     resume: bool,
     logs: Mapping[str, MakeLog],
 ) -> None:
-    jobs, processes = workers
     import ddco_pyro
     from ddco_pyro.cli import console
     from ddco_pyro.fitting.seeds import check_seeds, repeat
@@ -179,7 +166,7 @@ def _fit_and_report(
             for log in logged:
                 log(event)
 
-        fitted = ddco_pyro.fit(loaded, None, folder, listen, jobs, processes, resume)
+        fitted = ddco_pyro.fit(loaded, None, folder, listen, jobs, resume)
         for log in logged:
             log.scalars(_held_out(fitted))
         if seeds is not None:

@@ -40,12 +40,11 @@ from ddco_pyro.spec import Spec, load_spec, with_overrides
 from ddco_pyro.training.data import demonstrations as read_demonstrations
 from ddco_pyro.training.data import dimensions, known_demonstrations, parts, refuse_unfit, seen
 from ddco_pyro.training.devices import device_of, repeatable
-from ddco_pyro.training.jobs import LONG, beside, check_jobs, useful_jobs
+from ddco_pyro.training.jobs import LONG, BackendError, beside, check_jobs, useful_jobs
 from ddco_pyro.training.labels import used
-from ddco_pyro.training.launching import check_processes, together
 from ddco_pyro.training.networks import Dimensions, check_models, model_name, parameters
 from ddco_pyro.training.optimizers import optimizer_of
-from ddco_pyro.training.processes import ALONE, Ranks
+from ddco_pyro.training.processes import Ranks
 from ddco_pyro.training.restarts import train_model
 
 PACKAGES = ("ddco-pyro", "torch", "pyro-ppl", "numpy", "dm-control", "mujoco", "ompl", "scikit-learn")
@@ -58,7 +57,6 @@ def fit(
     out: str | Path | None = None,
     on_event: OnEvent = ignore,
     jobs: int = 1,
-    processes: int = 1,
     resume: bool = True,
     keep: bool = True,
 ) -> Fit:
@@ -85,11 +83,9 @@ def fit(
     :param jobs: processes that train restarts, or baselines beside the model, -1 for one on each core; 1 for this
         process alone. The result is the same for any number. In a script, more than one needs the usual
         ``if __name__ == "__main__":``.
-    :param processes: processes that share the work of each gradient step instead, at most ``training.shards``; the
-        result is the same for any number.
     :param resume: whether ``out`` may hold the finished run.
     :param keep: whether ``out`` has a copy of demonstrations from memory; False where the spec's file has them.
-    :raises BackendError: so many processes cannot share the work.
+    :raises BackendError: there is no such number of jobs, or ``torchrun`` started too many processes.
     :raises SpecError: something in the spec does not fit the demonstrations.
     :raises DemonstrationsError: the demonstrations cannot be used.
     :raises RunError: the folder holds something else.
@@ -98,7 +94,7 @@ def fit(
     """
     spec, folder = spec if isinstance(spec, Spec) else load_spec(spec), None if out is None else Path(out)
     check_jobs(jobs)
-    check_processes(processes, jobs, spec.training.shards)
+    _check_shards(spec.training.shards)
     allowed()  # or $DDCO_PYRO_MEMORY is wrong
     clock, given = Clock(), None
     with clock("demonstrations"):
@@ -138,10 +134,21 @@ def fit(
         assert demos is not None
         if not known:  # the dimensions of the control decide the baselines too
             models = check_models(spec, Dimensions.of(demos))
-        ranks = stack.enter_context(together(processes))
         short = spec.training.restarts == 1 or all(_over_all(*model) for model in models.values())
         baselines = dict(list(models.items())[1:])
-        return _fit_model(spec, demos, folder, on_event, jobs, ranks, clock, baselines, short)
+        return _fit_model(spec, demos, folder, on_event, jobs, clock, baselines, short)
+
+
+def _check_shards(shards: int) -> None:
+    """Refuse processes of ``torchrun`` that have no part of a minibatch.
+
+    :raises BackendError: there are more of them than shards.
+    """
+    if (processes := Ranks.here().size) > shards:
+        raise BackendError(
+            f"torchrun started {processes} processes, but a minibatch is cut into training.shards={shards}; add "
+            f"--set training.shards={processes} (results depend on the shards, not on the processes)"
+        )
 
 
 def _fit_model(
@@ -150,7 +157,6 @@ def _fit_model(
     folder: Path | None,
     on_event: OnEvent,
     jobs: int,
-    ranks: Ranks,
     clock: Clock,
     baselines: Mapping[str, tuple[Spec, Hierarchy]],
     short: bool = True,
@@ -172,22 +178,20 @@ def _fit_model(
     }
     far = _shared(jobs, [name for name, model in baselines.items() if short and _worth_a_process(*model, demos)])
     began = {name: TrainingBegan(name, its.training.epochs) for name, (its, _) in baselines.items()}
-    others = {name: fits[name] for name in far} if ranks.size == 1 else {}
+    others = {name: fits[name] for name in far} if Ranks.here().size == 1 else {}
     with _in_other_processes(others, began, jobs, on_event) as begun:
         with clock("training"):
             free = max(1, useful_jobs(jobs, sys.maxsize) - len(begun))
-            trained = train_model(
-                spec, size, split["train"], on_event, checkpoints, split.get("valid"), name, free, ranks
-            )
+            trained = train_model(spec, size, split["train"], on_event, checkpoints, split.get("valid"), name, free)
         hierarchy = trained.hierarchy
         if folder:
             write_history(folder, trained.history)
             write_model(folder, hierarchy)
         with clock("baselines"):
-            here = {name: fits[name](on_event, jobs, ranks) for name in fits if name not in begun}
+            here = {name: fits[name](on_event, jobs) for name in fits if name not in begun}
             by_name = {name: here[name] if name in here else begun[name]() for name in fits}
     with clock("training"):
-        apart = _leave_one_out(spec, size, demos, folder, on_event, jobs, ranks)
+        apart = _leave_one_out(spec, size, demos, folder, on_event, jobs)
     fitted = Fit(spec, hierarchy, folder=folder, given=demos, beside=by_name, apart=apart)
     train, valid = len(trained.data.train), len(split.get("valid", ()))
     counts = {"train": train, "tune": len(split["train"]) - train, "valid": valid, "left_out": bool(apart)}
@@ -224,7 +228,6 @@ def _leave_one_out(
     folder: Path | None,
     on_event: OnEvent,
     jobs: int,
-    ranks: Ranks,
 ) -> dict[str, Hierarchy]:
     """The model trained without each demonstration, by its name, each kept in the run folder as soon as it is done."""
     models: dict[str, Hierarchy] = {}
@@ -239,7 +242,7 @@ def _leave_one_out(
         others = demos.select(other for other in demos.names if other != name)
         checkpoints = place / "checkpoints" if place else None
         event = f"{model_name(spec)} without {name}"
-        models[name] = train_model(spec, size, others, on_event, checkpoints, None, event, jobs, ranks).hierarchy
+        models[name] = train_model(spec, size, others, on_event, checkpoints, None, event, jobs).hierarchy
         if place:
             write_model(place, models[name])
     return models
@@ -253,7 +256,6 @@ def _fit_baseline(
     name: str,
     on_event: OnEvent,
     jobs: int = 1,
-    ranks: Ranks = ALONE,
 ) -> Fit:
     """Fit a baseline, or load it where that is done.
 
@@ -264,7 +266,7 @@ def _fit_baseline(
         record(folder, demos, recorded(above))
         if is_finished(folder):
             return load(folder, allow_code=True)
-    return _fit_model(spec, demos, folder, on_event, jobs, ranks, Clock(), {}, name=name)
+    return _fit_model(spec, demos, folder, on_event, jobs, Clock(), {}, name=name)
 
 
 # --- baselines in other processes -------------------------------------------------------------------------------------

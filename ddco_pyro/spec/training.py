@@ -129,8 +129,8 @@ class TrainingSpec(Model):
     batch_size: Count = 16
     """Trajectories in each gradient step."""
     shards: Count = 1
-    """Number of parts of a minibatch, and the most processes that can share it (``fit --processes``). Results depend on
-    the number of shards, by rounding and dropout, and not on the number of processes."""
+    """Number of parts of a minibatch, and the most processes of ``torchrun`` that can share it. Results depend on the
+    number of shards, by rounding and dropout, and not on the number of processes."""
     restarts: Count = 1
     """Number of independent initialisations; the best on the tuning demonstrations is kept."""
     halving: Count | None = 50

@@ -42,7 +42,7 @@ from ddco_pyro.training.optimizers import (
     optimizer_state,
     restore_optimizer,
 )
-from ddco_pyro.training.processes import ALONE, Ranks
+from ddco_pyro.training.processes import Ranks
 from ddco_pyro.training.stages import Stage, StageEnd, plan, share
 
 SAVE_EVERY = 5.0
@@ -59,15 +59,12 @@ def train(
     seconds: float = math.inf,
     checkpoint: Path | None = None,
     on_event: OnEvent = ignore,
-    ranks: Ranks = ALONE,
 ) -> Restart:
-    """Train a restart further, on one thread.
+    """Train a restart further, on one thread, together with the processes of ``torchrun`` (:meth:`Ranks.here`).
 
     :param until: epochs of the last stage after which training pauses; None to train until patience or budget end it.
     :param seconds: training also pauses after about this time, at the end of an epoch.
     :param checkpoint: the file that the restart is written to at the end of epochs and of the training.
-    :param ranks: the processes that train this restart together, none of them with a limit of ``seconds``; the first
-        writes the file.
     """
     now, states, spec = restart.progress, restart.states, data.spec.training
     device, deadline, saved = device_of(spec), time.monotonic() + seconds, -math.inf
@@ -79,7 +76,7 @@ def train(
             while not now.done:
                 last = now.stage == len(stages) - 1
                 cap = share(spec.epochs, now.spent, len(stages) - now.stage)
-                stage, begun = StageTraining(data, model, stages[now.stage], restart, ranks, last), now.epoch
+                stage, begun = StageTraining(data, model, stages[now.stage], restart, last), now.epoch
                 while (cap is None or now.epoch < cap) and not stage.converged:
                     overdue = now.epoch > begun and time.monotonic() > deadline
                     if overdue or (last and until is not None and now.epoch >= until):
@@ -110,14 +107,12 @@ class StageTraining:
         (Polyak and Juditsky 1992) where ``training.average`` asks for it, the trained model otherwise.
     """
 
-    def __init__(
-        self, data: TrainingData, model: Hierarchy, stage: Stage, restart: Restart, ranks: Ranks, last: bool
-    ) -> None:
-        self.data, self.model, self.stage, self.restart, self.ranks = data, model, stage, restart, ranks
+    def __init__(self, data: TrainingData, model: Hierarchy, stage: Stage, restart: Restart, last: bool) -> None:
+        self.data, self.model, self.stage, self.restart, self.ranks = data, model, stage, restart, Ranks.here()
         self.spec, self.last, now = data.spec.training, last, restart.progress
         if stage.memoryless:
             model.begin_terminations()
-        self.objective = Objective(data, now, stage, ranks, restart.states if now.epoch else None)
+        self.objective = Objective(data, now, stage, restart.states if now.epoch else None)
         self.parameters = [p for name, p in model.named_parameters() if name.startswith(stage.trained)]
         self.whole: Expectation | QuasiNewton | None = None
         optimizer = optimizer_of(self.spec.optimizer, model)

@@ -20,7 +20,7 @@ from ddco_pyro.model.tables import Tables, always_ends
 from ddco_pyro.spec import DurationSpec
 from ddco_pyro.training.checkpoint import Progress, State, TrainingData
 from ddco_pyro.training.initialization import Clusters, EqualParts, RandomCuts
-from ddco_pyro.training.processes import ALONE, Ranks
+from ddco_pyro.training.processes import Ranks
 from ddco_pyro.training.stages import Stage
 from ddco_pyro.training.upper import Constants, expected, fitted
 
@@ -54,10 +54,9 @@ class Objective:
         data: TrainingData,
         progress: Progress,
         stage: Stage,
-        ranks: Ranks = ALONE,
         states: Mapping[str, State] | None = None,
     ) -> None:
-        self.data, self.progress, self.stage, self.ranks = data, progress, stage, ranks
+        self.data, self.progress, self.stage, self.ranks = data, progress, stage, Ranks.here()
         self.likelihoods = 2 if stage.selecting else 1
         self.constants = Constants.of((states or {}).get("constants", {}))
         self.known: tuple[Known, Known] = {}, {}

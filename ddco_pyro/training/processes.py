@@ -1,4 +1,4 @@
-"""Ranks: processes that train one restart together (``torch.distributed``).
+"""Ranks: processes that train one restart together, started by ``torchrun`` and connected by ``torch.distributed``.
 
 All ranks come to the same exchanges in the same order. Results are passed on in the order of the calls that gave them,
 whichever rank computed them.
@@ -6,9 +6,11 @@ whichever rank computed them.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import timedelta
 from itertools import islice
 from typing import Any, TypeVar
 
@@ -26,8 +28,7 @@ class LostProcess(Failed):
     def __init__(self) -> None:
         super().__init__(
             "a process that trained together with this one was ended from outside (too little memory?); what was "
-            "trained is kept in a run folder: continue with the same command, with fewer --processes if memory was "
-            "short"
+            "trained is kept in a run folder: continue with the same command, with fewer processes if memory was short"
         )
 
 
@@ -41,6 +42,11 @@ class Ranks:
 
     rank: int = 0
     size: int = 1
+
+    @classmethod
+    def here(cls) -> Ranks:
+        """This process among those that :func:`together` has connected; elsewhere a single process."""
+        return cls(distributed.get_rank(), distributed.get_world_size()) if distributed.is_initialized() else cls()
 
     def share(self, value: Any = None) -> Any:
         """The value that the first process gives, in each process.
@@ -88,8 +94,34 @@ class Ranks:
         return results
 
 
-ALONE = Ranks()
-"""A single process."""
+LAUNCHED = {"RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT"}
+"""The environment variables of processes that ``torchrun`` starts."""
+
+PATIENCE = timedelta(days=1)
+"""How long a process waits for the others between exchanges. A process that ends is noticed at once, since its
+connections close."""
+
+
+@contextmanager
+def together() -> Iterator[Ranks]:
+    """Inside, this process is connected with the others of ``torchrun``; a process of its own is alone.
+
+    The end of this block in the first process tells the others that there is no further model.
+
+    :raises LostProcess: another process has ended.
+    """
+    if not os.environ.keys() >= LAUNCHED or os.environ["WORLD_SIZE"] == "1":
+        yield Ranks()
+        return
+    with connected():
+        distributed.init_process_group("gloo", timeout=PATIENCE)
+    ranks = Ranks.here()
+    try:
+        yield ranks
+        if ranks.rank == 0:
+            ranks.share(None)
+    finally:
+        distributed.destroy_process_group()
 
 
 @contextmanager

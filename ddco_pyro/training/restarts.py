@@ -48,7 +48,7 @@ from ddco_pyro.training.loop import train
 from ddco_pyro.training.networks import Dimensions, build_hierarchy, model_name
 from ddco_pyro.training.objective import TrainingError
 from ddco_pyro.training.optimizers import optimizer_of
-from ddco_pyro.training.processes import ALONE, Ranks
+from ddco_pyro.training.processes import Ranks
 from ddco_pyro.training.stages import StageEnd, plan
 
 SHORT = 10.0
@@ -73,7 +73,6 @@ def train_model(
     held_out: Demonstrations | None = None,
     name: str | None = None,
     jobs: int = 1,
-    ranks: Ranks = ALONE,
 ) -> Trainer:
     """Train a spec's model on demonstrations, of which ``training.tune_fraction`` are used to tune.
 
@@ -86,7 +85,7 @@ def train_model(
     budget = spec.training
     with one_thread():
         split = tuning_split(spec, dimensions, demos)
-        trainer = Trainer(spec, dimensions, *split, checkpoints, on_event, jobs, ranks)
+        trainer = Trainer(spec, dimensions, *split, checkpoints, on_event, jobs)
         if held_out is not None:
             refuse_unusable(held_out, trainer.hierarchy.encoder, trainer.hierarchy.scaling)
         trainer.check_engines()
@@ -108,8 +107,7 @@ class Trainer:
 
     :param checkpoints: the folder for a checkpoint of each restart; None for nowhere.
     :param jobs: processes that train restarts side by side, each a whole one; -1 is one for each core. The result is
-        the same for any number.
-    :param ranks: processes that train each restart together instead, of which this is the first (:func:`follow`).
+        the same for any number. Under ``torchrun`` its processes train each restart together (:func:`follow`).
     :raises DemonstrationsError: a number is too large for networks.
     :raises SpecError: the demonstrations lack the labels that the spec names, or have more labels than options.
     """
@@ -123,9 +121,8 @@ class Trainer:
         checkpoints: Path | None = None,
         on_event: OnEvent = ignore,
         jobs: int = 1,
-        ranks: Ranks = ALONE,
     ) -> None:
-        self.spec, self.checkpoints, self.on_event, self.ranks = spec, checkpoints, on_event, ranks
+        self.spec, self.checkpoints, self.on_event, self.ranks = spec, checkpoints, on_event, Ranks.here()
         self.jobs = useful_jobs(jobs, spec.training.restarts)
         self.hierarchy = build_hierarchy(spec, dimensions)
         encoder, scaling = self.hierarchy.encoder, self.hierarchy.scaling
@@ -188,7 +185,6 @@ class Trainer:
             self._train([again], None)
         self.ranks.share(None)
         if (why := self.restarts[self.best].progress.diverged) is not None:
-            self.ranks.share(None)  # no further model
             raise TrainingError(why)
         if len(self.restarts) > 1 and self.hierarchy.depth:
             from sklearn.metrics import normalized_mutual_info_score
@@ -308,7 +304,7 @@ class Trainer:
         while left and (len(left) == 1 or time.monotonic() < deadline):
             own, seconds = self.restarts[left[0]], math.inf if len(left) == 1 else deadline - time.monotonic()
             self.ranks.share((own, until))
-            self._keep(train(self.data, own, until, seconds, self._path(left[0]), self.on_event, self.ranks))
+            self._keep(train(self.data, own, until, seconds, self._path(left[0]), self.on_event))
             if seconds == math.inf or time.monotonic() < deadline:  # or it has paused
                 del left[0]
         if not left:
@@ -342,7 +338,7 @@ def follow(ranks: Ranks) -> None:
     while (data := ranks.share()) is not None:
         while (work := ranks.share()) is not None:
             restart, until = work
-            train(data, restart, until, ranks=ranks)
+            train(data, restart, until)
 
 
 def best_until(progress: Progress, epochs: int, last: int) -> float:
