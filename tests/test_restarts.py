@@ -150,7 +150,7 @@ class Scripted:
     def __init__(self, curves):
         self.curves = curves
 
-    def __call__(self, data, restart, until, seconds=None, checkpoint=None, on_event=None, ranks=None):
+    def __call__(self, data, restart, until, seconds=None, checkpoint=None, on_event=None):
         progress = restart.progress
         curve = self.curves[progress.restart]
         progress.start = curve[0]

@@ -13,7 +13,11 @@ from ddco_pyro.data.planted import pick_and_place
 
 HIDDEN = ("cv2", "dm_control", "dm_env", "gymnasium", "mujoco", "ompl")
 WITHOUT = f"""
-import json, sys
+import importlib.metadata, json, sys
+find = importlib.metadata.MetadataPathFinder.find_distributions
+importlib.metadata.MetadataPathFinder.find_distributions = lambda context: (
+    found for found in find(context) if found.name.replace("-", "_") not in {HIDDEN}
+)
 class Hidden:
     def find_spec(self, name, path=None, target=None):
         if name.partition(".")[0] in {HIDDEN}:

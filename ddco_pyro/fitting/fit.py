@@ -48,7 +48,7 @@ from ddco_pyro.training.processes import Ranks
 from ddco_pyro.training.restarts import train_model
 
 PACKAGES = ("ddco-pyro", "torch", "pyro-ppl", "numpy", "dm-control", "mujoco", "ompl", "scikit-learn")
-"""Packages whose versions are in ``metrics.json``."""
+"""Packages whose versions are in ``metrics.json``, where they are installed."""
 
 
 def fit(
@@ -208,7 +208,7 @@ def _fit_model(
             parameters=parameters(hierarchy),
             training=trained.summary,
             seconds={},
-            versions={package: importlib.metadata.version(package) for package in PACKAGES},
+            versions=_versions(),
         )
         named = read_names(folder, spec) if folder else None
         if named is None and spec.hierarchy and name is None:
@@ -219,6 +219,11 @@ def _fit_model(
     if folder:
         metrics.write(folder)
     return replace(fitted, metrics=metrics, named=named or {})
+
+
+def _versions() -> dict[str, str]:
+    installed = {package: next(iter(importlib.metadata.distributions(name=package)), None) for package in PACKAGES}
+    return {package: found.version for package, found in installed.items() if found}
 
 
 def _leave_one_out(
