@@ -263,6 +263,83 @@ def test_minaris_paths_stay_in_the_dataset(written_by_minari, out: Path) -> None
             import_demonstrations(path, out)
 
 
+# --- JIGSAWS ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def surgeons(tmp_path: Path) -> tuple[Path, list[np.ndarray]]:
+    """The folder of a task in the official layout, and its trials: each instrument moves half as far as its master."""
+    folder, random, trials = tmp_path / "Knot_Tying", np.random.default_rng(0), []
+    for part in ("kinematics/AllGestures", "transcriptions"):
+        (folder / part).mkdir(parents=True)
+    for trial, frames in {"Knot_Tying_B001": 31, "Knot_Tying_C002": 24, "Knot_Tying_C003": 30}.items():
+        rows = random.normal(size=(frames, 76))
+        for master, instrument in ((0, 57), (19, 38)):  # crossed
+            rows[:, instrument : instrument + 3] = 0.5 * np.cumsum(rows[:, master + 12 : master + 15], 0) / 30
+        np.savetxt(folder / "kinematics" / "AllGestures" / f"{trial}.txt", rows, fmt="%15.8f")
+        trials.append(rows.round(8))
+    (folder / "transcriptions" / "Knot_Tying_B001.txt").write_text("3 12 G12 \n13 30 G2 \n")
+    (folder / "transcriptions" / "Knot_Tying_C002.txt").write_text("1 24 G11\n\n")
+    (folder / "meta_file_Knot_Tying.txt").write_text("Knot_Tying_B001\t\tN\t\t13\t\t2\nKnot_Tying_C002\t\tE\t\t20\n\n")
+    return folder, trials
+
+
+def test_a_task_of_jigsaws(surgeons, out: Path) -> None:
+    folder, trials = surgeons
+    assert import_demonstrations(folder, out).names == ("demo_0", "demo_1", "demo_2")
+    demos = Demonstrations.read(out)
+    for demo, rows in zip(demos, trials, strict=True):
+        np.testing.assert_array_equal(demo.actions, np.concatenate([rows[:, 12:19], rows[:, 31:38]], 1))
+        moved = np.diff(demo.observations["left_position"], axis=0)
+        np.testing.assert_allclose(moved, 0.5 * demo.actions[1:, :3] / 30, atol=1e-7)
+        np.testing.assert_array_equal(demo.observations["right_rotation"], rows[:, 41:50])
+    assert {key for key in demos.observation_shapes if "velocity" in key} == set()
+    first, second, third = (demo.labels["gesture"].tolist() for demo in demos)
+    assert first == [-1] * 2 + [2] * 10 + [0] * 18 + [-1]  # G2, G11, G12
+    assert (second, third) == ([1] * 24, [-1] * 30)
+    facts = inspect(out)
+    assert facts.frequency == 30
+    assert json.loads(demos.attributes["label_names"]) == {"gesture": ["G2", "G11", "G12"]}
+    with h5py.File(out) as file:
+        about = [dict(file[f"data/demo_{number}"].attrs) for number in range(3)]
+    assert [(one["surgeon"], one["trial"], one.get("skill")) for one in about] == [
+        ("B", 1, "N"),
+        ("C", 2, "E"),
+        ("C", 3, None),
+    ]
+
+
+def test_a_source_at_a_lower_rate(surgeons, out: Path) -> None:
+    folder, trials = surgeons
+    assert call("import", folder, "--out", out, "--hz", "10").status == 0
+    demos = Demonstrations.read(out)
+    assert demos.lengths == (10, 8, 10)
+    means = trials[0][:30].reshape(10, 3, 76).mean(1)
+    np.testing.assert_allclose(demos[0].actions[:, :7], means[:, 12:19], rtol=1e-6)
+    np.testing.assert_allclose(demos[0].observations["left_position"], means[:, 57:60], rtol=1e-6)
+    assert demos[0].labels["gesture"].tolist() == [-1, 2, 2, 2, 0, 0, 0, 0, 0, 0]
+    assert inspect(out).frequency == 10
+
+
+@pytest.mark.parametrize(
+    ("change", "more", "message"),
+    [
+        (("transcriptions/Knot_Tying_B001.txt", "3 x G12"), (), "Knot_Tying_B001.txt: row 1 is no FIRST LAST GESTURE"),
+        (("kinematics/AllGestures/Knot_Tying_B001.txt", ""), (), "Knot_Tying_B001.txt is empty"),
+        (("kinematics/AllGestures/Knot_Tying_B001.txt", "1 2"), (), "rows of 2 numbers, where JIGSAWS has 76"),
+        (("kinematics/AllGestures/Knot_Tying_B001.txt", "1 a"), (), "Knot_Tying_B001.txt is no table of numbers"),
+        (None, ("--hz", "20"), "--hz 20: the source has 30 Hz; give a whole part of that, such as 15, 10, 7.5, 6"),
+    ],
+)
+def test_what_is_wrong_with_surgeons_files_is_one_line(surgeons, out: Path, change, more, message: str) -> None:
+    folder, _ = surgeons
+    if change:
+        (folder / change[0]).write_text(change[1])
+    ended = call("import", folder, "--out", out, *more)
+    assert (ended.status, ended.err.count("\n"), message in ended.err) == (2, 1, True), ended.err
+    assert not out.exists()
+
+
 # --- whole or not at all, and resumed ---------------------------------------------------------------------------------
 
 

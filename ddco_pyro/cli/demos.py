@@ -26,12 +26,14 @@ class FormatName(StrEnum):
     maniskill = "maniskill"
     act = "act"
     d4rl = "d4rl"
+    jigsaws = "jigsaws"
 
 
 SourcePath = Annotated[
     Path,
     typer.Argument(
-        metavar="FILE", help="An HDF5 file, or the folder of a Minari or LeRobot dataset, or of ACT's episodes."
+        metavar="FILE",
+        help="An HDF5 file, or the folder of a Minari or LeRobot dataset, of ACT's episodes, or JIGSAWS.",
     ),
 ]
 FormatOption = Annotated[
@@ -118,6 +120,7 @@ def import_(
     image_size: Annotated[
         int | None, typer.Option(min=8, max=4096, help="Scale pictures to so many pixels in height and width.")
     ] = None,
+    hz: Annotated[float | None, typer.Option(min=0.01, help="Steps a second: means over the source's frames.")] = None,
     skip_broken: Annotated[
         bool, typer.Option("--skip-broken", help="Leave out demonstrations that cannot be used, and list them.")
     ] = False,
@@ -130,7 +133,7 @@ def import_(
 
     check_outputs([Output("--out", out, "file")], [source])
     size = (image_size, image_size) if image_size else None
-    choice = Choice(tuple(observations), mask, videos, size, skip_broken, allow_external)
+    choice = Choice(tuple(observations), mask, videos, size, hz, skip_broken, allow_external)
     with console.Progress("importing") as progress:
         imported = import_demonstrations(
             source, out, form.value if form else None, choice, lambda *done: progress(DemonstrationsDone(*done))

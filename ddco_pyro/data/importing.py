@@ -31,6 +31,8 @@ class Choice:
     :param mask: import only the demonstrations of this mask (robomimic: filter key).
     :param videos: whether videos are decoded, too.
     :param image_size: height and width to which pictures are scaled; None for no scaling.
+    :param hz: the rate to import at, Hz; None for that of the source. Numbers are means over the source's frames; a
+        picture, a label and a discrete action are those of one frame.
     :param skip_broken: whether unusable demonstrations are left out rather than refused.
     :param allow_external: whether parts of an HDF5 file may be in other files.
     """
@@ -39,6 +41,7 @@ class Choice:
     mask: str | None = None
     videos: bool = False
     image_size: tuple[int, int] | None = None
+    hz: float | None = None
     skip_broken: bool = False
     allow_external: bool = False
 
@@ -78,7 +81,7 @@ def import_demonstrations(
             if not parts.done:
                 raise DemonstrationsError(f"{source}: none of its demonstrations can be used")
             done = tuple(parts.done)
-            parts.finish(_attributes(opened_source, source, identity), _masks(opened_source, done))
+            parts.finish(_attributes(opened_source, source, identity, choice), _masks(opened_source, done))
     return Imported(out, done, left_out)
 
 
@@ -91,7 +94,7 @@ def _keep(source: Source, choice: Choice, parts: Parts, on_recording: OnRecordin
         _check_headers(source, names, choice)
     for number, name in enumerate(names):
         try:
-            recording = _chosen(source.recording(name), choice)
+            recording = _chosen(source, name, choice)
             check(recording)
             check_alike(recording, first or recording)
             if name not in parts.done:
@@ -112,7 +115,7 @@ def _check_headers(source: Source, names: Sequence[str], choice: Choice) -> None
     first: Recording | None = None
     try:
         for name in names:
-            recording = _chosen(source.recording(name), choice)
+            recording = _chosen(source, name, choice)
             check(recording)
             check_alike(recording, first or recording)
             first = first or recording
@@ -159,14 +162,16 @@ def _masks(source: Source, names: Sequence[str]) -> dict[str, tuple[str, ...]]:
     return {mask: members for mask, members in imported.items() if members}
 
 
-def _attributes(source: Source, path: str | Path, identity: str) -> dict[str, Attribute]:
-    frequency = {FREQUENCY: source.frequency} if source.frequency else {}
+def _attributes(source: Source, path: str | Path, identity: str, choice: Choice) -> dict[str, Attribute]:
+    rate = choice.hz or source.frequency
+    frequency = {FREQUENCY: rate} if rate else {}
     facts = {"source": Path(path).name, "source_format": source.format, IDENTITY: _digest(identity)}
     return {**source.attributes, **frequency, **facts}
 
 
-def _chosen(recording: Recording, choice: Choice) -> Recording:
-    """The recording with the chosen observations, scaled."""
+def _chosen(source: Source, name: str, choice: Choice) -> Recording:
+    """A recording with the chosen observations, scaled, at the chosen rate."""
+    recording = source.recording(name)
     known = recording.observations
     for key in choice.observations:
         if key not in known:
@@ -179,7 +184,53 @@ def _chosen(recording: Recording, choice: Choice) -> Recording:
     if not wanted:
         raise DemonstrationsError(f"{recording.name}: has no observation that can be used")
     observations = {key: _scaled(known[key], choice.image_size) for key in wanted}
-    return replace(recording, observations=observations)
+    recording = replace(recording, observations=observations)
+    return recording if choice.hz is None else _slower(recording, _frames(source.frequency, choice.hz))
+
+
+def _frames(frequency: float | None, hz: float) -> int:
+    """The frames of a step.
+
+    :raises BadInput: they are no whole number.
+    """
+    if frequency is None:
+        raise BadInput(f"--hz {hz:g}: the source does not say its own rate; leave --hz out")
+    frames = round(frequency / hz)
+    if not frames or abs(frames * hz / frequency - 1) > NEARLY:
+        rates = ", ".join(f"{frequency / number:g}" for number in range(2, 6))
+        raise BadInput(f"--hz {hz:g}: the source has {frequency:g} Hz; give a whole part of that, such as {rates}")
+    return frames
+
+
+NEARLY = 0.01
+"""How far the rate may be from a whole part of the source's."""
+
+
+def _slower(recording: Recording, frames: int) -> Recording:
+    def slower(column: Column) -> Column:
+        def reduced(rows: np.ndarray) -> np.ndarray:
+            steps = rows.reshape(-1, frames, *rows.shape[1:])
+            if rows.dtype.kind == "f":
+                return steps.mean(1, dtype=np.float64).astype(rows.dtype)
+            middle: np.ndarray = steps[:, frames // 2]
+            return middle
+
+        def blocks() -> Iterator[np.ndarray]:
+            left = np.empty((0, *column.shape[1:]), column.dtype)
+            for block in column.blocks():
+                rows = np.concatenate([left, block])
+                whole = len(rows) - len(rows) % frames
+                left = rows[whole:]
+                if whole:
+                    yield reduced(rows[:whole])
+
+        return Column((column.shape[0] // frames, *column.shape[1:]), column.dtype, blocks, column.video)
+
+    def each(columns: Mapping[str, Column]) -> dict[str, Column]:
+        return {key: slower(column) for key, column in columns.items()}
+
+    actions, observations = slower(recording.actions), each(recording.observations)
+    return replace(recording, actions=actions, observations=observations, labels=each(recording.labels))
 
 
 def _scaled(column: Column, size: tuple[int, int] | None) -> Column:

@@ -1,7 +1,7 @@
 """Sources of demonstrations: files and folders of several libraries behind one interface.
 
-``robomimic`` HDF5 files (also this project's layout), ``minari`` and ``lerobot`` v3 datasets, and HDF5 files of
-``maniskill``, ``act`` and ``d4rl``.
+``robomimic`` HDF5 files (also this project's layout), ``minari`` and ``lerobot`` v3 datasets, HDF5 files of
+``maniskill``, ``act`` and ``d4rl``, and the text files of ``jigsaws``.
 """
 
 from __future__ import annotations
@@ -76,6 +76,10 @@ def open_source(path: str | Path, form: Format | None = None, external: bool = F
         from ddco_pyro.data.sources.lerobot import open_lerobot
 
         opened = open_lerobot(path)
+    elif form == "jigsaws":
+        from ddco_pyro.data.sources.jigsaws import open_jigsaws
+
+        opened = open_jigsaws(path)
     else:
         from ddco_pyro.data.sources.hdf5_layouts import open_layout
 
@@ -109,6 +113,8 @@ def format_of(path: Path) -> Format:
         return "minari"
     if any(EPISODE.fullmatch(one.name) for one in path.iterdir()):
         return "act"
+    if (path / "kinematics" / "AllGestures").is_dir():
+        return "jigsaws"
     roots = [path, *(one for one in path.iterdir() if one.is_dir())]
     lines = "write its episodes into an HDF5 file as data/demo_0, data/demo_1, ... with the lines in docs/own.md"
     if any((root / name).exists() for root in roots for name in (".zgroup", "zarr.json")):
@@ -117,7 +123,8 @@ def format_of(path: Path) -> Format:
         raise DemonstrationsError(f"{path}: is a TensorFlow dataset (RLDS); {lines}")
     raise DemonstrationsError(
         f"{path}: is a folder of no known format; name an HDF5 file, or the folder of a LeRobot dataset (with "
-        "meta/info.json), a Minari dataset (with data/metadata.json) or ACT's episodes (episode_0.hdf5)"
+        "meta/info.json), a Minari dataset (with data/metadata.json), ACT's episodes (episode_0.hdf5) or a task of "
+        "JIGSAWS (with kinematics/AllGestures)"
     )
 
 

@@ -28,7 +28,7 @@ from ddco_pyro.data.pictures import (
 LABEL_NAMES = "label_names"
 """Attribute of a file of demonstrations: JSON, the names of labels 0, 1, ... for each name of labels."""
 
-Format = Literal["robomimic", "minari", "lerobot", "maniskill", "act", "d4rl"]
+Format = Literal["robomimic", "minari", "lerobot", "maniskill", "act", "d4rl", "jigsaws"]
 
 
 @dataclass(frozen=True)
