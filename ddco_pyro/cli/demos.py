@@ -27,13 +27,14 @@ class FormatName(StrEnum):
     act = "act"
     d4rl = "d4rl"
     jigsaws = "jigsaws"
+    ogbench = "ogbench"
 
 
 SourcePath = Annotated[
     Path,
     typer.Argument(
         metavar="FILE",
-        help="An HDF5 file, or the folder of a Minari or LeRobot dataset, of ACT's episodes, or JIGSAWS.",
+        help="An HDF5 or npz file, or the folder of a Minari or LeRobot dataset, of ACT's episodes, or of JIGSAWS.",
     ),
 ]
 FormatOption = Annotated[
@@ -115,6 +116,12 @@ def import_(
     observations: Annotated[
         list[str], typer.Option("--observation", metavar="KEY", help="Import only this one; repeatable.")
     ] = [],  # noqa: B006 (typer reads the default, which never changes)
+    actions: Annotated[
+        list[str],
+        typer.Option(
+            "--action", metavar="KEY", help="The control, where a dataset has several; repeatable, joined in this order."
+        ),
+    ] = [],  # noqa: B006
     mask: Annotated[str | None, typer.Option(help="Import only the demonstrations of this mask (filter key).")] = None,
     videos: Annotated[bool, typer.Option("--videos", help="Decode the videos of a LeRobot dataset too.")] = False,
     image_size: Annotated[
@@ -133,7 +140,7 @@ def import_(
 
     check_outputs([Output("--out", out, "file")], [source])
     size = (image_size, image_size) if image_size else None
-    choice = Choice(tuple(observations), mask, videos, size, hz, skip_broken, allow_external)
+    choice = Choice(tuple(observations), mask, videos, size, hz, skip_broken, allow_external, tuple(actions))
     with console.Progress("importing") as progress:
         imported = import_demonstrations(
             source, out, form.value if form else None, choice, lambda *done: progress(DemonstrationsDone(*done))

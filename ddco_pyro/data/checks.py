@@ -57,15 +57,16 @@ def rounding(low: np.ndarray, high: np.ndarray, dtype: np.dtype[Any]) -> np.ndar
     return np.where(finite, np.maximum(own, SETTLED * largest), np.nan)
 
 
-def check_values(recording: Recording, remedy: str = "repair it") -> None:
+def check_values(recording: Recording, remedy: str = "repair it", pictures: bool = False) -> None:
     """Refuse a demonstration with a number that is not :func:`usable`; arrays are read block by block.
 
     :param remedy: what the user can do.
-    :raises DemonstrationsError: a number is NaN, infinite or too large.
+    :param pictures: whether pictures are read too, which takes long; their values are usable.
+    :raises DemonstrationsError: a number is NaN, infinite or too large, or an array cannot be read.
     """
     for place, column in recording.columns():
-        if column.dtype.kind != "f":
-            continue  # whole numbers are usable
+        if column.image and not pictures:
+            continue
         before = 0
         for block in column.blocks():
             good = usable(block)
@@ -74,7 +75,7 @@ def check_values(recording: Recording, remedy: str = "repair it") -> None:
                 value = block[step, *index]
                 limit = f", and at most {LARGEST:g} can be used" if np.isfinite(value) else ""
                 raise DemonstrationsError(
-                    f"{recording.name}: {place} is {number(value)} at step {before + step}, index {index}{limit}; "
+                    f"{recording.name}: {column.named or place} is {number(value)} at step {before + step}, index {index}{limit}; "
                     f"{remedy}"
                 )
             before += len(block)
@@ -91,11 +92,14 @@ def check(recording: Recording) -> None:
     name, shape = recording.name, recording.actions.shape
     for place, column in recording.columns():
         if column.dtype.kind not in NUMBERS:
-            raise DemonstrationsError(f"{name}: {place} holds {column.dtype}, it has to hold real numbers")
+            raise DemonstrationsError(
+                f"{name}: {column.named or place} holds {column.dtype}, it has to hold real numbers"
+            )
+    actions = recording.actions.named or "actions"
     if problem := problem_of_controls(shape[1:], recording.actions.dtype):
-        raise DemonstrationsError(f"{name}: actions {problem}")
+        raise DemonstrationsError(f"{name}: {actions} {problem}")
     if not shape[0]:
-        raise DemonstrationsError(f"{name}: actions has no steps; remove this demonstration")
+        raise DemonstrationsError(f"{name}: {actions} has no steps; remove this demonstration")
     for place, column in recording.columns():
         check_steps(name, place, column, shape[0])
 
@@ -146,7 +150,8 @@ def check_alike(recording: Recording, first: Recording) -> None:
     :raises DemonstrationsError: they differ.
     """
     ours, theirs = dict(recording.columns()), dict(first.columns())
-    missing, more = sorted(theirs.keys() - ours.keys()), sorted(ours.keys() - theirs.keys())
+    missing = sorted(theirs[place].named or place for place in theirs.keys() - ours.keys())
+    more = sorted(ours[place].named or place for place in ours.keys() - theirs.keys())
     if missing:
         raise DemonstrationsError(f"{recording.name}: {', '.join(missing)} is missing, which {first.name} has")
     if more:
@@ -154,7 +159,7 @@ def check_alike(recording: Recording, first: Recording) -> None:
             f"{recording.name}: {', '.join(more)} is not in {first.name}; all demonstrations need the same"
         )
     for place, column in ours.items():
-        check_shape(f"{recording.name}: {place}", column, theirs[place].shape[1:], first.name)
+        check_shape(f"{recording.name}: {column.named or place}", column, theirs[place].shape[1:], first.name)
 
 
 def check_shape(where: str, column: Column, expected: tuple[int, ...], first: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -27,7 +28,7 @@ OnRecording = Callable[[int, int], None]
 class Choice:
     """The part of a source that is imported.
 
-    :param observations: keys; if empty, all observations that hold numbers, without videos.
+    :param observations: keys, or names in the source; if empty, the observations that hold numbers, without videos.
     :param mask: import only the demonstrations of this mask (robomimic: filter key).
     :param videos: whether videos are decoded, too.
     :param image_size: height and width to which pictures are scaled; None for no scaling.
@@ -35,6 +36,7 @@ class Choice:
         picture, a label and a discrete action are those of one frame.
     :param skip_broken: whether unusable demonstrations are left out rather than refused.
     :param allow_external: whether parts of an HDF5 file may be in other files.
+    :param actions: names in the source of the arrays that are the control together; if empty, the usual ones.
     """
 
     observations: tuple[str, ...] = ()
@@ -44,6 +46,7 @@ class Choice:
     hz: float | None = None
     skip_broken: bool = False
     allow_external: bool = False
+    actions: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -69,7 +72,7 @@ def import_demonstrations(
     :raises DemonstrationsError: the source cannot be read, or a demonstration cannot be used.
     :raises BadInput: ``out`` exists and is not this import, or another process is writing it.
     """
-    with open_source(source, form, choice.allow_external) as opened_source:
+    with open_source(source, form, choice.allow_external, choice.actions) as opened_source:
         identity = _identity(opened_source, choice)
         if out.exists():
             discard(out)
@@ -79,7 +82,8 @@ def import_demonstrations(
                 return _already(out, identity)
             left_out = _keep(opened_source, choice, parts, on_recording)
             if not parts.done:
-                raise DemonstrationsError(f"{source}: none of its demonstrations can be used")
+                why = next(iter(left_out.values()))
+                raise DemonstrationsError(f"{source}: none of its demonstrations can be used: {why}")
             done = tuple(parts.done)
             parts.finish(_attributes(opened_source, source, identity, choice), _masks(opened_source, done))
     return Imported(out, done, left_out)
@@ -98,15 +102,18 @@ def _keep(source: Source, choice: Choice, parts: Parts, on_recording: OnRecordin
             check(recording)
             check_alike(recording, first or recording)
             if name not in parts.done:
-                check_values(recording)
+                check_values(recording, pictures=choice.skip_broken)
                 parts.add(recording)
             first = first or recording
         except DemonstrationsError as error:
             if not choice.skip_broken:
-                raise _refused(error) from None
+                raise _refused(source, names, choice, error) from None
             left_out[name] = str(error)
         on_recording(number + 1, len(names))
-    parts.close()
+    try:
+        parts.close()
+    except DemonstrationsError as error:  # a picture of one that is not written yet
+        raise _refused(source, names, choice, error) from None
     return left_out
 
 
@@ -120,11 +127,20 @@ def _check_headers(source: Source, names: Sequence[str], choice: Choice) -> None
             check_alike(recording, first or recording)
             first = first or recording
     except DemonstrationsError as error:
-        raise _refused(error) from None
+        raise _refused(source, names, choice, error) from None
 
 
-def _refused(error: DemonstrationsError) -> DemonstrationsError:
-    return DemonstrationsError(f"{error}; or leave such ones out with --skip-broken")
+def _refused(
+    source: Source, names: Sequence[str], choice: Choice, error: DemonstrationsError
+) -> DemonstrationsError:
+    """The error, with the advice to leave demonstrations out where one of them can be used."""
+    for name in names:
+        with suppress(DemonstrationsError):
+            recording = _chosen(source.recording(name), choice)
+            check(recording)
+            check_values(recording, pictures=True)
+            return DemonstrationsError(f"{error}; or leave such ones out with --skip-broken")
+    return error
 
 
 def _identity(source: Source, choice: Choice) -> str:
@@ -173,14 +189,18 @@ def _chosen(source: Source, name: str, choice: Choice) -> Recording:
     """A recording with the chosen observations, scaled, at the chosen rate."""
     recording = source.recording(name)
     known = recording.observations
+    names = {column.named or key: key for key, column in known.items()}
+    keys = names | {key: key for key in known}
     for key in choice.observations:
-        if key not in known:
+        if key not in keys:
             raise DemonstrationsError(
-                f"{recording.name}: there is no observation {key!r}{nearest(key, known)}; there is: {', '.join(known)}"
+                f"{recording.name}: there is no observation {key!r}{nearest(key, keys)}; there is: {', '.join(names)}"
             )
-    wanted = choice.observations or tuple(
-        key for key, column in known.items() if column.dtype.kind in NUMBERS and (choice.videos or not column.video)
-    )
+    wanted = [keys[key] for key in choice.observations] or [
+        key
+        for key, column in known.items()
+        if column.dtype.kind in NUMBERS and not column.aside and (choice.videos or not column.video)
+    ]
     if not wanted:
         raise DemonstrationsError(f"{recording.name}: has no observation that can be used")
     observations = {key: _scaled(known[key], choice.image_size) for key in wanted}
@@ -241,4 +261,4 @@ def _scaled(column: Column, size: tuple[int, int] | None) -> Column:
         for block in column.blocks():
             yield resized(block, size)
 
-    return Column((column.shape[0], *size, column.shape[3]), column.dtype, blocks)
+    return Column((column.shape[0], *size, column.shape[3]), column.dtype, blocks, named=column.named)

@@ -1,17 +1,18 @@
 """Sources of demonstrations: files and folders of several libraries behind one interface.
 
 ``robomimic`` HDF5 files (also this project's layout), ``minari`` and ``lerobot`` v3 datasets, HDF5 files of
-``maniskill``, ``act`` and ``d4rl``, and the text files of ``jigsaws``.
+``maniskill``, ``act`` and ``d4rl``, npz files of ``ogbench``, and the text files of ``jigsaws``.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from shlex import quote
 from typing import Protocol
+from zipfile import is_zipfile
 
 import h5py
 
@@ -53,15 +54,20 @@ class Source(Protocol):
 
 
 @contextmanager
-def open_source(path: str | Path, form: Format | None = None, external: bool = False) -> Iterator[Source]:
+def open_source(
+    path: str | Path, form: Format | None = None, external: bool = False, actions: Sequence[str] = ()
+) -> Iterator[Source]:
     """Open a file or folder.
 
     :param form: its format; recognised if None.
     :param external: whether parts of an HDF5 file may be in other files.
+    :param actions: names of the arrays that are the control together, where a LeRobot or Minari dataset has several.
     :raises DemonstrationsError: the source cannot be read, or has another format.
     """
     path = Path(path)
     form = form or format_of(path)
+    if actions and form not in ("lerobot", "minari"):
+        raise DemonstrationsError(f"{path}: is {form}, with one control; --action is for LeRobot and Minari datasets")
     opened: AbstractContextManager[Source]
     # Each reader imports its own library, which need not be installed for other formats.
     if form == "robomimic":
@@ -71,11 +77,15 @@ def open_source(path: str | Path, form: Format | None = None, external: bool = F
     elif form == "minari":
         from ddco_pyro.data.sources.minari import open_minari
 
-        opened = open_minari(path, external)
+        opened = open_minari(path, external, actions)
     elif form == "lerobot":
         from ddco_pyro.data.sources.lerobot import open_lerobot
 
-        opened = open_lerobot(path)
+        opened = open_lerobot(path, actions)
+    elif form == "ogbench":
+        from ddco_pyro.data.sources.ogbench import open_ogbench
+
+        opened = open_ogbench(path)
     elif form == "jigsaws":
         from ddco_pyro.data.sources.jigsaws import open_jigsaws
 
@@ -102,7 +112,7 @@ def format_of(path: Path) -> Format:
     if path.is_file():
         if path.name == "main_data.hdf5" and path.with_name("metadata.json").is_file():
             return "minari"
-        return _format_of_file(path)
+        return "ogbench" if is_zipfile(path) else _format_of_file(path)
     if not path.exists():
         raise DemonstrationsError(f"{path}: there is no such file or folder; check the path")
     if not path.is_dir():

@@ -20,7 +20,7 @@ from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError, dataset_at, data
 from ddco_pyro.data.pictures import block_steps
 from ddco_pyro.data.sources import EPISODE, TRAJECTORY
 from ddco_pyro.data.sources.metadata import inside
-from ddco_pyro.data.sources.recording import Column, Format, Recording, of_array, of_dataset
+from ddco_pyro.data.sources.recording import Column, Format, Recording, joined, of_array, of_dataset
 
 BARE = "state"
 """Key of an observation array without a name."""
@@ -114,7 +114,8 @@ class Act(_Source):
     def _read(self, name: str, group: h5py.Group) -> Recording:
         actions = _column(group, "action", name)
         if "base_action" in group:
-            actions = _beside(actions, _column(group, "base_action", name), name)
+            base = _column(group, "base_action", name)
+            actions = of_array(joined({"action": actions.array(), "base_action": base.array()}, name))
         keys = datasets(member(group, "observations", h5py.Group, f"{name}: "))
         observations = {key: _column(group, f"observations/{key}", name) for key in keys}
         for key, column in observations.items():
@@ -145,13 +146,18 @@ class D4RL(_Source):
                 if len(values) != steps:
                     raise DemonstrationsError(f"{key} has {len(values)} steps, but actions has {steps}")
                 ends |= values.astype(bool)
-        bounds = [0, *(np.flatnonzero(ends[:-1]) + 1).tolist(), steps]
-        self._spans = {f"demo_{number}": slice(*span) for number, span in enumerate(pairwise(bounds)) if steps}
+        self._spans = spans(ends)
         return dict.fromkeys(self._spans, (self.path, "/"))
 
     def _read(self, name: str, group: h5py.Group) -> Recording:
         observations, actions = (_column(group, key, name, self._spans[name]) for key in ("observations", "actions"))
         return Recording(name, {BARE: observations}, actions)
+
+
+def spans(ends: np.ndarray) -> dict[str, slice]:
+    """The steps of each demonstration by name, from the steps [N] that end one; so does the last step."""
+    bounds = [0, *(np.flatnonzero(ends[:-1]) + 1).tolist(), len(ends)]
+    return {f"demo_{number}": slice(*span) for number, span in enumerate(pairwise(bounds)) if len(ends)}
 
 
 def _observed(group: h5py.Group, name: str) -> dict[str, str]:
@@ -182,14 +188,6 @@ def _column(group: h5py.Group, key: str, name: str, part: slice = slice(None)) -
                 yield block[:, None] if bare else block
 
     return Column((max(stop - start, 0), *((1,) if bare else known.shape[1:])), known.dtype, blocks)
-
-
-def _beside(actions: Column, base: Column, name: str) -> Column:
-    """The controls of an arm [T, A] and its base [T, B], joined to [T, A + B]."""
-    steps = actions.shape[0]
-    if len(actions.shape) != 2 or len(base.shape) != 2 or base.shape[0] != steps:
-        raise DemonstrationsError(f"{name}: base_action has shape {base.shape}, and action {actions.shape}")
-    return of_array(np.concatenate([actions.array(), base.array()], 1))
 
 
 def _decoded(column: Column, where: str) -> Column:

@@ -9,9 +9,11 @@ import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import cv2
@@ -19,9 +21,11 @@ import numpy as np
 
 from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError
 from ddco_pyro.data.memory import refuse_too_much
-from ddco_pyro.data.sources.metadata import check_keys, check_links, filled, first_missing, inside
-from ddco_pyro.data.sources.recording import LABEL_NAMES, Column, Format, Recording, damaged, of_array
+from ddco_pyro.data.pictures import channels_last, turned
+from ddco_pyro.data.sources.metadata import check_links, filled, first_missing, inside, stored_keys
+from ddco_pyro.data.sources.recording import LABEL_NAMES, Column, Format, Recording, damaged, joined, of_array
 from ddco_pyro.data.sources.video import video_column
+from ddco_pyro.errors import nearest
 
 try:
     import pyarrow
@@ -37,10 +41,15 @@ _CONVERT = (
     "convert it with LeRobot's own script: python -m lerobot.scripts.convert_dataset_v21_to_v30 (in LeRobot 0.4: "
     "lerobot.datasets.v30.convert_dataset_v21_to_v30)"
 )
-OBSERVATION = "observation."
+OBSERVATION, ACTION = "observation.", "action"
 SUBTASK = "subtask_index"
 ANNOTATIONS = Path("meta") / "lerobot_annotations.json"
 IMAGES_AT_ONCE = 32
+UNEVEN = 0.3
+"""Gaps between times are even if they differ from their median by less than UNEVEN × the median. A missing frame is a
+gap of twice the median, and clocks of robots jitter by less."""
+_NO_CONTROL = {"timestamp", "frame_index", "episode_index", "index", "task_index", "image", "video", "string"}
+"""Names and types of features that are never the control."""
 _LONGEST = 1e9
 """Longest video, seconds."""
 _DAMAGE = (pyarrow.ArrowException, OSError, KeyError, ValueError, TypeError, IndexError)
@@ -50,13 +59,16 @@ class LeRobot:
     """A dataset's folder: ``meta/info.json``, ``meta/episodes``, ``data`` and ``videos``.
 
     ``observation.images.top`` becomes ``obs/images/top``, ``action`` becomes ``actions``, and ``subtask_index`` becomes
-    ``labels/subtask``. Without that column, the subtasks in ``meta/lerobot_annotations.json`` do: they are numbered in
-    the order in which they first occur, and -1 marks steps before the first one.
+    ``labels/subtask``. Beside ``observation.state``, the feature ``observation.state.gripper`` keeps its dots.
+    Without the column of subtasks, the subtasks in ``meta/lerobot_annotations.json`` become labels: they are numbered
+    in the order in which they first occur, and -1 marks steps before the first one.
+
+    :param actions: features that are the control together, in this order; ``action`` if empty.
     """
 
     format: Format = "lerobot"
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, actions: Sequence[str] = ()) -> None:
         self.folder = folder
         check_links(folder)
         self.info: dict[str, Any] = _json(folder / "meta" / "info.json")
@@ -66,7 +78,15 @@ class LeRobot:
                 f"{folder}: is a LeRobot dataset {version}, and {VERSION}x can be read; {_CONVERT}"
             )
         self.features: dict[str, Any] = self.info["features"]
-        check_keys(folder, (_key(key) for key in self.features if key.startswith(OBSERVATION)))
+        observed = [feature for feature in self.features if feature.startswith(OBSERVATION)]
+        bare = [feature.removeprefix(OBSERVATION) for feature in observed]
+        keys = stored_keys(folder, bare, [name.replace(".", "/") for name in bare])
+        self._keys = dict(zip(observed, keys, strict=True))
+        self._actions = tuple(actions) or (ACTION,)
+        self._check_actions()
+        if isinstance(template := self.info.get("video_path"), str):  # before anything is read
+            numbers = dict.fromkeys(("chunk_index", "file_index", "episode_index"), 0)
+            inside(folder, filled(folder, template, {**numbers, "video_key": "video"}))
         self._episodes, self._twice = _episodes(folder)
         if not self._episodes:
             raise DemonstrationsError(f"{folder}: meta/episodes holds no episodes; at least one is needed")
@@ -85,6 +105,19 @@ class LeRobot:
         meta = sorted((folder / "meta").rglob("*.parquet"))
         more = (folder / path for path in (ANNOTATIONS, *self.data_files))
         self.files = (folder / "meta" / "info.json", *meta, *(path for path in more if path.is_file()))
+
+    def _check_actions(self) -> None:
+        """Refuse features that do not exist as the control."""
+        types = {feature: str(about["dtype"]) for feature, about in self.features.items()}
+        there = [feature for feature, dtype in types.items() if not {feature, dtype} & _NO_CONTROL]
+        for feature in self._actions:
+            if feature not in there:
+                close = [name for name in there if name.startswith(ACTION)] or there
+                such = f", such as --action {quote(close[0])}" if close else ""
+                raise DemonstrationsError(
+                    f"{self.folder}: there is no feature {feature!r}{nearest(feature, there)}; there is: "
+                    f"{', '.join(there) or 'none'}; import the control with --action{such}"
+                )
 
     def _annotations(self) -> tuple[dict[int, list[tuple[int, int]]], list[str]]:
         """The subtasks of each annotated episode as (first step, number of its name), and the names."""
@@ -136,6 +169,8 @@ class LeRobot:
         try:
             numbers = {name: int(self._episodes[index][f"{prefix}/{name}"]) for name in ("chunk_index", "file_index")}
             path = filled(self.folder, str(self.info[template]), {**numbers, "episode_index": index, **more})
+        except KeyError as error:
+            raise DemonstrationsError(f"{self.folder}: demo_{index}: its metadata has no {error.args[0]}") from None
         except _DAMAGE as error:
             raise damaged(self.folder, f"demo_{index}: {template}", error) from error
         return inside(self.folder, path)
@@ -168,15 +203,17 @@ class LeRobot:
         try:
             rows = _Rows(path, index, name)
             self._check(rows, index)
-            keys = [key for key in self.features if key.startswith(OBSERVATION)]
-            observations = {_key(key): self._column(rows, key, index) for key in keys}
+            observations = {key: self._column(rows, feature, index) for feature, key in self._keys.items()}
             labels = {"subtask": rows.vectors(SUBTASK, ())} if SUBTASK in rows.present else {}
             if self._subtasks:
                 labels = {"subtask": of_array(self._labels(index, len(rows)))}
-            actions = rows.vectors("action", self.features["action"]["shape"])
+            controls = {key: rows.vectors(key, self.features[key]["shape"]).array() for key in self._actions}
         except _DAMAGE as error:
             raise damaged(self.folder, name, error) from error
-        return Recording(name, observations, actions, labels, self._facts(index))
+        actions = of_array(joined(controls, f"{self.folder}: {name}"))
+        return Recording(
+            name, observations, replace(actions, named=" + ".join(controls)), labels, self._facts(index)
+        )
 
     def _labels(self, index: int, steps: int) -> np.ndarray:
         """The number of the annotated subtask at each step [T]; -1 where there is none."""
@@ -195,13 +232,11 @@ class LeRobot:
                 raise DemonstrationsError(
                     f"{rows.name}: {what} in meta/episodes is {length}, and {rows.path} has {there} rows of it"
                 )
-        steps = np.arange(there)
-        if "frame_index" in rows.present:
-            frames = rows.vectors("frame_index", ()).array()
-            _refuse_where(frames != steps, rows, "frame_index", frames, steps)
-        if "timestamp" in rows.present and self.frequency:
-            times, expected = rows.vectors("timestamp", ()).array(), steps / self.frequency
-            _refuse_where(~(np.abs(times - expected) < 0.5 / self.frequency), rows, "timestamp", times, expected)
+        for column, frequency in (("frame_index", 1.0), ("timestamp", self.frequency)):
+            if column in rows.present and frequency:
+                times = rows.vectors(column, ()).array()
+                if problem := _problem_of_times(times.astype(float), frequency, column):
+                    raise DemonstrationsError(f"{rows.path}: {rows.name}: {problem}")
 
     def _facts(self, index: int) -> dict[str, Attribute]:
         tasks = self._episodes[index].get("tasks")
@@ -213,12 +248,24 @@ class LeRobot:
         if kind == "image":
             return rows.images(key, self._size(key))
         if kind == "video":
-            path = self._path("video_path", index, f"videos/{key}", video_key=key)
-            start = float(self._episodes[index][f"videos/{key}/from_timestamp"])
-            if not 0 <= start < _LONGEST:
-                raise ValueError(f"{key} begins at second {start:g} of its video")
-            return video_column(path, rows.name, start, len(rows), self._size(key), self.frequency or 1.0)
+            return self._video(rows, key, index)
         return rows.vectors(key, self.features[key]["shape"])
+
+    def _video(self, rows: _Rows, key: str, index: int) -> Column:
+        """A column of a video, which is looked for when it is read."""
+        size = self._size(key)
+
+        def blocks() -> Iterator[np.ndarray]:
+            try:
+                path = self._path("video_path", index, f"videos/{key}", video_key=key)
+                start = float(self._episodes[index][f"videos/{key}/from_timestamp"])
+            except _DAMAGE as error:
+                raise damaged(self.folder, f"{rows.name}: {key}", error) from error
+            if not 0 <= start < _LONGEST:
+                raise DemonstrationsError(f"{rows.name}: {key} begins at second {start:g} of its video")
+            yield from video_column(path, rows.name, start, len(rows), size, self.frequency or 1.0).blocks()
+
+        return Column((len(rows), *size, 3), np.dtype(np.uint8), blocks, video=True, named=key)
 
     def _size(self, key: str) -> tuple[int, int]:
         """Height and width of an image, whose channels may come first."""
@@ -228,17 +275,22 @@ class LeRobot:
         return int(height), int(width)
 
 
-def _refuse_where(wrong: np.ndarray, rows: _Rows, what: str, values: np.ndarray, expected: np.ndarray) -> None:
-    if wrong.any():
-        at = int(wrong.argmax())
-        raise DemonstrationsError(
-            f"{rows.name}: {what} is {values[at]:g} in row {at}, not {expected[at]:g}: frames are missing or out of "
-            f"order in {rows.path}"
-        )
-
-
-def _key(name: str) -> str:
-    return name.removeprefix(OBSERVATION).replace(".", "/")
+def _problem_of_times(times: np.ndarray, frequency: float, column: str) -> str:
+    """The first problem with the times [T] of frames, in words; empty if frame t is at time t / frequency."""
+    expected = np.arange(len(times)) / frequency
+    wrong = ~(np.abs(times - expected) < 0.5 / frequency)
+    if not wrong.any():
+        return ""
+    gaps = np.diff(times)
+    typical = float(np.median(gaps)) if len(gaps) else 1 / frequency
+    if typical > 0 and (np.abs(gaps - typical) < UNEVEN * typical).all():
+        mean = float(gaps.mean()) if len(gaps) else typical
+        if abs(mean * frequency - 1) * len(times) < 0.5:
+            return f"{column} starts at {times[0]:.6g}, not at 0; subtract that from each"
+        if column == "timestamp":
+            return f"{column} runs at {1 / mean:.4g} Hz, and fps in meta/info.json is {frequency:g}; correct one of them"
+    at = int(wrong.argmax())
+    return f"{column} is {times[at]:g} in row {at}, not {expected[at]:g}: frames are missing or out of order"
 
 
 class _Rows:
@@ -247,7 +299,8 @@ class _Rows:
     def __init__(self, path: Path, episode: int, name: str) -> None:
         self.path, self.name = path, name
         file, spans = _open(path, path.stat().st_mtime_ns)
-        self.present = set(file.schema_arrow.names)
+        self.schema = file.schema_arrow
+        self.present = set(self.schema.names)
         there = spans.get(episode, [])
         if len(there) != 1:
             what = "are not together" if there else "are missing"
@@ -260,9 +313,45 @@ class _Rows:
     def vectors(self, key: str, shape: Sequence[int] = (1,)) -> Column:
         """A column of numbers or lists of numbers; ``shape`` is the shape of a step."""
         size = math.prod(shape)
-        refuse_too_much(8 * size * len(self), f"{self.name}: {key}", "leave it out with --observation")
-        parts = [_flat(batch.column(0), size).reshape(len(batch), *shape) for batch in self._batches(key, 4096)]
-        return of_array(np.concatenate(parts))
+
+        def blocks() -> Iterator[np.ndarray]:
+            at = 0
+            try:
+                for batch in self._batches(key, 4096):
+                    yield turned(self._numbers(batch.column(0), size, key, at).reshape(len(batch), *shape))
+                    at += len(batch)
+            except _DAMAGE as error:
+                raise damaged(self.path, f"{self.name}: {key}", error) from error
+
+        dtype = self._dtype(key)
+        return Column(channels_last((len(self), *shape), dtype), dtype, blocks, named=key)
+
+    def _dtype(self, key: str) -> np.dtype:
+        """The type of the numbers in a column; of numbers where the column is missing, and its reading reports that."""
+        if key not in self.present:
+            return np.dtype(np.float32)
+        kind = self.schema.field(key).type
+        while pyarrow.types.is_nested(kind) and hasattr(kind, "value_type"):
+            kind = kind.value_type
+        return np.dtype(object) if pyarrow.types.is_nested(kind) else np.dtype(kind.to_pandas_dtype())
+
+    def _numbers(self, values: Any, size: int, key: str, first: int) -> np.ndarray:
+        """The numbers of a column with ``size`` numbers in each row, flat; ``first`` is the number of the first row.
+
+        :raises DemonstrationsError: a row has more or fewer numbers, or is null.
+        """
+        row, rows = np.arange(len(values)), len(values)
+        while pyarrow.types.is_nested(values.type):
+            row = np.repeat(row, compute.list_value_length(values).fill_null(0).to_numpy())
+            values = values.flatten()
+        counts = np.bincount(row[values.is_valid().to_numpy(zero_copy_only=False)], minlength=rows)
+        if (counts != size).any():
+            at = int((counts != size).argmax())
+            has = f"has {counts[at]} numbers in row {first + at}, and meta/info.json says {size}; correct one of them"
+            raise DemonstrationsError(
+                f"{self.path}: {self.name}: {key} {has if counts[at] else f'is null in row {first + at}; repair it'}"
+            )
+        return values.to_numpy(zero_copy_only=False)
 
     def images(self, key: str, size: tuple[int, int]) -> Column:
         """A column of encoded pictures, uint8 [T, H, W, 3]."""
@@ -274,7 +363,7 @@ class _Rows:
             except _DAMAGE as error:
                 raise damaged(self.path, f"{self.name}: {key}", error) from error
 
-        return Column((len(self), *size, 3), np.dtype(np.uint8), blocks)
+        return Column((len(self), *size, 3), np.dtype(np.uint8), blocks, named=key)
 
     def _picture(self, encoded: bytes | None, size: tuple[int, int]) -> np.ndarray:
         if encoded is None:
@@ -286,6 +375,8 @@ class _Rows:
 
     def _batches(self, key: str, rows: int) -> Iterator[Any]:
         """The episode's part of a column, from the row groups that hold the episode."""
+        if key not in self.present:
+            raise DemonstrationsError(f"{self.path}: {self.name}: has no column {key}, which meta/info.json names")
         file, _ = _open(self.path, self.path.stat().st_mtime_ns)
         ends = np.cumsum([file.metadata.row_group(group).num_rows for group in range(file.metadata.num_row_groups)])
         first, last = np.searchsorted(ends, [self.start, self.stop - 1], side="right")
@@ -295,22 +386,6 @@ class _Rows:
             at += len(batch)
             if low < high:
                 yield batch.slice(low, high - low)
-
-
-def _flat(values: Any, size: int) -> np.ndarray:
-    """The numbers of a column with ``size`` numbers in each row.
-
-    :raises ValueError: a row has more or fewer numbers.
-    """
-    rows = len(values)
-    while pyarrow.types.is_nested(values.type):
-        lengths = compute.list_value_length(values)
-        if lengths.null_count or len(lengths.unique()) > 1:
-            raise ValueError("its rows differ in length, or are missing")
-        values = values.flatten()
-    if len(values) != rows * size:
-        raise ValueError(f"its rows have {len(values) // max(rows, 1)} numbers, and meta/info.json says {size}")
-    return values.to_numpy(zero_copy_only=False)
 
 
 @lru_cache(maxsize=2)
@@ -367,12 +442,13 @@ def _json(path: Path) -> dict[str, Any]:
 
 
 @contextmanager
-def open_lerobot(path: Path) -> Iterator[LeRobot]:
+def open_lerobot(path: Path, actions: Sequence[str] = ()) -> Iterator[LeRobot]:
     """Open a dataset.
 
+    :param actions: features that are the control together; ``action`` if empty.
     :raises DemonstrationsError: the dataset has another version, or is damaged.
     """
     try:
-        yield LeRobot(path)
+        yield LeRobot(path, actions)
     finally:
         _open.cache_clear()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
 from ddco_pyro.data.hdf5 import DemonstrationsError
@@ -92,25 +92,36 @@ def _storable(key: str) -> bool:
     return length <= 1000 and "\0" not in key and all(part not in ("", ".") for part in key.split("/"))
 
 
-def check_keys(folder: Path, keys: Iterable[str]) -> None:
-    """Refuse keys that HDF5 cannot store together.
+def stored_keys(folder: Path, names: Sequence[str], preferred: Sequence[str]) -> list[str]:
+    """Keys under which HDF5 can store observations together, whatever their order.
 
-    :raises DemonstrationsError: a key is not a valid path, occurs twice, or is below another key.
+    A name gets its preferred key, unless another name has that key, or has one above or below. Then the name itself is
+    the key, or the name with underscores in place of slashes.
+
+    :param preferred: of each name.
+    :raises DemonstrationsError: a name cannot be stored, or occurs too often.
     """
-    known: set[str] = set()
-    for key in keys:
-        if not _storable(key):
+    keys, groups = dict[str, int](), set[str]()
+    # A key is above keys with more parts, so that keys with fewer parts go first.
+    order = sorted(range(len(names)), key=lambda i: (preferred[i].count("/"), preferred[i] != names[i], names[i]))
+    for index in order:
+        storable = [key for key in (preferred[index], names[index], names[index].replace("/", "_")) if _storable(key)]
+        if not storable:
             raise DemonstrationsError(
-                f"{folder}: an observation is called {key[:100]!r}, which cannot be stored; rename it"
+                f"{folder}: an observation is called {names[index][:100]!r}, which cannot be stored; rename it"
             )
-        if key in known:
-            raise DemonstrationsError(f"{folder}: two observations are called {key!r}; rename one")
-        known.add(key)
-    for key in known:
-        parts = key.split("/")
-        for above in ("/".join(parts[:length]) for length in range(1, len(parts))):
-            if above in known:
-                raise DemonstrationsError(f"{folder}: observations are called {above!r} and {key!r}; rename one")
+        free = (key for key in storable if not (key in keys or key in groups) and not _above(key) & keys.keys())
+        if (key := next(free, None)) is None:
+            raise DemonstrationsError(f"{folder}: two observations are called {names[index]!r}; rename one")
+        keys[key] = index
+        groups |= _above(key)
+    return sorted(keys, key=keys.__getitem__)
+
+
+def _above(key: str) -> set[str]:
+    """The groups of HDF5 in which a key lies."""
+    parts = key.split("/")
+    return {"/".join(parts[:length]) for length in range(1, len(parts))}
 
 
 def first_missing(folder: Path, total: object, there: Collection[int], named: str) -> dict[int, str]:

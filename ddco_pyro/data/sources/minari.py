@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -11,8 +11,9 @@ import h5py
 import numpy as np
 
 from ddco_pyro.data.hdf5 import DAMAGE, Attribute, DemonstrationsError, dataset_at, datasets, member, opened
-from ddco_pyro.data.sources.metadata import check_keys, check_links, first_missing
-from ddco_pyro.data.sources.recording import Column, Format, Recording, damaged, of_array
+from ddco_pyro.data.sources.metadata import check_links, first_missing, stored_keys
+from ddco_pyro.data.sources.recording import Format, Recording, damaged, joined, of_array
+from ddco_pyro.errors import nearest
 
 BARE = "observation"
 """Key of an observation array without a name."""
@@ -21,15 +22,18 @@ BARE = "observation"
 class Minari:
     """Episodes of a dataset's folder. Nested observations ``{"arm": {"joints": ...}}`` become ``obs/arm/joints``.
 
-    An episode of T steps has T + 1 observations; the observation after the last action is left out.
+    Nested actions are joined, in the order of the action space. An episode of T steps has T + 1 observations; the
+    observation after the last action is left out.
+
+    :param actions: names of nested actions that are the control together, such as ``arm/joints``; all if empty.
     """
 
     format: Format = "minari"
     frequency: float | None = None
     masks: Mapping[str, tuple[str, ...]] = {}
 
-    def __init__(self, folder: Path, storage: Any, external: bool) -> None:
-        self.folder, self._storage, self._external = folder, storage, external
+    def __init__(self, folder: Path, storage: Any, external: bool, actions: Sequence[str]) -> None:
+        self.folder, self._storage, self._external, self._actions = folder, storage, external, actions
         stored = _stored(folder)
         self._missing = first_missing(folder, storage.total_episodes, stored, "the dataset")
         self.names = tuple(f"demo_{index}" for index in sorted({*stored, *self._missing}))
@@ -41,8 +45,7 @@ class Minari:
     def recording(self, name: str) -> Recording:
         """One episode, in memory.
 
-        :raises DemonstrationsError: the episode is missing, damaged or in another file, or its actions are not one
-            array of numbers.
+        :raises DemonstrationsError: the episode is missing, damaged or in another file, or its actions are no numbers.
         """
         index = int(name.removeprefix("demo_"))
         if index in self._missing:
@@ -53,24 +56,30 @@ class Minari:
             (facts,) = self._storage.get_episode_metadata([index])
         except (*DAMAGE, AssertionError) as error:
             raise damaged(self.folder, name, error) from error
-        actions = episode["actions"]
-        if not isinstance(actions, np.ndarray) or actions.dtype.kind not in "fiu":
-            what = actions.dtype if isinstance(actions, np.ndarray) else "several arrays"
-            raise DemonstrationsError(
-                f"{self.folder}: {name}: actions are {what}, they have to be one array of numbers"
-            )
+        actions = self._control(episode["actions"], f"{self.folder}: {name}")
         steps, total = len(actions), facts.get("total_steps")
         if total is not None and total != steps:
             raise DemonstrationsError(f"{self.folder}: {name}: total_steps is {total}, and there are {steps} actions")
         leaves = list(_leaves(episode["observations"], ""))
-        check_keys(self.folder, (key for key, _ in leaves))
+        names = [key for key, _ in leaves]
         # an observation with another number of steps stays, and is refused later
-        observations = {key: of_array(array[:-1] if len(array) == steps + 1 else array) for key, array in leaves}
+        arrays = [of_array(array[:-1] if len(array) == steps + 1 else array) for _, array in leaves]
+        observations = dict(zip(stored_keys(self.folder, names, names), arrays, strict=True))
         seed = facts.get("seed")
         known: dict[str, Attribute] = {"episode_index": index}
         if seed is not None:
             known["seed"] = int(seed)
-        return Recording(name, observations, _rows(actions), {}, known)
+        return Recording(name, observations, of_array(actions), {}, known)
+
+    def _control(self, actions: Any, where: str) -> np.ndarray:
+        """The chosen actions [T, A] of an episode."""
+        parts = dict(_leaves(actions, "", "actions"))
+        for key in self._actions:
+            if key not in parts:
+                raise DemonstrationsError(
+                    f"{where}: there is no action {key!r}{nearest(key, parts)}; there is: {', '.join(parts)}"
+                )
+        return joined({key: parts[key] for key in self._actions or parts}, where)
 
     def _check_stored(self, index: int) -> None:
         """Refuse an episode in HDF5 whose arrays are not stored."""
@@ -83,12 +92,11 @@ class Minari:
                         dataset_at(episode, key, f"episode_{index}/", self._external)
 
 
-def _rows(actions: np.ndarray) -> Column:
-    return of_array(actions.reshape(len(actions), -1))
+def _leaves(observations: Any, key: str, bare: str = BARE) -> Iterator[tuple[str, np.ndarray]]:
+    """Path and array of each nested observation; text is left out.
 
-
-def _leaves(observations: Any, key: str) -> Iterator[tuple[str, np.ndarray]]:
-    """Path and array of each nested observation; text is left out."""
+    :param bare: the path of an array that is not nested.
+    """
     if isinstance(observations, dict):
         for name, below in observations.items():
             yield from _leaves(below, f"{key}/{name}" if key else str(name))
@@ -96,7 +104,7 @@ def _leaves(observations: Any, key: str) -> Iterator[tuple[str, np.ndarray]]:
         for number, below in enumerate(observations):
             yield from _leaves(below, f"{key}/{number}" if key else str(number))
     elif isinstance(observations, np.ndarray):
-        yield key or BARE, observations if observations.ndim > 1 else observations[:, None]
+        yield key or bare, observations if observations.ndim > 1 else observations[:, None]
 
 
 def _stored(folder: Path) -> set[int]:
@@ -111,10 +119,11 @@ def _stored(folder: Path) -> set[int]:
 
 
 @contextmanager
-def open_minari(path: Path, external: bool = False) -> Iterator[Minari]:
+def open_minari(path: Path, external: bool = False, actions: Sequence[str] = ()) -> Iterator[Minari]:
     """Open a dataset's folder, its folder ``data``, or the file ``main_data.hdf5``.
 
     :param external: whether parts of the HDF5 file may be in other files.
+    :param actions: names of nested actions that are the control together; all if empty.
     :raises DemonstrationsError: Minari is not installed, or cannot read the dataset.
     """
     try:
@@ -132,4 +141,4 @@ def open_minari(path: Path, external: bool = False) -> Iterator[Minari]:
         storage = MinariStorage.read(folder)
     except (*DAMAGE, AssertionError, ImportError, AttributeError, RecursionError) as error:
         raise damaged(folder, "", error) from error
-    yield Minari(folder, storage, external)
+    yield Minari(folder, storage, external, actions)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -28,7 +28,7 @@ from ddco_pyro.data.pictures import (
 LABEL_NAMES = "label_names"
 """Attribute of a file of demonstrations: JSON, the names of labels 0, 1, ... for each name of labels."""
 
-Format = Literal["robomimic", "minari", "lerobot", "maniskill", "act", "d4rl", "jigsaws"]
+Format = Literal["robomimic", "minari", "lerobot", "maniskill", "act", "d4rl", "ogbench", "jigsaws"]
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,8 @@ class Column:
     :param blocks: starts a new pass over the array at each call; the blocks have T steps in all.
     :param video: whether reading decodes a video.
     :param kept: the array as lazy pictures in an HDF5 file; None for other arrays.
+    :param named: the name of the array in its source; empty where that is its place in a :class:`Recording`.
+    :param aside: whether an import leaves the array out unless it is asked for.
     """
 
     shape: tuple[int, ...]
@@ -45,6 +47,8 @@ class Column:
     blocks: Callable[[], Iterator[np.ndarray]]
     video: bool = False
     kept: Pictures | None = None
+    named: str = ""
+    aside: bool = False
 
     @property
     def image(self) -> bool:
@@ -56,7 +60,11 @@ class Column:
         return self.array() if self.kept is None else self.kept
 
     def array(self) -> np.ndarray:
-        """The array, in memory."""
+        """The array, in memory.
+
+        :raises DemonstrationsError: it cannot be read, or takes more memory than is allowed.
+        """
+        refuse_too_much(self.dtype.itemsize * math.prod(self.shape), self.named or "an array", "divide the episode")
         whole, at = np.zeros(self.shape, self.dtype), 0
         for block in self.blocks():
             whole[at : at + len(block)] = block
@@ -104,16 +112,31 @@ def of_array(values: ArrayLike | Pictures) -> Column:
     return Column(array.shape, array.dtype, lambda: iter([array]))
 
 
+def joined(parts: Mapping[str, np.ndarray], where: str) -> np.ndarray:
+    """Arrays [T, ...] by name as one array [T, D], in this order.
+
+    :param where: the demonstration, for messages.
+    :raises DemonstrationsError: an array holds no numbers, or has another number of steps than the first.
+    """
+    first, steps = next((name, len(array)) for name, array in parts.items())
+    for name, array in parts.items():
+        if array.dtype.kind not in "fiub":
+            raise DemonstrationsError(f"{where}: {name} holds {array.dtype}, controls have to be numbers")
+        if len(array) != steps:
+            raise DemonstrationsError(f"{where}: {name} has {len(array)} steps, but {first} has {steps}")
+    return np.concatenate([array.reshape(steps, math.prod(array.shape[1:])) for array in parts.values()], axis=1)
+
+
 def _discrete(actions: Column) -> Column:
     if len(actions.shape) != 1 or actions.dtype.kind not in "iu":
         return actions
-    return Column((*actions.shape, 1), actions.dtype, lambda: (block[:, None] for block in actions.blocks()))
+    return replace(actions, shape=(*actions.shape, 1), blocks=lambda: (block[:, None] for block in actions.blocks()))
 
 
 def _flat(labels: Column) -> Column:
     if labels.shape[1:] != (1,):
         return labels
-    return Column(labels.shape[:1], labels.dtype, lambda: (block[:, 0] for block in labels.blocks()))
+    return replace(labels, shape=labels.shape[:1], blocks=lambda: (block[:, 0] for block in labels.blocks()))
 
 
 def of_dataset(dataset: h5py.Dataset, where: str) -> Column:

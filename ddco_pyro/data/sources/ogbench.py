@@ -1,0 +1,114 @@
+"""Npz files of OGBench: concatenated demonstrations."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+
+from ddco_pyro.data.checks import NUMBERS
+from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError
+from ddco_pyro.data.memory import refuse_too_much
+from ddco_pyro.data.pictures import channels_last, turned
+from ddco_pyro.data.sources.hdf5_layouts import BARE, spans
+from ddco_pyro.data.sources.recording import Column, Format, Recording, damaged
+
+OBSERVATIONS, ACTIONS, TERMINALS, TIMEOUTS = "observations", "actions", "terminals", "timeouts"
+_DAMAGE = (OSError, ValueError, KeyError, EOFError, NotImplementedError, RuntimeError, BadZipFile)
+
+
+class OGBench:
+    """Arrays ``observations`` [N, ...], ``actions`` [N, A] and ``terminals`` [N], which is 1 in last steps.
+
+    ``observations`` becomes ``obs/state``. Any other array of N steps, such as ``qpos``, is imported if it is asked
+    for. Arrays are read whole, and kept.
+    """
+
+    format: Format = "ogbench"
+    frequency: float | None = None
+    masks: Mapping[str, tuple[str, ...]] = {}
+    attributes: Mapping[str, Attribute] = {}
+
+    def __init__(self, path: Path, file: Any) -> None:
+        self.path, self.files, self._file = path, (path,), file
+        self._array = cache(self._read)
+        self._known = {key: _header(file, key) for key in file.files}
+        if missing := {OBSERVATIONS: 0, ACTIONS: 0, TERMINALS: 0}.keys() - self._known.keys():
+            raise DemonstrationsError(
+                f"{path}: is an npz file without {', '.join(sorted(missing))}, which OGBench's files have; there is: "
+                f"{', '.join(self._known) or 'nothing'}; write its episodes into HDF5 with the lines in docs/own.md"
+            )
+        steps = self._known[ACTIONS][0][:1]
+        ends = [key for key in (TERMINALS, TIMEOUTS) if key in self._known]
+        for key in (OBSERVATIONS, *ends):
+            if self._known[key][0][:1] != steps:
+                had, needed = (list(self._known[name][0]) for name in (key, ACTIONS))
+                raise DemonstrationsError(f"{path}: {key} has shape {had}, and actions {needed}: the steps differ")
+        self._spans = spans(np.any([self._array(key).reshape(*steps, -1).any(1) for key in ends], axis=0))
+        self.names = tuple(self._spans)
+        self._observed = [
+            key
+            for key, (shape, dtype) in self._known.items()
+            if shape[:1] == steps and dtype.kind in NUMBERS and key not in (ACTIONS, *ends)
+        ]
+        if not self.names:
+            raise DemonstrationsError(f"{path}: holds no demonstrations; at least one is needed")
+
+    def _read(self, key: str) -> np.ndarray:
+        shape, dtype = self._known[key]
+        refuse_too_much(math.prod(shape) * dtype.itemsize, f"{self.path}: {key}", "divide the file")
+        try:
+            return np.asarray(self._file[key])
+        except _DAMAGE as error:
+            raise damaged(self.path, key, error) from error
+
+    def recording(self, name: str) -> Recording:
+        """One demonstration; reading its arrays raises :class:`DemonstrationsError` if they are damaged."""
+        state = OBSERVATIONS if BARE in self._observed else BARE
+        observations = {state if key == OBSERVATIONS else key: self._column(key, name) for key in self._observed}
+        return Recording(name, observations, self._column(ACTIONS, name))
+
+    def _column(self, key: str, name: str) -> Column:
+        """A part of an array; one number per step becomes a vector."""
+        shape, dtype = self._known[key]
+        span = self._spans[name]
+        shape = (span.stop - span.start, *(shape[1:] or (1,)))
+
+        def blocks() -> Iterator[np.ndarray]:
+            yield turned(self._array(key)[span].reshape(shape))
+
+        aside = key not in (OBSERVATIONS, ACTIONS)
+        return Column(channels_last(shape, dtype), dtype, blocks, named=key, aside=aside)
+
+
+def _header(file: Any, key: str) -> tuple[tuple[int, ...], np.dtype]:
+    """The shape and the type of an array, which is not read."""
+    with file.zip.open(f"{key}.npy") as stream:
+        one = np.lib.format.read_magic(stream) == (1, 0)
+        read = np.lib.format.read_array_header_1_0 if one else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read(stream)
+    return shape, dtype
+
+
+@contextmanager
+def open_ogbench(path: Path) -> Iterator[OGBench]:
+    """Open a file.
+
+    :raises DemonstrationsError: the file cannot be read, has other arrays, or holds no demonstrations.
+    """
+    try:
+        file = np.load(path, allow_pickle=False)
+    except _DAMAGE as error:
+        raise damaged(path, "", error) from error
+    with file:
+        try:
+            source = OGBench(path, file)
+        except _DAMAGE as error:
+            raise damaged(path, "", error) from error
+        yield source
