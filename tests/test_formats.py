@@ -45,7 +45,7 @@ OTHER = [*ORDERED, [(2, 3), (1, 3), (2, 2), (1, 2)]]
 class Planted:
     """Demonstrations in a file, with known segments."""
 
-    def __init__(self, folder, plan, pictures=False, frequency=20.0):
+    def __init__(self, folder, plan, pictures=False, frequency=20.0, discrete=False):
         self.folder, self.file = folder, folder / "demos.hdf5"
         self.options = [np.concatenate([np.full(steps, option) for option, steps in each]) for each in plan]
         rng = np.random.default_rng(0)
@@ -54,7 +54,8 @@ class Planted:
             seen = {"arm/joints": rng.normal(size=(len(options), 3)), "jaw": rng.normal(size=(len(options), 1))}
             if pictures:
                 seen["camera"] = rng.integers(0, 256, (len(options), 8, 10, 3), np.uint8)
-            demos.append(Demonstration(f"demo_{number}", seen, rng.normal(size=(len(options), 2))))
+            actions = rng.integers(0, 4, len(options)) if discrete else rng.normal(size=(len(options), 2))
+            demos.append(Demonstration(f"demo_{number}", seen, actions))
         self.demos = Demonstrations(tuple(demos), attributes={"control_frequency": frequency, "task": "plant"})
         self.demos.write(self.file)
         certain = [0.5 + 0.5 * rng.random(len(options)) for options in self.options]
@@ -203,11 +204,14 @@ def test_a_file_that_is_not_prepared_is_refused(planted, kind, first):
 # --- LeRobot ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("frequency", [20.0, 30.0])
-def test_a_new_lerobot_dataset_holds_the_demonstrations_and_their_subtasks(tmp_path, frequency):
+@pytest.mark.parametrize(("frequency", "discrete"), [(20.0, False), (30.0, True)])
+def test_a_new_lerobot_dataset_holds_the_demonstrations_and_their_subtasks(tmp_path, frequency, discrete):
     """Read back by this library's reader of LeRobot datasets, annotations included; LeRobot's own below."""
-    planted = Planted(tmp_path, OTHER, pictures=True, frequency=frequency)
+    planted = Planted(tmp_path, OTHER, pictures=True, frequency=frequency, discrete=discrete)
     out = planted.write(Annotated, "dataset")
+    assert json.loads((out / "meta" / "info.json").read_text())["features"]["action"]["dtype"] == (
+        "int64" if discrete else "float32"
+    )
     with open_source(out) as source:
         assert source.frequency == frequency
         assert json.loads(source.attributes["label_names"]) == {"subtask": ["reach", "grasp", "place"]}
@@ -218,6 +222,7 @@ def test_a_new_lerobot_dataset_holds_the_demonstrations_and_their_subtasks(tmp_p
                 np.testing.assert_allclose(found.observations[key].array(), expected, rtol=1e-6)
             np.testing.assert_array_equal(found.observations["camera"].array(), demo.observations["camera"])
             np.testing.assert_allclose(found.actions.array(), demo.actions, rtol=1e-6)
+            assert found.actions.dtype == (np.int64 if discrete else np.float32)
             named = [("reach", "grasp", "place")[label] for label in found.labels["subtask"].array()]
             assert named == [NAMES[option] for option in planted.options[number]]
             assert found.attributes["task"] == "plant"
@@ -227,6 +232,16 @@ def test_a_new_lerobot_dataset_holds_the_demonstrations_and_their_subtasks(tmp_p
     np.testing.assert_allclose(stats["action"]["std"], actions.std(axis=0), rtol=1e-5)
     np.testing.assert_allclose(stats["action"]["q90"], np.quantile(actions, 0.9, axis=0), rtol=1e-5)
     assert np.shape(stats["observation.camera"]["mean"]) == (3, 1, 1)
+
+
+def test_observations_that_lerobot_cannot_tell_apart_are_refused(tmp_path):
+    planted = Planted(tmp_path, ORDERED)
+    with h5py.File(planted.file, "r+") as file:
+        for demo in file["data"].values():
+            demo["obs"].copy("arm/joints", demo["obs"], "arm.joints")
+    with pytest.raises(BadInput, match=r"obs/arm/joints and another observation are both observation\.arm\.joints"):
+        planted.write(Annotated, "dataset")
+    assert not (tmp_path / "dataset").exists()
 
 
 def test_annotations_are_imported_as_labels_with_names(tmp_path):

@@ -8,6 +8,7 @@ from __future__ import annotations
 import gc
 import json
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import h5py
@@ -132,6 +133,75 @@ def test_a_video_need_not_be_read_to_its_end() -> None:
     gc.collect()
 
 
+DROID = [
+    *(odd.column(f"observation.state.{name}") for name in ("gripper_position", "joint.0")),
+    *(odd.column(f"action.{name}") for name in ("gripper_position", "joint_position")),
+]
+
+
+def test_features_that_begin_with_the_name_of_another_keep_their_dots(tmp_path: Path, out: Path) -> None:
+    """As in DROID. Each feature is asked for as LeRobot names it, or by its key."""
+    dataset = odd.changed(*DROID)(tmp_path)
+    keys = ["state", "state.gripper_position", "state.joint.0"]
+    import_demonstrations(dataset, out)
+    demos = Demonstrations.read(out)
+    assert set(demos.observation_shapes) == {*keys, "images/wrist"}
+    np.testing.assert_array_equal(demos[1].observations["state.gripper_position"].ravel(), np.arange(5, 11))
+    assert {f"obs/{key}" for key in keys} < set(inspect(dataset).fields)
+    for asked in (keys, [f"observation.{key}" for key in keys], keys[1:2]):
+        out.unlink()
+        import_demonstrations(dataset, out, choice=Choice(tuple(asked)))
+        expected = {key for key in keys if {key, f"observation.{key}"} & set(asked)}
+        assert set(Demonstrations.read(out).observation_shapes) == expected
+
+
+def test_the_control_is_made_of_the_features_that_are_asked_for(tmp_path: Path, out: Path) -> None:
+    dataset = odd.changed(*DROID, odd.renamed("action", "action.continuous"))(tmp_path)
+    asked = ["action.joint_position", "action.continuous"]
+    ended = call("import", dataset, "--out", out, "--action", asked[0], "--action", asked[1])
+    assert (ended.status, ended.out) == (0, f"{out}: 4 demonstrations\n")
+    for demo, start in zip(Demonstrations.read(out), (0, 5, 11, 18), strict=True):
+        np.testing.assert_array_equal(demo.actions[:, 0], start + np.arange(len(demo)))
+        np.testing.assert_allclose(demo.actions[:, 1], 0.1 * np.arange(len(demo)), rtol=1e-6)
+
+
+BROKEN = odd.values("observation.state", lambda row, value: None if row % 5 else value)
+
+
+@pytest.mark.parametrize("change", [BROKEN, odd.feature("observation.ghost"), odd.WITHOUT_VIDEOS])
+def test_what_is_not_chosen_is_not_read(change: odd.Change, tmp_path: Path, out: Path) -> None:
+    import_demonstrations(odd.changed(change)(tmp_path), out, choice=Choice(("observation.images.wrist",)))
+    assert set(Demonstrations.read(out).observation_shapes) == {"images/wrist"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "arguments", "message"),
+    [
+        (DROID, ["--observation", "state.griper_position"], "(did you mean 'state.gripper_position'?); there is: obs"),
+        (DROID, ["--observation", "images/top", "--action", "action.jaw"], "there is no feature 'action.jaw'"),
+        ([BROKEN], [], "demo_0: observation.state is null in row 1; repair it"),
+        ([odd.WITHOUT_VIDEOS], ["--videos"], "demo_0: its metadata has no videos/observation.images.top/chunk_index"),
+    ],
+)
+def test_to_skip_is_no_advice_where_nothing_is_left(
+    changes: list[odd.Change], arguments: list[str], message: str, tmp_path: Path, out: Path
+) -> None:
+    dataset = odd.changed(*changes)(tmp_path)
+    for more in ([], ["--skip-broken"]):
+        ended = call("import", dataset, "--out", out, *arguments, *more)
+        assert (ended.status, ended.out) == (2, "")
+        assert message in ended.err
+        assert "--skip-broken" not in ended.err
+
+
+def test_episodes_without_all_of_their_video_are_left_out(tmp_path: Path, out: Path) -> None:
+    dataset = odd.changed(odd.video_of(*range(12)))(tmp_path)
+    with pytest.raises(DemonstrationsError, match=r"demo_2: .*; or leave such ones out with --skip-broken"):
+        import_demonstrations(dataset, out, choice=Choice(videos=True))
+    left_out = import_demonstrations(dataset, out, choice=Choice(videos=True, skip_broken=True)).left_out
+    assert (set(left_out), Demonstrations.read(out).names) == ({"demo_2", "demo_3"}, ("demo_0", "demo_1"))
+
+
 def test_lerobot_splits_and_subtasks(tmp_path: Path, out: Path) -> None:
     splits = odd.info(splits={"train": "0:3", "val": "3:4"})
     subtasks = odd.rewritten(odd.DATA, lambda table: table.append_column("subtask_index", table["frame_index"]))
@@ -171,6 +241,15 @@ def test_a_damaged_lerobot_dataset_is_refused(tmp_path: Path, out: Path, change:
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:minari.*")
 
 
+def batched(samples: list[Any]) -> Any:
+    """Samples of a space, with a first axis of time in each array."""
+    if isinstance(samples[0], dict):
+        return {key: batched([sample[key] for sample in samples]) for key in samples[0]}
+    if isinstance(samples[0], tuple):
+        return tuple(map(batched, map(list, zip(*samples, strict=True))))
+    return np.stack(samples)
+
+
 @pytest.fixture
 def written_by_minari(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Makes a dataset with Minari: its folder, and the buffers it was made of."""
@@ -191,7 +270,7 @@ def written_by_minari(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
                 "camera": np.full((steps + 1, 32, 32, 3), 60 * episode, np.uint8),
                 "goal": np.full(steps + 1, episode),
             }
-            actions = np.stack([action.sample() for _ in range(steps)])
+            actions = batched([action.sample() for _ in range(steps)])
             ends = np.arange(steps) == steps - 1
             buffers.append(
                 EpisodeBuffer(episode, 7 + episode, None, observations, actions, np.ones(steps), ends, ~ends, {})
@@ -222,6 +301,23 @@ def test_minari_with_discrete_actions(written_by_minari, out: Path) -> None:
     import_demonstrations(folder, out)
     for buffer, demo in zip(buffers, Demonstrations.read(out), strict=True):
         np.testing.assert_array_equal(demo.actions[:, 0], buffer.actions)
+
+
+def test_minari_with_nested_actions(written_by_minari, out: Path) -> None:
+    arm = spaces.Dict({"joints": spaces.Box(-1, 1, (2,)), "base": spaces.Box(-1, 1, (1,), np.float64)})
+    folder, buffers = written_by_minari(
+        spaces.Dict({"arm": arm, "hands": spaces.Tuple((spaces.Discrete(2), spaces.Box(-1, 1, (1, 2))))})
+    )
+    import_demonstrations(folder, out)
+    for buffer, demo in zip(buffers, Demonstrations.read(out), strict=True):
+        joints, base = (buffer.actions["arm"][key] for key in ("joints", "base"))
+        grasp, fingers = buffer.actions["hands"]
+        np.testing.assert_array_equal(demo.actions, np.hstack([base, joints, grasp[:, None], fingers[:, 0]]))
+    out.unlink()
+    import_demonstrations(folder, out, choice=Choice(actions=("hands/0", "arm/base")))
+    np.testing.assert_array_equal(Demonstrations.read(out)[3].actions, np.hstack([grasp[:, None], base]))
+    with pytest.raises(DemonstrationsError, match=r"no action 'hand/0' \(did you mean 'hands/0'\?\); there is: arm"):
+        import_demonstrations(folder, out.with_name("x"), choice=Choice(actions=("hand/0",)))
 
 
 def test_minaris_environment_is_never_made(written_by_minari, out: Path) -> None:
@@ -420,6 +516,7 @@ def test_broken_demonstrations_are_refused_or_left_out(tmp_path: Path, out: Path
         (["--observation", "objct"], "demo_0: there is no observation 'objct' (did you mean 'object'?); there is: "),
         (["--format", "lerobot"], "info.json: cannot be read, or is damaged"),
         (["--format", "minari"], "cannot be read, or is damaged"),
+        (["--action", "actions"], "has the format robomimic, with one control; --action is for LeRobot and Minari"),
         (["--image-size", "3"], "Invalid value for '--image-size'"),
     ],
 )

@@ -15,7 +15,7 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.hdf5 import DemonstrationsError
 from ddco_pyro.data.importing import Choice, import_demonstrations
 from ddco_pyro.data.inspection import inspect
-from ddco_pyro.data.sources.metadata import check_keys
+from ddco_pyro.data.sources.metadata import stored_keys
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.spec import parse_spec
 
@@ -146,8 +146,24 @@ def test_data_need_not_lie_under_data(tmp_path: Path, run: Path) -> None:
     assert "language_persistent" in json.loads((out / "meta" / "info.json").read_text())["features"]
 
 
-def test_keys_of_observations() -> None:
-    check_keys(Path("d"), ["a", "b/c", "b/d", "..", "ab"])
-    for keys in (["a//b"], ["/a"], ["."], ["\ud800"], ["a", "a"], ["a/b/c", "a"], [2000 * "x"]):
-        with pytest.raises(DemonstrationsError):
-            check_keys(Path("d"), keys)
+@pytest.mark.parametrize(
+    ("names", "keys"),
+    [
+        (["a.b", "a.c", "ab", "a..b"], ["a/b", "a/c", "ab", "a..b"]),
+        (["state", "state.x", "state.x.y", "s.x"], ["state", "state.x", "state.x.y", "s/x"]),
+        (["a.b", "a.b.c", "a.b.c.d"], ["a/b", "a.b.c", "a.b.c.d"]),
+        (["images.top", "images/top"], ["images.top", "images/top"]),
+        (["state", "state/x", "state.x"], ["state", "state_x", "state.x"]),
+    ],
+)
+def test_keys_of_observations(names: list[str], keys: list[str]) -> None:
+    """Whatever the order of the names, each has the same key, and HDF5 stores them together."""
+    for order in (names, names[::-1]):
+        found = stored_keys(Path("d"), order, [name.replace(".", "/") for name in order])
+        assert dict(zip(order, found, strict=True)) == dict(zip(names, keys, strict=True))
+
+
+@pytest.mark.parametrize("names", [["."], ["\ud800"], ["a", "a"], [2000 * "x"], ["a\0"], [""]])
+def test_keys_that_cannot_be_stored(names: list[str]) -> None:
+    with pytest.raises(DemonstrationsError):
+        stored_keys(Path("d"), names, names)

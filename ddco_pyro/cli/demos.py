@@ -96,15 +96,14 @@ def init(
 ) -> None:
     """Write a commented spec for a file of demonstrations, ready to fit."""
     from ddco_pyro.data.inspection import inspect as look
+    from ddco_pyro.data.sources import refuse_foreign
     from ddco_pyro.data.starting import starting_spec
 
     check_outputs([Output("--out", out)], [file])
     if out.exists() and not force:
         raise BadInput(f"{out}: exists; choose another --out, or replace it with --force")
-    facts = look(file)
-    if facts.format != "robomimic":
-        raise BadInput(f"{file}: is a {facts.format} dataset; first: {command('import', file, '--out', 'demos.hdf5')}")
-    text = starting_spec(facts, file).replace("THIS_FILE", quote(str(out)))
+    refuse_foreign(file)
+    text = starting_spec(look(file), file).replace("THIS_FILE", quote(str(out)))
     write_text(out, text)
     print(f"{out}: fit it with: {command('fit', out, '--out', f'runs/{out.stem}')}")
 
@@ -119,7 +118,9 @@ def import_(
     actions: Annotated[
         list[str],
         typer.Option(
-            "--action", metavar="KEY", help="The control, where a dataset has several; repeatable, joined in this order."
+            "--action",
+            metavar="KEY",
+            help="The control, where a dataset has several; repeatable, joined in this order.",
         ),
     ] = [],  # noqa: B006
     mask: Annotated[str | None, typer.Option(help="Import only the demonstrations of this mask (filter key).")] = None,

@@ -75,8 +75,8 @@ def check_values(recording: Recording, remedy: str = "repair it", pictures: bool
                 value = block[step, *index]
                 limit = f", and at most {LARGEST:g} can be used" if np.isfinite(value) else ""
                 raise DemonstrationsError(
-                    f"{recording.name}: {column.named or place} is {number(value)} at step {before + step}, index {index}{limit}; "
-                    f"{remedy}"
+                    f"{recording.name}: {column.named or place} is {number(value)} at step {before + step}, "
+                    f"index {index}{limit}; {remedy}"
                 )
             before += len(block)
 

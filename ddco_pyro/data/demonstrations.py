@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, overload
@@ -21,6 +22,7 @@ from ddco_pyro.data.checks import (
 from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError
 from ddco_pyro.data.memory import PROGRAM, Extent, refuse_too_much
 from ddco_pyro.data.pictures import Observed, Pictures
+from ddco_pyro.data.sources import refuse_foreign
 from ddco_pyro.data.sources.recording import Recording, of_array
 from ddco_pyro.data.sources.robomimic import Robomimic, open_robomimic, robomimic_file, write_recording
 
@@ -142,7 +144,7 @@ class Demonstrations(Sequence[Demonstration]):
         :param exclude: names of demonstrations that are not read and are removed from masks.
         :raises DemonstrationsError: the file cannot be read, lacks something asked for, or does not fit into memory.
         """
-        with open_robomimic(Path(path)) as source:
+        with _opened(Path(path)) as source:
             needed = PROGRAM + _extent(source, observations, labels, exclude).size
             refuse_too_much(needed, "reading it", "read only some observations, or scale pictures down")
             read = tuple(map(Demonstration.of, _recordings(source, observations, labels, exclude)))
@@ -222,8 +224,14 @@ def extent(path: str | Path, observations: Sequence[str], exclude: Sequence[str]
 
     :raises DemonstrationsError: the file cannot be read, or lacks an observation.
     """
-    with open_robomimic(Path(path)) as source:
+    with _opened(Path(path)) as source:
         return _extent(source, observations, (), exclude)
+
+
+def _opened(path: Path) -> AbstractContextManager[Robomimic]:
+    if path.is_file():
+        refuse_foreign(path)
+    return open_robomimic(path)
 
 
 def _extent(

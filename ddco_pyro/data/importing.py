@@ -130,13 +130,11 @@ def _check_headers(source: Source, names: Sequence[str], choice: Choice) -> None
         raise _refused(source, names, choice, error) from None
 
 
-def _refused(
-    source: Source, names: Sequence[str], choice: Choice, error: DemonstrationsError
-) -> DemonstrationsError:
+def _refused(source: Source, names: Sequence[str], choice: Choice, error: DemonstrationsError) -> DemonstrationsError:
     """The error, with the advice to leave demonstrations out where one of them can be used."""
     for name in names:
         with suppress(DemonstrationsError):
-            recording = _chosen(source.recording(name), choice)
+            recording = _chosen(source, name, choice)
             check(recording)
             check_values(recording, pictures=True)
             return DemonstrationsError(f"{error}; or leave such ones out with --skip-broken")

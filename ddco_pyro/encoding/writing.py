@@ -22,7 +22,7 @@ import numpy as np
 from ddco_pyro.data.files import only_one, write_text
 from ddco_pyro.data.hdf5 import DemonstrationsError, opened
 from ddco_pyro.data.pictures import MOVED, shifted
-from ddco_pyro.data.sources import Column, Recording, format_of
+from ddco_pyro.data.sources import Column, Recording, refuse_foreign
 from ddco_pyro.data.sources.robomimic import Robomimic, open_robomimic, parts_of, robomimic_file, write_recording
 from ddco_pyro.encoding.autoencoder import UPDATES, Convolutions, train
 from ddco_pyro.encoding.encoder import (
@@ -36,7 +36,7 @@ from ddco_pyro.encoding.encoder import (
     principal_components,
 )
 from ddco_pyro.encoding.pictures import Pictures, batches
-from ddco_pyro.errors import BadInput, command
+from ddco_pyro.errors import BadInput
 from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
 from ddco_pyro.inference.threads import one_thread
 
@@ -129,8 +129,7 @@ def encode(
     users = is_users(encoding.encoder, allow_code)
     if out.exists() and not out.is_file():
         raise BadInput(f"{out}: is there already and is no file; choose another --out")
-    if (form := format_of(path)) != "robomimic":
-        raise BadInput(f"{path}: is a {form} dataset; first: {command('import', path, '--out', 'demos.hdf5')}")
+    refuse_foreign(path)
     with open_robomimic(path) as source, nullcontext() if users else one_thread():  # same bits
         job = _Job(source, path, out, encoding, on_event, allow_code)
         return job.already() or job.run()

@@ -18,8 +18,9 @@ import h5py
 
 from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError
 from ddco_pyro.data.sources.recording import Column, Format, Recording
+from ddco_pyro.errors import command
 
-__all__ = ["Column", "Format", "Recording", "Source", "format_of", "open_source"]
+__all__ = ["Column", "Format", "Recording", "Source", "open_source", "refuse_foreign"]
 
 
 class Source(Protocol):
@@ -67,7 +68,9 @@ def open_source(
     path = Path(path)
     form = form or format_of(path)
     if actions and form not in ("lerobot", "minari"):
-        raise DemonstrationsError(f"{path}: is {form}, with one control; --action is for LeRobot and Minari datasets")
+        raise DemonstrationsError(
+            f"{path}: has the format {form}, with one control; --action is for LeRobot and Minari datasets"
+        )
     opened: AbstractContextManager[Source]
     # Each reader imports its own library, which need not be installed for other formats.
     if form == "robomimic":
@@ -112,7 +115,7 @@ def format_of(path: Path) -> Format:
     if path.is_file():
         if path.name == "main_data.hdf5" and path.with_name("metadata.json").is_file():
             return "minari"
-        return "ogbench" if is_zipfile(path) else _format_of_file(path)
+        return "ogbench" if path.suffix == ".npz" or is_zipfile(path) else _format_of_file(path)
     if not path.exists():
         raise DemonstrationsError(f"{path}: there is no such file or folder; check the path")
     if not path.is_dir():
@@ -136,6 +139,16 @@ def format_of(path: Path) -> Format:
         "meta/info.json), a Minari dataset (with data/metadata.json), ACT's episodes (episode_0.hdf5) or a task of "
         "JIGSAWS (with kinematics/AllGestures)"
     )
+
+
+def refuse_foreign(path: Path) -> None:
+    """Refuse a dataset of another library, which is to be imported first.
+
+    :raises DemonstrationsError: it is one, nothing is there, or the layout is unknown.
+    """
+    if (form := format_of(path)) != "robomimic":
+        first = command("import", path, "--out", "demos.hdf5")
+        raise DemonstrationsError(f"{path}: has the format {form}; first: {first}")
 
 
 def _format_of_file(path: Path) -> Format:

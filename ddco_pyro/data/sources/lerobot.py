@@ -211,9 +211,7 @@ class LeRobot:
         except _DAMAGE as error:
             raise damaged(self.folder, name, error) from error
         actions = of_array(joined(controls, f"{self.folder}: {name}"))
-        return Recording(
-            name, observations, replace(actions, named=" + ".join(controls)), labels, self._facts(index)
-        )
+        return Recording(name, observations, replace(actions, named=" + ".join(controls)), labels, self._facts(index))
 
     def _labels(self, index: int, steps: int) -> np.ndarray:
         """The number of the annotated subtask at each step [T]; -1 where there is none."""
@@ -288,7 +286,7 @@ def _problem_of_times(times: np.ndarray, frequency: float, column: str) -> str:
         if abs(mean * frequency - 1) * len(times) < 0.5:
             return f"{column} starts at {times[0]:.6g}, not at 0; subtract that from each"
         if column == "timestamp":
-            return f"{column} runs at {1 / mean:.4g} Hz, and fps in meta/info.json is {frequency:g}; correct one of them"
+            return f"{column} runs at {1 / mean:.4g} Hz, and meta/info.json says {frequency:g}; correct one of them"
     at = int(wrong.argmax())
     return f"{column} is {times[at]:g} in row {at}, not {expected[at]:g}: frames are missing or out of order"
 

@@ -7,8 +7,8 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Any
-from zipfile import BadZipFile
+from zipfile import BadZipFile, ZipFile
+from zlib import error as ZlibError
 
 import numpy as np
 
@@ -17,17 +17,19 @@ from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError
 from ddco_pyro.data.memory import refuse_too_much
 from ddco_pyro.data.pictures import channels_last, turned
 from ddco_pyro.data.sources.hdf5_layouts import BARE, spans
+from ddco_pyro.data.sources.metadata import stored_keys
 from ddco_pyro.data.sources.recording import Column, Format, Recording, damaged
 
 OBSERVATIONS, ACTIONS, TERMINALS, TIMEOUTS = "observations", "actions", "terminals", "timeouts"
-_DAMAGE = (OSError, ValueError, KeyError, EOFError, NotImplementedError, RuntimeError, BadZipFile)
+SUFFIX = ".npy"
+_DAMAGE = (OSError, ValueError, KeyError, EOFError, NotImplementedError, RuntimeError, BadZipFile, ZlibError)
 
 
 class OGBench:
     """Arrays ``observations`` [N, ...], ``actions`` [N, A] and ``terminals`` [N], which is 1 in last steps.
 
     ``observations`` becomes ``obs/state``. Any other array of N steps, such as ``qpos``, is imported if it is asked
-    for. Arrays are read whole, and kept.
+    for. An array is read whole, because an archive cannot be read in parts.
     """
 
     format: Format = "ogbench"
@@ -35,13 +37,16 @@ class OGBench:
     masks: Mapping[str, tuple[str, ...]] = {}
     attributes: Mapping[str, Attribute] = {}
 
-    def __init__(self, path: Path, file: Any) -> None:
-        self.path, self.files, self._file = path, (path,), file
+    def __init__(self, path: Path, archive: ZipFile) -> None:
+        self.path, self.files, self._archive = path, (path,), archive
         self._array = cache(self._read)
-        self._known = {key: _header(file, key) for key in file.files}
-        if missing := {OBSERVATIONS: 0, ACTIONS: 0, TERMINALS: 0}.keys() - self._known.keys():
+        try:
+            self._known = _headers(archive)
+        except _DAMAGE as error:
+            raise damaged(path, "", error) from error
+        if missing := [key for key in (OBSERVATIONS, ACTIONS, TERMINALS) if key not in self._known]:
             raise DemonstrationsError(
-                f"{path}: is an npz file without {', '.join(sorted(missing))}, which OGBench's files have; there is: "
+                f"{path}: is an npz file without {', '.join(missing)}, which OGBench's files have; there is: "
                 f"{', '.join(self._known) or 'nothing'}; write its episodes into HDF5 with the lines in docs/own.md"
             )
         steps = self._known[ACTIONS][0][:1]
@@ -50,28 +55,30 @@ class OGBench:
             if self._known[key][0][:1] != steps:
                 had, needed = (list(self._known[name][0]) for name in (key, ACTIONS))
                 raise DemonstrationsError(f"{path}: {key} has shape {had}, and actions {needed}: the steps differ")
+        if not any(steps):
+            raise DemonstrationsError(f"{path}: holds no demonstrations; at least one is needed")
         self._spans = spans(np.any([self._array(key).reshape(*steps, -1).any(1) for key in ends], axis=0))
         self.names = tuple(self._spans)
-        self._observed = [
+        observed = [
             key
             for key, (shape, dtype) in self._known.items()
             if shape[:1] == steps and dtype.kind in NUMBERS and key not in (ACTIONS, *ends)
         ]
-        if not self.names:
-            raise DemonstrationsError(f"{path}: holds no demonstrations; at least one is needed")
+        preferred = [BARE if key == OBSERVATIONS else key for key in observed]
+        self._keys = dict(zip(observed, stored_keys(path, observed, preferred), strict=True))
 
     def _read(self, key: str) -> np.ndarray:
         shape, dtype = self._known[key]
         refuse_too_much(math.prod(shape) * dtype.itemsize, f"{self.path}: {key}", "divide the file")
         try:
-            return np.asarray(self._file[key])
+            with self._archive.open(key + SUFFIX) as stream:
+                return np.lib.format.read_array(stream, allow_pickle=False)
         except _DAMAGE as error:
             raise damaged(self.path, key, error) from error
 
     def recording(self, name: str) -> Recording:
         """One demonstration; reading its arrays raises :class:`DemonstrationsError` if they are damaged."""
-        state = OBSERVATIONS if BARE in self._observed else BARE
-        observations = {state if key == OBSERVATIONS else key: self._column(key, name) for key in self._observed}
+        observations = {key: self._column(array, name) for array, key in self._keys.items()}
         return Recording(name, observations, self._column(ACTIONS, name))
 
     def _column(self, key: str, name: str) -> Column:
@@ -83,17 +90,20 @@ class OGBench:
         def blocks() -> Iterator[np.ndarray]:
             yield turned(self._array(key)[span].reshape(shape))
 
-        aside = key not in (OBSERVATIONS, ACTIONS)
-        return Column(channels_last(shape, dtype), dtype, blocks, named=key, aside=aside)
+        return Column(channels_last(shape, dtype), dtype, blocks, named=key, aside=key not in (OBSERVATIONS, ACTIONS))
 
 
-def _header(file: Any, key: str) -> tuple[tuple[int, ...], np.dtype]:
-    """The shape and the type of an array, which is not read."""
-    with file.zip.open(f"{key}.npy") as stream:
-        one = np.lib.format.read_magic(stream) == (1, 0)
-        read = np.lib.format.read_array_header_1_0 if one else np.lib.format.read_array_header_2_0
-        shape, _, dtype = read(stream)
-    return shape, dtype
+def _headers(archive: ZipFile) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
+    """The shape and the type of each array, none of which is read."""
+    found = {}
+    for name in archive.namelist():
+        if name.endswith(SUFFIX):
+            with archive.open(name) as stream:
+                one = np.lib.format.read_magic(stream) == (1, 0)
+                read = np.lib.format.read_array_header_1_0 if one else np.lib.format.read_array_header_2_0
+                shape, _, dtype = read(stream)
+            found[name.removesuffix(SUFFIX)] = shape, dtype
+    return found
 
 
 @contextmanager
@@ -103,12 +113,8 @@ def open_ogbench(path: Path) -> Iterator[OGBench]:
     :raises DemonstrationsError: the file cannot be read, has other arrays, or holds no demonstrations.
     """
     try:
-        file = np.load(path, allow_pickle=False)
+        archive = ZipFile(path)
     except _DAMAGE as error:
         raise damaged(path, "", error) from error
-    with file:
-        try:
-            source = OGBench(path, file)
-        except _DAMAGE as error:
-            raise damaged(path, "", error) from error
-        yield source
+    with archive:
+        yield OGBench(path, archive)

@@ -15,6 +15,7 @@ from pyarrow import parquet
 
 from ddco_pyro.data.files import write_text
 from ddco_pyro.data.sources import Column, Recording, Source
+from ddco_pyro.errors import BadInput
 from ddco_pyro.segmenting import Segmented
 from ddco_pyro.segmenting.formats import Asked
 
@@ -33,8 +34,11 @@ FRAMES, PIXELS = 4, 8
 def write_dataset(folder: Path, asked: Asked, segmented: Segmented) -> None:
     """Write the segmented demonstrations as episodes 0, 1, ...
 
-    An observation ``arm`` is ``observation.arm``: a picture as PNG in the parquet files, other arrays as vectors of
-    float32. ``observation.state`` has all vectors one after another, unless the source has a ``state``.
+    An observation ``arm`` is ``observation.arm``: a picture as PNG in the parquet files, other arrays as vectors.
+    Floating point numbers are float32 there, and whole numbers keep their type. ``observation.state`` has all vectors
+    one after another, unless the source has a ``state``.
+
+    :raises BadInput: two observations have the same name in LeRobot.
     """
     source, names = asked.source, [demo.name for demo in segmented.segments]
     frequency = segmented.frequency or FREQUENCY
@@ -104,9 +108,11 @@ def _columns(
 ) -> tuple[dict[str, pyarrow.Array], dict[str, Mapping[str, Any]]]:
     """The observations and controls of an episode as columns, and the entries of their features."""
     columns, features = dict[str, pyarrow.Array](), dict[str, Mapping[str, Any]]()
-    vectors = {}
+    vectors = dict[str, np.ndarray]()
     for key, column in recording.observations.items():
         name = "observation." + key.replace("/", ".")
+        if name in columns.keys() | vectors.keys():
+            raise BadInput(f"obs/{key} and another observation are both {name} in LeRobot; rename one")
         if column.image:
             columns[name] = _pictures(column, name, statistics)
             features[name] = {
@@ -115,20 +121,21 @@ def _columns(
         else:
             vectors[name] = _vectors(column)
     if vectors and "observation.state" not in vectors:
-        vectors["observation.state"] = np.concatenate(list(vectors.values()), axis=1)
+        vectors["observation.state"] = np.concatenate(list(vectors.values()), axis=1, dtype=np.float32)
     for name, values in {**vectors, "action": _vectors(recording.actions)}.items():
         size = values.shape[1]
         flat = pyarrow.array(values.ravel())
         columns[name] = flat if size == 1 else pyarrow.FixedSizeListArray.from_arrays(flat, size)
-        features[name] = {"dtype": "float32", "shape": [size], "names": None}
+        features[name] = {"dtype": str(values.dtype), "shape": [size], "names": None}
         statistics.add(name, values)
     return columns, features
 
 
 def _vectors(column: Column) -> np.ndarray:
-    """Float32 [T, D]."""
+    """Whole numbers, or float32 [T, D]."""
     values = column.array()
-    return values.reshape(len(values), math.prod(column.shape[1:])).astype(np.float32)
+    flat = values.reshape(len(values), math.prod(column.shape[1:]))
+    return flat.astype(np.float32) if flat.dtype.kind == "f" else flat
 
 
 def _pictures(column: Column, name: str, statistics: _Statistics) -> pyarrow.Array:

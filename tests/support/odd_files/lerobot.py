@@ -7,6 +7,7 @@ import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pyarrow
 import pyarrow.compute as compute
@@ -55,6 +56,43 @@ def feature(name: str, **values: object) -> Change:
 
 def rewritten(place: Path, change: Callable[[pyarrow.Table], pyarrow.Table]) -> Change:
     return lambda dataset: parquet.write_table(change(parquet.read_table(dataset / place)), dataset / place)
+
+
+def column(name: str, **about: object) -> Change:
+    """Adds a feature of one number, the number of the row."""
+
+    def change(dataset: Path) -> None:
+        feature(name, **{"shape": [1], "names": None} | about)(dataset)
+        rewritten(DATA, lambda table: table.append_column(name, pyarrow.array(map(float, range(len(table))))))(dataset)
+
+    return change
+
+
+def values(name: str, change: Callable[[int, Any], object]) -> Change:
+    """Replaces each value of a column, by the number of its row and what it was."""
+
+    def replace(table: pyarrow.Table) -> pyarrow.Table:
+        changed = [change(row, value) for row, value in enumerate(table[name].to_pylist())]
+        return table.set_column(table.column_names.index(name), name, pyarrow.array(changed))
+
+    return rewritten(DATA, replace)
+
+
+def renamed(old: str, new: str) -> Change:
+    """Renames a feature and its column."""
+
+    def change(dataset: Path) -> None:
+        features = json.loads((dataset / "meta" / "info.json").read_text())["features"]
+        info(features={new if name == old else name: about for name, about in features.items()})(dataset)
+        rewritten(DATA, lambda table: table.rename_columns([{old: new}.get(c, c) for c in table.column_names]))(dataset)
+
+    return change
+
+
+WITHOUT_VIDEOS = rewritten(
+    EPISODES, lambda table: table.drop_columns([name for name in table.column_names if name.startswith("videos/")])
+)
+"""Nothing says where the videos are."""
 
 
 def episode(index: int, key: str, value: object) -> Change:
@@ -146,12 +184,13 @@ def video_of(*times: int) -> Change:
     return change
 
 
-def ragged(table: pyarrow.Table) -> pyarrow.Table:
-    """Controls of one number and of three, which are two on average."""
-    values = table["action"].to_pylist()
-    values[0], values[1] = values[0][:1], [*values[1], 0.0]
-    at = table.column_names.index("action")
-    return table.set_column(at, "action", pyarrow.array(values, pyarrow.list_(pyarrow.float32())))
+RAGGED = values("action", lambda row, value: [value[:1], [*value, 0.0]][row] if row < 2 else value)
+"""Controls of one number and of three, which are two on average."""
+
+
+def in_episode_1(name: str, change: Callable[[int, Any], object]) -> Callable[[Path], Path]:
+    """A dataset in which the values of a column in episode 1 are replaced."""
+    return changed(values(name, lambda row, value: change(row, value) if 5 <= row < 11 else value))
 
 
 def of_episode(table: pyarrow.Table, index: int) -> pyarrow.Table:
@@ -202,7 +241,39 @@ EPISODES_NOT_WHOLE = {
         "demo_1: dataset_to_index - dataset_from_index in meta/episodes is 7, and .* has 6",
     ),
     "lerobot no rows": (changed(without_rows(*range(5, 11))), "demo_1: its rows are missing in"),
-    "lerobot ragged": (changed(rewritten(DATA, ragged)), "demo_0: cannot be read, or is damaged: its rows differ"),
+    "lerobot ragged": (changed(RAGGED), "demo_0: action has 1 numbers in row 0, and meta/info.json says 2; correct"),
+    "lerobot null action": (
+        in_episode_1("action", lambda row, value: None if row == 7 else value),
+        "demo_1: action is null in row 2; repair it",
+    ),
+    "lerobot null number": (
+        in_episode_1("action", lambda row, value: [value[0], None] if row == 7 else value),
+        "demo_1: action has 1 numbers in row 2, and",
+    ),
+    "lerobot null state": (
+        in_episode_1("observation.state", lambda row, value: None if row == 7 else value),
+        r"demo_1: observation\.state is null in row 2; repair it",
+    ),
+    "lerobot null time": (
+        in_episode_1("timestamp", lambda row, value: None if row == 7 else value),
+        "demo_1: timestamp is null in row 2; repair it",
+    ),
+    "lerobot late": (
+        in_episode_1("timestamp", lambda _, value: value + 3.2),
+        r"demo_1: timestamp starts at 3\.2, not at 0; subtract that",
+    ),
+    "lerobot late frames": (
+        in_episode_1("frame_index", lambda _, value: value + 7),
+        r"demo_1: frame_index starts at 7, not at 0; subtract that",
+    ),
+    "lerobot 50 Hz": (
+        in_episode_1("timestamp", lambda _, value: value / 5),
+        r"demo_1: timestamp runs at 50 Hz, and meta/info\.json says 10; correct one",
+    ),
+    "lerobot late, 50 Hz, and uneven": (
+        in_episode_1("timestamp", lambda row, value: 3 + value / 5 + 0.001 * (row % 2)),
+        r"demo_1: timestamp runs at (50|49\.\d+|50\.\d+) Hz, and meta/info\.json says 10",
+    ),
 }
 """Datasets of which one episode is not whole, and what is said of it."""
 
@@ -224,10 +295,14 @@ ROWS = {
     ),
     "lerobot key with a NUL": Row(changed(feature("observation.a\0b")), "which cannot be stored; rename it"),
     "lerobot key of nothing": Row(changed(feature("observation.")), "which cannot be stored; rename it"),
-    "lerobot key twice": Row(changed(feature("observation.images/top")), "two observations are called 'images/top'"),
-    "lerobot key below another": Row(
-        changed(feature("observation.state.x")), "observations are called 'state' and 'state/x'"
+    "lerobot key twice": Row(changed(column("observation.images/top")), None),
+    "lerobot key below another": Row(changed(column("observation.state.x")), None),
+    "lerobot feature without a column": Row(changed(feature("observation.x")), r"demo_0: has no column observation\.x"),
+    "lerobot without a control": Row(
+        changed(renamed("action", "action.continuous")),
+        "there is no feature 'action'.*; there is: observation.state, action.continuous; .* --action action.continuous",
     ),
+    "lerobot without a place of videos": Row(changed(WITHOUT_VIDEOS), None),
     "lerobot splits are a list": Row(changed(info(splits=[1])), None),
     "lerobot endless frequency": Row(changed(info(fps=float("inf"))), None),
 }
