@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
-from ddco_pyro.data.controls import control_dimensions, control_parts, notes
+from ddco_pyro.data.controls import ControlDimension, ControlStatistics, control_dimensions, control_parts, notes
 from ddco_pyro.model.controls import ControlScaling
 from ddco_pyro.spec import ControlSpec
 
 STEPS = 200
+
+
+def in_blocks(blocks: list[np.ndarray]) -> tuple[ControlDimension, ...]:
+    """The statistics of one demonstration that is read in these blocks."""
+    statistics = ControlStatistics()
+    for block in blocks:
+        statistics.add(block, "demo")
+    return statistics.dimensions()
 
 
 def controls() -> np.ndarray:
@@ -26,7 +36,7 @@ def controls() -> np.ndarray:
 
 @pytest.mark.parametrize("cuts", [[], [1, 2, 3], [60, 150], list(range(1, STEPS))])
 def test_each_dimension_is_described(cuts: list[int]) -> None:
-    free, still, switch, seldom, twice, both = control_dimensions(np.split(controls(), cuts))
+    free, still, switch, seldom, twice, both = in_blocks(np.split(controls(), cuts))
     assert (free.constant, free.values, free.extremes, free.note) == (False, (), (), "")
     assert (still.constant, still.values) == (True, (0.3,))
     assert (switch.constant, switch.values, switch.extremes) == (False, (0.0, 1.0), ())
@@ -58,7 +68,7 @@ def resting(steps: int = STEPS) -> np.ndarray:
 
 @pytest.mark.parametrize("cuts", [[], [1, 2, 3], [60, 150], list(range(1, STEPS))])
 def test_a_value_inside_the_range_is_counted_and_with_whom_it_is_taken(cuts: list[int]) -> None:
-    first, second, third, fourth = control_dimensions(np.split(resting(), cuts))
+    first, second, third, fourth = in_blocks(np.split(resting(), cuts))
     assert [(each.inside, each.at_inside) for each in (first, second, third)] == [(0.25, 100), (0.0, 90), (0.0, 20)]
     assert [each.together for each in (first, second, third)] == [(1,), (0,), ()]
     assert first.note == "exactly 0.25 in 50.0 % of the steps"
@@ -70,9 +80,9 @@ def test_a_value_inside_the_range_is_counted_and_with_whom_it_is_taken(cuts: lis
 def test_five_in_a_hundred_are_a_value_and_four_are_none() -> None:
     controls = np.random.default_rng(0).normal(size=(100, 1))
     controls[10:14] = 0.1
-    assert control_dimensions([controls])[0].note == ""
+    assert control_dimensions({"demo": controls})[0].note == ""
     controls[14] = 0.1
-    assert control_dimensions([controls])[0].note == "exactly 0.1 in 5.0 % of the steps"
+    assert control_dimensions({"demo": controls})[0].note == "exactly 0.1 in 5.0 % of the steps"
 
 
 def test_counts_of_many_steps_do_not_depend_on_blocks() -> None:
@@ -80,7 +90,7 @@ def test_counts_of_many_steps_do_not_depend_on_blocks() -> None:
     controls = resting(9000)
     late = controls[:, 3]
     late[5000:][np.arange(4000) % 4 != 0] = 0.5
-    whole, cut = (control_dimensions(np.split(controls, cuts)) for cuts in ([], [10, 4100, 8500]))
+    whole, cut = (in_blocks(np.split(controls, cuts)) for cuts in ([], [10, 4100, 8500]))
     assert whole == cut
     assert [each.at_inside for each in whole[:3]] == [4500, 4050, 900]
     assert (whole[3].inside, whole[3].at_inside) == (0.5, int((late[4096:] == 0.5).sum()))
@@ -103,7 +113,7 @@ def rounded(dtype: type) -> np.ndarray:
 def test_a_limit_that_is_missed_by_rounding_is_reached(cuts: list[int], dtype: type) -> None:
     """Else most steps at the limit are a value inside the range, beside an extreme that a few steps have."""
     demonstration = rounded(dtype)
-    found = control_dimensions(np.split(demonstration, cuts))
+    found = in_blocks(np.split(demonstration, cuts))
     limit, switch, rest, still = found
     assert len(np.unique(demonstration[::4, 0])) == 2  # rounding does show
     assert (limit.at_minimum, limit.at_maximum, limit.inside) == (50, 50, None)
@@ -126,12 +136,82 @@ def test_a_limit_that_is_missed_by_rounding_is_reached(cuts: list[int], dtype: t
 
 def test_a_short_file_does_not_sit_on_its_extremes() -> None:
     """In 20 steps a value that is taken once is taken in 5 % of them."""
-    assert notes(control_dimensions([np.arange(20.0)[:, None]])) == []
+    assert notes(control_dimensions({"demo": np.arange(20.0)[:, None]})) == []
 
 
 def test_values_that_are_not_finite_do_not_count() -> None:
     column = np.array([np.nan, 2.0, np.inf, 2.0, -np.inf])
     for blocks in ([column[:, None]], np.split(column[:, None], 5)):
-        (found,) = control_dimensions(blocks)
+        (found,) = in_blocks(blocks)
         assert (found.values, found.steps) == ((2.0,), 2)
-    assert control_dimensions([np.full((3, 1), np.nan)]) == ()
+    assert control_dimensions({"demo": np.full((3, 1), np.nan)}) == ()
+
+
+# --- values that a single demonstration makes -------------------------------------------------------------------------
+
+
+def dead(made: np.ndarray) -> np.ndarray:
+    return 0 * made
+
+
+def padded(made: np.ndarray) -> np.ndarray:
+    return np.concatenate([made, np.zeros((100, 2))])
+
+
+def at_its_limit(made: np.ndarray) -> np.ndarray:
+    return np.where(np.arange(len(made))[:, None] < 20, 5.0, made)
+
+
+def positive(random: np.random.Generator) -> np.ndarray:
+    return random.uniform(0.1, 1, (50, 2))
+
+
+def free(random: np.random.Generator) -> np.ndarray:
+    return random.normal(size=(50, 2))
+
+
+@pytest.mark.parametrize("spoilt", [(3,), (3, 17)], ids=["one", "two"])
+@pytest.mark.parametrize("spoil", [dead, padded, at_its_limit])
+@pytest.mark.parametrize("others", [free, positive])
+def test_what_few_demonstrations_make_decides_no_kind(others: Any, spoil: Any, spoilt: tuple[int, ...]) -> None:
+    """It is said of whom it is; what half of them make decides the kind as it did."""
+    random = np.random.default_rng(0)
+    made = {f"demo_{n}": others(random) for n in range(20)}
+    rested = {name: spoil(one) if number % 2 else one for number, (name, one) in enumerate(made.items())}
+    made |= {f"demo_{n}": spoil(made[f"demo_{n}"]) for n in spoilt}
+    found = control_dimensions(made)
+    (part,) = control_parts(ControlSpec(), found)
+    assert part.kind == "gaussian"
+    assert all(f"demo_{n}" in text for n in spoilt for text in (part.why, found[0].note))
+    assert {part.kind for part in control_parts(ControlSpec(), control_dimensions(rested))} == {
+        "clipped" if spoil is at_its_limit or others is positive else "hurdle"
+    }
+
+
+def test_another_value_is_modelled_beside_the_one_that_a_dead_demonstration_makes() -> None:
+    random = np.random.default_rng(0)
+    made = {f"demo_{n}": free(random) for n in range(20)}
+    for demo in made.values():
+        demo[::12] = 0.25
+    made["demo_7"] = np.zeros((400, 2))
+    (part,) = control_parts(ControlSpec(), control_dimensions(made))
+    assert (part.kind, part.exact) == ("hurdle", (0.25, 0.25))
+
+
+@pytest.mark.parametrize(
+    ("others", "odd", "named"),
+    [
+        ((-1.0, 1.0), (-1.0, 0.0, 1.0), True),
+        ((-1.0, 1.0), (0.0, 0.0, 1.0), True),
+        ((1.0, 1.0), (1.0, 1.0, 0.0), True),
+        ((-1.0, 0.0, 1.0), (-1.0, 0.0, 1.0), False),
+        ((-1.0, 1.0), (1.0, 1.0, 1.0), False),
+    ],
+)
+def test_a_demonstration_without_which_a_dimension_would_be_a_switch_or_constant_is_named(
+    others: tuple[float, ...], odd: tuple[float, ...], named: bool
+) -> None:
+    made = {f"demo_{n}": np.resize(others, 30)[:, None] for n in range(10)}
+    made["demo_4"] = np.resize(odd, 30)[:, None]
+    (found,) = control_dimensions(made)
+    assert found.strays == (("demo_4",) if named else ())

@@ -58,13 +58,13 @@ def spec_of(**control):
 
 
 def kinds(actions, **control):
-    parts = control_parts(ControlSpec(**control), control_dimensions([actions]))
+    parts = control_parts(ControlSpec(**control), control_dimensions({"demo": actions}))
     return {dimension: part.kind for part in parts for dimension in part.dims}
 
 
 def test_kinds_are_decided_from_the_demonstrations():
     assert kinds(mixed()) == {0: "gaussian", 1: "clipped", 2: "binary", 3: "clipped"}
-    parts = {part.kind: part for part in control_parts(ControlSpec(), control_dimensions([mixed()]))}
+    parts = {part.kind: part for part in control_parts(ControlSpec(), control_dimensions({"demo": mixed()}))}
     assert parts["clipped"].low == (-2.0, -np.inf)
     assert parts["clipped"].high == (2.0, 1.0)
     assert (parts["binary"].low, parts["binary"].high) == ((0.1,), (0.7,))
@@ -82,7 +82,7 @@ def test_one_in_a_hundred_at_an_extreme_is_a_bound_and_a_single_extreme_is_none(
 
 def test_whole_numbers_alone_are_discrete_actions():
     actions = np.random.default_rng(0).integers(0, 5, (40, 1)).astype(float)
-    (part,) = control_parts(ControlSpec(), control_dimensions([actions]))
+    (part,) = control_parts(ControlSpec(), control_dimensions({"demo": actions}))
     assert (part.kind, part.values) == ("categorical", (0.0, 1.0, 2.0, 3.0, 4.0))
     both = np.concatenate([actions, np.random.default_rng(1).normal(size=(40, 1))], axis=1)
     assert "categorical" not in kinds(both).values()
@@ -94,12 +94,12 @@ def whole(seed, columns=2):
 
 
 def test_of_an_integer_type_every_column_is_discrete_whatever_its_sign():
-    parts = control_parts(ControlSpec(), control_dimensions([whole(0)]))
+    parts = control_parts(ControlSpec(), control_dimensions({"demo": whole(0)}))
     assert [(part.dims, part.kind, part.values) for part in parts] == [
         ((0,), "categorical", (-1.0, 0.0, 1.0)),
         ((1,), "categorical", (0.0, 1.0, 2.0)),
     ]
-    assert parts == control_parts(ControlSpec(), control_dimensions([whole(1), whole(0)]))
+    assert parts == control_parts(ControlSpec(), control_dimensions({"one": whole(1), "two": whole(0)}))
     assert kinds(whole(0).astype(float)) == {0: "hurdle", 1: "hurdle"}
     assert kinds(whole(0).astype(float), kind="categorical") == {0: "categorical", 1: "categorical"}
     many = np.arange(100).reshape(-1, 1)
@@ -146,7 +146,7 @@ def test_parts_by_name_come_first_and_the_rest_follows():
 )
 def test_what_does_not_fit_the_demonstrations_is_refused(control, message):
     with pytest.raises(SpecError, match=message):
-        control_parts(spec_of(**control).control, control_dimensions([mixed()]))
+        control_parts(spec_of(**control).control, control_dimensions({"demo": mixed()}))
 
 
 @pytest.mark.parametrize(

@@ -45,7 +45,7 @@ def test_without_skill_options_gain_nothing(at_once):
 
 
 def decided(demos, **control):
-    return control_parts(ControlSpec(**control), control_dimensions(demo.actions for demo in demos))
+    return control_parts(ControlSpec(**control), control_dimensions({demo.name: demo.actions for demo in demos}))
 
 
 def test_dimensions_that_rest_at_once_share_a_probability():
@@ -68,16 +68,16 @@ def test_a_value_is_that_of_the_demonstrations_however_it_is_rounded():
     controls = np.where(np.arange(60) % 2 == 0, stored, np.random.default_rng(0).normal(size=60))[:, None]
     for value in (0.1, stored, None):
         parts = [{"name": "stick", "dims": [0], "kind": "hurdle", "value": value}]
-        (part,) = control_parts(ControlSpec(parts=parts), control_dimensions([controls]))
+        (part,) = control_parts(ControlSpec(parts=parts), control_dimensions({"demo": controls}))
         assert part.exact == (stored,)
 
 
 def test_a_declared_value_may_be_an_extreme():
     controls = np.abs(no_ops()[0].actions[:, :1])
     parts = [{"name": "pedal", "dims": [0], "kind": "hurdle", "value": 0.0}]
-    (part,) = control_parts(ControlSpec(parts=parts), control_dimensions([controls]))
+    (part,) = control_parts(ControlSpec(parts=parts), control_dimensions({"demo": controls}))
     assert (part.exact, part.low, part.high) == ((0.0,), (-np.inf,), (np.inf,))
-    assert [part.kind for part in control_parts(ControlSpec(), control_dimensions([controls]))] == ["clipped"]
+    assert [part.kind for part in control_parts(ControlSpec(), control_dimensions({"demo": controls}))] == ["clipped"]
 
 
 # --- from file to controller ------------------------------------------------------------------------------------------

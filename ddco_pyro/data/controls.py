@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,9 @@ ATOM = 0.05
 
 FEWEST = 3
 """Fewest steps of an atom: rounded numbers coincide now and then."""
+
+FEW = 0.1
+"""What at most this share of the demonstrations makes, or a single one, decides no kind."""
 
 TOGETHER = 0.9
 """Two dimensions rest together if this share of the steps in which either rests is shared."""
@@ -50,6 +54,9 @@ class ControlDimension:
     :param at_inside: number of steps that equal ``inside``.
     :param together: other dimensions that equal their ``inside`` in the same steps (:data:`TOGETHER`).
     :param integer: whether the controls have an integer type.
+    :param made_by: for ``minimum``, ``maximum`` and ``inside``: names of the few demonstrations (:data:`FEW`) without
+        which the value would be rare. Such a value decides no kind.
+    :param strays: names of the few demonstrations without which the dimension would be constant or a switch.
     """
 
     number: int
@@ -63,6 +70,8 @@ class ControlDimension:
     at_inside: int = 0
     together: tuple[int, ...] = ()
     integer: bool = False
+    made_by: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    strays: tuple[str, ...] = ()
 
     @property
     def whole(self) -> bool:
@@ -90,18 +99,29 @@ class ControlDimension:
     def extremes(self) -> tuple[tuple[str, float, float], ...]:
         """(``minimum`` or ``maximum``, its value, share of the steps that equal it) for extremes that are common.
 
-        Empty for discrete dimensions and for one or two values. An extreme that occurs once does not count.
+        Empty for discrete dimensions and for one or two values. An extreme that occurs once does not count, nor one
+        that few demonstrations make.
         """
         ends = (("minimum", self.minimum, self.at_minimum), ("maximum", self.maximum, self.at_maximum))
         often = [(name, value, at / self.steps) for name, value, at in ends if at > max(1, OFTEN * self.steps)]
-        return () if self.values or self.discrete else tuple(often)
+        return () if self.values or self.discrete else tuple(end for end in often if end[0] not in self.made_by)
 
     @property
     def atom(self) -> str:
         """The atom inside the range and its share of the steps, in words; empty without an atom."""
-        if self.inside is None or self.discrete or self.at_inside < max(FEWEST, ATOM * self.steps):
+        rare = self.at_inside < max(FEWEST, ATOM * self.steps) or "inside" in self.made_by
+        if self.inside is None or self.discrete or rare:
             return ""
         return f"exactly {number(self.inside)} in {100 * self.at_inside / self.steps:.1f} % of the steps"
+
+    @property
+    def made(self) -> str:
+        """The values that few demonstrations make, in words; empty without any."""
+        if self.values or self.discrete:
+            return ""
+        by = {name: getattr(self, end) for end in ("inside", "minimum", "maximum") for name in self.made_by.get(end, ())}
+        names = {value: [name for name in by if by[name] == value] for value in by.values()}
+        return "; ".join(f"{number(value)} is often the value in {few(own)} alone" for value, own in names.items())
 
     @property
     def note(self) -> str:
@@ -113,11 +133,11 @@ class ControlDimension:
         ends = ", at its ".join(
             f"{name} {number(value)} in {100 * share:.1f} % of the steps" for name, value, share in self.extremes
         )
-        return "; ".join(filter(None, (self.atom, ends and f"exactly at its {ends}")))
+        return "; ".join(filter(None, (self.atom, ends and f"exactly at its {ends}", self.made)))
 
     def as_data(self) -> dict[str, Any]:
         """The main statistics as plain data."""
-        left_out = ("distinct", "together", "integer")
+        left_out = ("distinct", "together", "integer", "made_by", "strays")
         return {key: value for key, value in asdict(self).items() if key not in left_out}
 
 
@@ -131,17 +151,22 @@ def number(value: float) -> str:
     return str(single) if float(single) == value else str(value)
 
 
+def few(names: Sequence[str]) -> str:
+    """``demo_3``, or ``demo_1, demo_2, demo_3, ...`` of more."""
+    return ", ".join(names[:3]) + ", ..." * (len(names) > 3)
+
+
 class ControlStatistics:
     """Streaming :class:`ControlDimension` statistics of controls; NaN and infinite values are ignored."""
 
     def __init__(self) -> None:
-        self._columns: list[np.ndarray] = []  # minimum, maximum, steps there, steps: each [A]
+        self._columns: dict[str, list[np.ndarray]] = {}  # by demonstration: as _columns_of, each [A]
         self._distinct: list[np.ndarray] = []
         self._common = _CommonValues()
         self._integer = True
 
-    def add(self, controls: np.ndarray) -> None:
-        """Add some steps [T, ...]."""
+    def add(self, controls: np.ndarray, name: str) -> None:
+        """Add some steps [T, ...] of the demonstration with this name."""
         self._integer &= controls.dtype.kind in "iu"
         values = np.asarray(controls, dtype=np.float64).reshape(len(controls), -1)
         finite = np.isfinite(values)
@@ -149,44 +174,100 @@ class ControlStatistics:
             return
         low, high = np.where(finite, values, np.inf).min(0), np.where(finite, values, -np.inf).max(0)
         new = [low, high, same(values, low).sum(0), same(values, high).sum(0), finite.sum(0)]
-        self._columns = _merged(self._columns, new) if self._columns else new
+        self._columns[name] = _merged(np.array([self._columns[name], new])) if name in self._columns else new
         before = self._distinct or [np.empty(0)] * values.shape[1]
         self._distinct = [
             old if len(old) > MOST_DISTINCT else np.union1d(old, column[use])[: MOST_DISTINCT + 1]
             for old, column, use in zip(before, values.T, finite.T, strict=True)
         ]
-        self._common.add(values)
+        self._common.add(values, len(self._columns) - 1)
 
     def dimensions(self) -> tuple[ControlDimension, ...]:
         """The statistics of all dimensions that have a finite value."""
-        columns = [column.tolist() for column in self._columns]
-        few = [tuple(values.tolist()) if len(values) <= MOST_DISTINCT else () for values in self._distinct]
-        inside = self._common.inside(*self._columns[:2]) if columns else {}
-        nowhere: tuple[float | None, int, tuple[int, ...]] = (None, 0, ())
+        if not self._columns:
+            return ()
+        each = np.array(list(self._columns.values()))  # [N, 5, A]
+        low, high, at_low, at_high, steps = (column.tolist() for column in _merged(each))
+        inside = self._common.inside(np.array(low), np.array(high), each[:, 4])
         return tuple(
             ControlDimension(
                 index,
-                low,
-                high,
-                at_low,
-                at_high,
-                steps,
-                distinct,
-                *inside.get(index, nowhere),
+                low[index],
+                high[index],
+                int(at_low[index]),
+                int(at_high[index]),
+                int(steps[index]),
+                tuple(values.tolist()) if len(values) <= MOST_DISTINCT else (),
+                *inside.get(index, _NOWHERE)[:3],
                 integer=self._integer,
+                made_by=self._made_by(each[:, :, index], low[index], high[index], inside.get(index, _NOWHERE)[3]),
+                strays=self._named(_strays(each[:, :, index])),
             )
-            for index, (low, high, at_low, at_high, steps, distinct) in enumerate(zip(*columns, few, strict=True))
-            if steps
+            for index, values in enumerate(self._distinct)
+            if steps[index]
         )
 
+    def still(self) -> dict[str, np.ndarray]:
+        """By name of each demonstration that has the same control [A] in all of :data:`FEWEST` steps or more: it."""
+        return {
+            name: low
+            for name, (low, high, *_, steps) in self._columns.items()
+            if (same(low, high) & (steps >= FEWEST)).all()
+        }
 
-def _merged(before: Sequence[np.ndarray], new: Sequence[np.ndarray]) -> list[np.ndarray]:
-    low, high = np.minimum(before[0], new[0]), np.maximum(before[1], new[1])
-    at_low, at_high = (
-        sum(np.where(same(part[end], value), part[end + 2], 0) for part in (before, new))
-        for end, value in ((0, low), (1, high))
-    )
-    return [low, high, np.asarray(at_low), np.asarray(at_high), before[4] + new[4]]
+    def _made_by(
+        self, each: np.ndarray, low: float, high: float, at_inside: np.ndarray
+    ) -> dict[str, tuple[str, ...]]:
+        """``made_by`` of a dimension, from its columns [N, 5] and the steps [N] at its value inside."""
+        ends = [np.where(same(each[:, place], end), each[:, place + 2], 0) for place, end in ((0, low), (1, high))]
+        counted = {"minimum": (ends[0], OFTEN), "maximum": (ends[1], OFTEN), "inside": (at_inside, ATOM)}
+        named = {end: self._named(_makers(at, each[:, 4], often)) for end, (at, often) in counted.items() if len(at)}
+        return {end: names for end, names in named.items() if names}
+
+    def _named(self, places: np.ndarray) -> tuple[str, ...]:
+        names = list(self._columns)
+        return tuple(names[place] for place in sorted(places.tolist()))
+
+
+_NOWHERE: tuple[float | None, int, tuple[int, ...], np.ndarray] = (None, 0, (), np.empty(0))
+
+
+def most_few(number: int) -> int:
+    """The largest number of demonstrations, of so many, that are few (:data:`FEW`)."""
+    return max(1, int(FEW * number)) if number > 2 else 0
+
+
+def _makers(at: np.ndarray, steps: np.ndarray, often: float) -> np.ndarray:
+    """The few demonstrations without which a value is rare, at most half as common as it is ``often``.
+
+    :param at: steps [N] of each demonstration at the value, of ``steps`` [N].
+    :returns: their places; empty where the value is rare with them, or common without them.
+    """
+    order = np.argsort(-at, kind="stable")
+    rest = [at[order[count:]].sum() / max(steps[order[count:]].sum(), 1) for count in range(most_few(len(at)) + 1)]
+    rare = [count for count, share in enumerate(rest) if share < often / 2]
+    return order[: rare[0]] if rare and rest[0] >= often else order[:0]
+
+
+def _strays(each: np.ndarray) -> np.ndarray:
+    """The few demonstrations without which a dimension, with columns [N, 5], would be constant or a switch."""
+    low, high, at_low, at_high, steps = each.T
+    two = (at_low + at_high == steps) | same(low, high)
+    values, times = np.unique(np.concatenate([low[two], high[two]]), return_counts=True)
+    kept = values[np.argsort(-times, kind="stable")]
+    for count in (1, 2):
+        within = two & np.all([np.any([same(end, value) for value in kept[:count]], axis=0) for end in (low, high)], 0)
+        outside = np.flatnonzero(~within & (steps > 0))
+        if len(kept) >= count and len(outside) <= most_few(len(each)):
+            return outside
+    return np.empty(0, dtype=int)
+
+
+def _merged(each: np.ndarray) -> list[np.ndarray]:
+    """Minimum, maximum, steps there and steps of several parts [P, 5, A], together."""
+    low, high = each[:, 0].min(0), each[:, 1].max(0)
+    at = (np.where(same(each[:, end], value), each[:, end + 2], 0).sum(0) for end, value in ((0, low), (1, high)))
+    return [low, high, *at, each[:, 4].sum(0)]
 
 
 CHUNK = 4096
@@ -210,25 +291,36 @@ class _CommonValues:
         self._waiting: list[np.ndarray] = []
         self._values: list[tuple[int, float]] = []
         self._counts = np.zeros((0, 0))
+        self._each: dict[tuple[int, float], Counter[int]] = {}  # steps by demonstration
 
-    def add(self, controls: np.ndarray) -> None:
-        """Add some steps [T, A]."""
+    def add(self, controls: np.ndarray, demonstration: int) -> None:
+        """Add some steps [T, A] of the demonstration with this number."""
         if controls.shape[1] <= MOST_DIMENSIONS:
-            self._waiting.append(controls)
+            self._waiting.append(np.column_stack([controls, np.full(len(controls), demonstration)]))
         if sum(map(len, self._waiting)) >= CHUNK:
             rows = np.concatenate(self._waiting)
             whole = len(rows) // CHUNK * CHUNK
             for chunk in np.split(rows[:whole], whole // CHUNK):
-                self._count(chunk)
+                self._count(chunk[:, :-1], chunk[:, -1].astype(int))
             self._waiting = [rows[whole:]]
 
-    def inside(self, low: np.ndarray, high: np.ndarray) -> dict[int, tuple[float, int, tuple[int, ...]]]:
-        """By dimension: its commonest value between the extremes, the count, and the dimensions that rest with it."""
+    def inside(
+        self, low: np.ndarray, high: np.ndarray, steps: np.ndarray
+    ) -> dict[int, tuple[float, int, tuple[int, ...], np.ndarray]]:
+        """By dimension: its commonest value between the extremes, the count, the dimensions that rest with it, and the
+        count in each demonstration. A value that few demonstrations make comes last.
+
+        :param steps: of each demonstration and dimension, [N, A].
+        """
         if waiting := [rows for rows in self._waiting if len(rows)]:
-            self._count(np.concatenate(waiting))
+            rows = np.concatenate(waiting)
+            self._count(rows[:, :-1], rows[:, -1].astype(int))
             self._waiting = []
+        each = [np.array([counted[number] for number in range(len(steps))]) for counted in self._each.values()]
+        made = [len(_makers(at, steps[:, dim], ATOM)) > 0 for at, (dim, _) in zip(each, self._values, strict=True)]
         places: dict[int, int] = {}
-        for place, (dimension, value) in enumerate(self._values):  # the commonest come first
+        for place in sorted(range(len(made)), key=made.__getitem__):  # the commonest come first
+            dimension, value = self._values[place]
             if not same(np.array([low[dimension], high[dimension]]), value).any():
                 places.setdefault(dimension, place)
         return {
@@ -236,6 +328,7 @@ class _CommonValues:
                 self._values[place][1],
                 int(self._counts[place, place]),
                 tuple(other for other, at in sorted(places.items()) if at != place and self._together(place, at)),
+                each[place],
             )
             for dimension, place in places.items()
         }
@@ -248,7 +341,7 @@ class _CommonValues:
     def _known(self, dimension: int, value: float) -> bool:
         return any(own == dimension and same(np.array(known), value) for own, known in self._values)
 
-    def _count(self, rows: np.ndarray) -> None:
+    def _count(self, rows: np.ndarray, demonstrations: np.ndarray) -> None:
         for dimension, column in enumerate(rows.T):
             values, times = np.unique(column[np.isfinite(column)], return_counts=True)
             often = np.argsort(-times, kind="stable")[:KEPT]
@@ -259,21 +352,23 @@ class _CommonValues:
                     self._values.append(each)
         at = np.zeros((len(rows), len(self._values)), np.float32)
         for place, (dimension, value) in enumerate(self._values):
-            at[:, place] = same(rows[:, dimension], value)
+            at[:, place] = there = same(rows[:, dimension], value)
+            self._each.setdefault((dimension, value), Counter()).update(demonstrations[there].tolist())
         counts = (at.T @ at).astype(np.float64)
         counts[: len(self._counts), : len(self._counts)] += self._counts
         order = np.argsort(-counts.diagonal(), kind="stable").tolist()
         owners = [self._values[place][0] for place in order]
         kept = [place for rank, place in enumerate(order) if owners[:rank].count(owners[rank]) < KEPT]
         self._values = [self._values[place] for place in kept]
+        self._each = {each: self._each[each] for each in self._values}
         self._counts = counts[np.ix_(kept, kept)]
 
 
-def control_dimensions(controls: Iterable[np.ndarray]) -> tuple[ControlDimension, ...]:
-    """The statistics of each control dimension in blocks of steps [T, A]."""
+def control_dimensions(controls: Mapping[str, np.ndarray]) -> tuple[ControlDimension, ...]:
+    """The statistics of each control dimension in demonstrations [T, A] by name."""
     statistics = ControlStatistics()
-    for block in controls:
-        statistics.add(block)
+    for name, steps in controls.items():
+        statistics.add(steps, name)
     return statistics.dimensions()
 
 
@@ -479,7 +574,7 @@ def _decided(dimension: ControlDimension, alone: bool) -> tuple[str, str]:
         return "hurdle", dimension.atom + ("; often at an extreme" if dimension.extremes else "")
     if dimension.extremes:
         return "clipped", "often exactly at an extreme"
-    return "gaussian", "varies freely"
+    return "gaussian", f"varies freely; {dimension.made}" if dimension.made else "varies freely"
 
 
 def _declared(dimension: ControlDimension, kind: str) -> tuple[str, str]:

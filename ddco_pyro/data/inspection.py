@@ -315,7 +315,7 @@ class _Inspector:
             values = block.reshape(len(block), -1)
             first = first if step else values[:1].copy()
             if array.place == "actions":
-                self.control.add(block)
+                self.control.add(block, name)
             self.coincidences.add(array.place, values, step, column.image)
             array.add(values, name, step, first)
             step += len(values)

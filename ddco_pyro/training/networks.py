@@ -50,7 +50,7 @@ class Dimensions:
 
         :raises DemonstrationsError: every dimension of the control is constant.
         """
-        control = control_dimensions(demo.actions for demo in demonstrations)
+        control = control_dimensions({demo.name: demo.actions for demo in demonstrations})
         constant = {dimension.number: dimension.minimum for dimension in control if dimension.constant}
         if len(constant) == len(control):
             raise DemonstrationsError(all_constant(control))
