@@ -127,7 +127,7 @@ def test_a_few_broken_demonstrations_are_left_out(path: Path, tmp_path: Path) ->
     spec = load_spec(written)
     assert spec.demonstrations.exclude == ("demo_2", "demo_9")
     assert [one.key for one in spec.observations] == ["pose"]
-    assert "# NaN, infinite or huge values, or damaged; where: ddco-pyro inspect" in text
+    assert "# NaN, infinite or huge values, damaged, or odd; why: ddco-pyro inspect" in text
     assert text.startswith("# A starting spec for 8 demonstrations of 3 to 6 steps.")
     fit = ddco_pyro.fit(load_spec(written, ["training.epochs=1", "compare_with=[]"]), out=tmp_path / "run")
     numbers = fit.metrics.demonstrations

@@ -121,7 +121,7 @@ class ControlDimension:
             return ""
         by = {name: getattr(self, end) for end in ("inside", "minimum", "maximum") for name in self.made_by.get(end, ())}
         names = {value: [name for name in by if by[name] == value] for value in by.values()}
-        return "; ".join(f"{number(value)} is often the value in {few(own)} alone" for value, own in names.items())
+        return "; ".join(f"{number(value)} is common in {few(own)} alone" for value, own in names.items())
 
     @property
     def note(self) -> str:
@@ -220,8 +220,8 @@ class ControlStatistics:
     ) -> dict[str, tuple[str, ...]]:
         """``made_by`` of a dimension, from its columns [N, 5] and the steps [N] at its value inside."""
         ends = [np.where(same(each[:, place], end), each[:, place + 2], 0) for place, end in ((0, low), (1, high))]
-        counted = {"minimum": (ends[0], OFTEN), "maximum": (ends[1], OFTEN), "inside": (at_inside, ATOM)}
-        named = {end: self._named(_makers(at, each[:, 4], often)) for end, (at, often) in counted.items() if len(at)}
+        counted = {"minimum": (ends[0], OFTEN, 2), "maximum": (ends[1], OFTEN, 2), "inside": (at_inside, ATOM, FEWEST)}
+        named = {end: self._named(_makers(at, each[:, 4], *often)) for end, (at, *often) in counted.items() if len(at)}
         return {end: names for end, names in named.items() if names}
 
     def _named(self, places: np.ndarray) -> tuple[str, ...]:
@@ -237,16 +237,17 @@ def most_few(number: int) -> int:
     return max(1, int(FEW * number)) if number > 2 else 0
 
 
-def _makers(at: np.ndarray, steps: np.ndarray, often: float) -> np.ndarray:
-    """The few demonstrations without which a value is rare, at most half as common as it is ``often``.
+def _makers(at: np.ndarray, steps: np.ndarray, often: float, least: int) -> np.ndarray:
+    """The few demonstrations without which a value is rare, less than half as common as ``often``.
 
     :param at: steps [N] of each demonstration at the value, of ``steps`` [N].
+    :param often: share of the steps from which on the value is common, unless it has fewer than ``least`` steps.
     :returns: their places; empty where the value is rare with them, or common without them.
     """
     order = np.argsort(-at, kind="stable")
     rest = [at[order[count:]].sum() / max(steps[order[count:]].sum(), 1) for count in range(most_few(len(at)) + 1)]
     rare = [count for count, share in enumerate(rest) if share < often / 2]
-    return order[: rare[0]] if rare and rest[0] >= often else order[:0]
+    return order[: rare[0]] if rare and rest[0] >= often and at.sum() >= least else order[:0]
 
 
 def _strays(each: np.ndarray) -> np.ndarray:
@@ -317,7 +318,7 @@ class _CommonValues:
             self._count(rows[:, :-1], rows[:, -1].astype(int))
             self._waiting = []
         each = [np.array([counted[number] for number in range(len(steps))]) for counted in self._each.values()]
-        made = [len(_makers(at, steps[:, dim], ATOM)) > 0 for at, (dim, _) in zip(each, self._values, strict=True)]
+        made = [len(_makers(at, steps[:, dim], ATOM, FEWEST)) > 0 for at, (dim, _) in zip(each, self._values, strict=True)]
         places: dict[int, int] = {}
         for place in sorted(range(len(made)), key=made.__getitem__):  # the commonest come first
             dimension, value = self._values[place]

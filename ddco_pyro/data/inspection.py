@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -26,7 +27,19 @@ from ddco_pyro.data.checks import (
     rounding,
     usable,
 )
-from ddco_pyro.data.controls import ControlDimension, ControlStatistics, control_parts, described, listed, notes, number
+from ddco_pyro.data.controls import (
+    FEWEST,
+    ControlDimension,
+    ControlStatistics,
+    control_parts,
+    described,
+    few,
+    listed,
+    most_few,
+    notes,
+    number,
+    same,
+)
 from ddco_pyro.data.hdf5 import DemonstrationsError, outside_files
 from ddco_pyro.data.pictures import MOVED
 from ddco_pyro.data.sources import Column, Format, Source, open_source
@@ -154,6 +167,7 @@ class Inspection:
     :param excluded: names of demonstrations that were skipped.
     :param unreadable: names of demonstrations that could not be read.
     :param external: other files that the HDF5 file names as parts of itself; they are not read.
+    :param odd: names of demonstrations that are dead or padded and change the model of all, and why.
     """
 
     path: Path
@@ -169,13 +183,20 @@ class Inspection:
     excluded: tuple[str, ...] = ()
     unreadable: tuple[str, ...] = ()
     external: tuple[str, ...] = ()
+    odd: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def exclusions(self) -> list[str]:
+        """A line for each reason to exclude demonstrations, with their names."""
+        names = {why: [name for name in self.odd if self.odd[name] == why] for why in self.odd.values()}
+        return [f"{few(own)}: {why}; exclude {'them' if len(own) > 1 else 'it'}" for why, own in names.items()]
 
     @property
     def notes(self) -> list[str]:
-        """A line for each unusual control dimension, each coincidence, and each kind of control."""
+        """A line for each odd demonstration, unusual control dimension, coincidence, and kind of control."""
         auto = control_parts(ControlSpec(), self.control) if self.control else ()
         kinds = (f"{line}, by control.kind: auto" for line in described(auto))
-        return [*notes(self.control), *self.coincidences, *kinds]
+        return [*self.exclusions, *notes(self.control), *self.coincidences, *kinds]
 
     @property
     def affected(self) -> list[str]:
@@ -279,12 +300,40 @@ class _Inspector:
             frequency=source.frequency,
             problems=[*kinds, *_problems_of_division(source, names, masks), *_problems(fields, self.lengths)],
             control=dimensions,
-            coincidences=tuple(self.coincidences.notes(masks, varying)),
+            coincidences=tuple(self.coincidences.notes(masks, dimensions)),
             leaks=tuple(p for p, array in fields.items() if self.coincidences.leaks(p, varying, array.constant)),
             excluded=exclude,
             unreadable=tuple(unreadable),
             external=tuple(sorted(external)),
+            odd=self._odd(dimensions),
         )
+
+    def _odd(self, dimensions: Sequence[ControlDimension]) -> dict[str, str]:
+        """Names of demonstrations to exclude, and why.
+
+        Dead ones are, and those whose padding, or other values of a switch, make what no other demonstration has. A
+        demonstration that rests or saturates for long is not.
+        """
+        if any(dimension.integer for dimension in dimensions):
+            return {}
+        still = self.control.still()
+        dead = [name for name, row in still.items() if not row.any()]
+        others = [name for name in still if name not in dead]
+        found = dict.fromkeys(dead, "all commands are 0") if 2 * len(dead) < len(self.lengths) else {}
+        if len(others) <= most_few(len(self.lengths)):
+            found |= dict.fromkeys(others, "all commands are the same")
+        paddings = self.coincidences.paddings()
+        for dimension in dimensions:
+            made = {name: getattr(dimension, end) for end, names in dimension.made_by.items() for name in names}
+            for name in (*made, *dimension.strays):
+                rows = paddings.get(name, {}).items()
+                value = made.get(name, math.nan)
+                why = next((why for why, row in rows if name not in made or same(row[dimension.number], value)), "")
+                if not why and name in dimension.strays and not dimension.values:
+                    why = f"control dimension {dimension.number} has further values there, and is a switch elsewhere"
+                if why:
+                    found.setdefault(name, why)
+        return {name: found[name] for name in self.lengths if name in found}
 
     def _read(self, name: str) -> set[str]:
         """Read a demonstration; the places of its arrays."""
@@ -364,6 +413,12 @@ WIDEST = 10_000
 FEW = 3
 """Number of values of a switch with padding."""
 
+STILL = 0.01
+"""Numbers that change by at most this part of their range are still."""
+
+LONG, LONG_SHARE = 10, 0.1
+"""A stretch is long from so many steps on, and from this share of the demonstration."""
+
 SHIFTS = {0: "at the same step", 1: "of the next step", -1: "of the step before"}
 """Steps by which a control follows the observation that equals it."""
 
@@ -372,8 +427,9 @@ SHIFTS = {0: "at the same step", 1: "of the next step", -1: "of the step before"
 class _Demonstration:
     """What is known of one demonstration.
 
-    :param tails: for each array, the number of equal last steps.
-    :param commands: the first controls [T, A].
+    :param tails: for each array, the controls first, the number of equal last steps.
+    :param commands: the first controls [T, A], at most :data:`LOOKED_AT`; ``ending`` the last ones.
+    :param rests: for each vector, the number of first steps and of last steps in which it hardly changes.
     :param values: the values of each control dimension; from :data:`FEW` + 1 values on, not all of them.
     :param ends: for each control dimension, the number of steps up to the last nonzero value.
     :param zeros: for each control dimension, the number of steps with value 0.
@@ -384,6 +440,8 @@ class _Demonstration:
     digest: bytes = b""
     tails: list[int] = field(default_factory=list)
     commands: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
+    ending: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
+    rests: list[tuple[int, int]] = field(default_factory=list)
     values: list[frozenset[float]] = field(default_factory=list)
     ends: list[int] = field(default_factory=list)
     zeros: list[int] = field(default_factory=list)
@@ -395,8 +453,9 @@ class _Demonstration:
 
     def add_controls(self, controls: np.ndarray, first: int) -> None:
         """Add controls [T, A] from step ``first`` on."""
+        self.commands = _joined(self.commands, controls)[:LOOKED_AT]
+        self.ending = _joined(self.ending, controls)[-LOOKED_AT:]
         if not first:
-            self.commands = controls[:LOOKED_AT].copy()
             self.values = [frozenset()] * controls.shape[1]
             self.ends, self.zeros = [0] * controls.shape[1], [0] * controls.shape[1]
         for dimension, column in enumerate(controls.T):
@@ -409,6 +468,17 @@ class _Demonstration:
                 self.ends[dimension] = first + int(moved[-1]) + 1
 
 
+def _joined(before: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    return np.concatenate([before, rows]) if len(before) else rows.copy()
+
+
+def _rest(rows: np.ndarray, span: np.ndarray) -> int:
+    """The number of first rows [T, D] that equal the very first one up to a small part of ``span`` [D]."""
+    with np.errstate(invalid="ignore"):
+        moved = (np.abs(rows - rows[0].astype(np.float64)) > STILL * span).any(1)
+    return int(moved.argmax()) if moved.any() else len(rows)
+
+
 class _Coincidences:
     """Suspicious equalities: padded ends, copied demonstrations, and controls among the observations."""
 
@@ -417,6 +487,7 @@ class _Coincidences:
         self._equal: dict[str, np.ndarray] = {}  # by place, for each shift, [D, A]: whether they are always equal
         self._compared: dict[str, np.ndarray] = {}  # number of compared steps, for each shift
         self._place, self._tail, self._last, self._digest = "", 0, np.empty(0), hashlib.sha256()
+        self._first = self._end = self._low = self._high = np.empty(0)  # of the array: rows, and the range
 
     def begin(self, name: str, steps: int) -> None:
         """Begin a demonstration, whose controls come first."""
@@ -429,6 +500,7 @@ class _Coincidences:
     def begin_column(self, place: str) -> None:
         """Begin an array of the demonstration."""
         self._place, self._tail, self._digest = place, 0, hashlib.sha256(place.encode())
+        self._first = self._end = np.empty((0, 0))
 
     def add(self, place: str, rows: np.ndarray, first: int, image: bool) -> None:
         """Add rows [T, D] of the array from step ``first`` on."""
@@ -440,6 +512,12 @@ class _Coincidences:
         continues = first and tail == len(rows) and np.array_equal(rows[0], self._last)
         self._tail, self._last = tail + (self._tail if continues else 0), rows[-1].copy()
         self._digest.update(np.ascontiguousarray(rows).tobytes())
+        if not image and place != "actions" and rows.shape[1] <= WIDEST:
+            ends = [rows.min(0), rows.max(0)]
+            self._low, self._high = (
+                (np.minimum(self._low, ends[0]), np.maximum(self._high, ends[1])) if first else ends
+            )
+            self._first, self._end = _joined(self._first, rows)[:LOOKED_AT], _joined(self._end, rows)[-LOOKED_AT:]
         if place == "actions":
             demo.add_controls(rows, first)
         elif len(demo.commands) and not first and not image and rows.shape[1] <= WIDEST:
@@ -450,6 +528,10 @@ class _Coincidences:
         if not self._place.startswith("labels/"):
             self._demos[-1].tails.append(self._tail)
             self._demos[-1].digest += self._digest.digest()
+        if len(self._first):
+            with np.errstate(invalid="ignore"):
+                span = self._high.astype(np.float64) - self._low
+            self._demos[-1].rests.append((_rest(self._first, span), _rest(self._end[::-1], span)))
 
     def _compare(self, place: str, rows: np.ndarray, commands: np.ndarray) -> None:
         """Update which numbers of an observation [T, D] equal controls [T, A] of the same or a neighbouring step."""
@@ -468,12 +550,46 @@ class _Coincidences:
             for dimension in np.flatnonzero(equal[at].any(0)):
                 equal[at, :, dimension] &= (own == ahead[:, [dimension]]).all(0)
 
-    def notes(self, masks: Mapping[str, Sequence[str]], varying: Sequence[int]) -> list[str]:
-        """A line for each kind of coincidence, with a count and the first place.
+    def notes(self, masks: Mapping[str, Sequence[str]], dimensions: Sequence[ControlDimension]) -> list[str]:
+        """A line for each kind of coincidence, with a count and the first place."""
+        varying = [dimension.number for dimension in dimensions if not dimension.constant]
+        padding = list(self._padding())
+        idle = () if any(dimension.integer for dimension in dimensions) else self._idle(dimensions, bool(padding))
+        return [*self._switches(varying), *padding, *idle, *self._copies(masks), *self._observed(varying)]
 
-        :param varying: the control dimensions that are not constant.
-        """
-        return [*self._switches(varying), *self._padding(), *self._copies(masks), *self._observed(varying)]
+    def paddings(self) -> dict[str, dict[str, np.ndarray]]:
+        """By name of the few demonstrations with equal commands at an end: the stretch in words, and the command."""
+        found: dict[str, dict[str, np.ndarray]] = {}
+        for where in ("first", "last"):
+            rows = {demo.name: demo.ending[::-1] if where == "last" else demo.commands for demo in self._demos}
+            steps = {name: _rest(own, np.zeros(own.shape[1])) for name, own in rows.items() if len(own)}
+            padded = [name for name in steps if steps[name] >= FEWEST]
+            for name in padded if len(padded) <= most_few(len(rows)) else ():
+                why = f"the {where} {steps[name]} commands are the same, as padding is"
+                found.setdefault(name, {})[why] = rows[name][0]
+        return found
+
+    def _idle(self, dimensions: Sequence[ControlDimension], padded: bool) -> Iterator[str]:
+        """A line for the demonstrations that begin with a long idle stretch, and for those that end with one."""
+        span = np.array([dimension.maximum - dimension.minimum for dimension in dimensions])
+        moves = [place for place, dimension in enumerate(dimensions) if not dimension.values]
+        for end, where in enumerate(("start", "end")):
+            found: dict[str, int] = {}
+            for demo in self._demos:
+                rows = demo.ending[::-1] if end else demo.commands
+                if demo.steps == 0 or rows.shape[1] != len(span) or (end and padded and demo.tail > 1):
+                    continue
+                steps = _rest(rows, span)
+                if rows[0][moves].any():  # no velocity: what is seen has to rest, too
+                    steps = min([steps, *(rests[end] for rests in demo.rests)])
+                if max(LONG, LONG_SHARE * demo.steps) <= steps < demo.steps:
+                    found[demo.name] = steps
+            if found:
+                name, steps = next(iter(found.items()))
+                yield (
+                    f"nothing moves at the {where} of {len(found)} of {len(self._demos)} demonstrations, in {name} for "
+                    f"{steps} steps: cut such stretches off, or an option may be the waiting"
+                )
 
     def leaks(self, place: str, varying: Sequence[int], still: Sequence[int]) -> bool:
         """Whether an observation holds nothing but controls that are still to be predicted.
@@ -542,7 +658,8 @@ class _Coincidences:
             if len(whole) != FEW or 0.0 not in whole:
                 continue
             padded = [demo for demo in each if demo.zeros[dimension]]
-            if all(demo.ends[dimension] + demo.zeros[dimension] == demo.steps for demo in padded):
+            ends = all(demo.ends[dimension] + demo.zeros[dimension] == demo.steps for demo in padded)
+            if ends and len(padded) > most_few(len(each)):  # fewer are odd
                 low, high = map(number, sorted(whole - {0.0}))
                 yield (
                     f"control dimension {dimension}: {low} or {high}, and 0 at the end of {len(padded)} of {len(each)} "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -62,12 +62,14 @@ PICTURES = Recipe(batch_steps=250, gradient_steps=4000, epochs=20)
 def starting_spec(inspection: Inspection, path: str | Path) -> str:
     """The commented YAML text of a spec for the inspected demonstrations, with ``path`` as its file.
 
-    Unreadable demonstrations are excluded. Demonstrations with unusable values are excluded if they are few; otherwise
-    the affected observations are left out, and comments say why.
+    Unreadable and odd demonstrations are excluded. Demonstrations with unusable values are excluded if they are few;
+    otherwise the affected observations are left out. Comments say why.
 
     :raises DemonstrationsError: nothing can be fitted to the demonstrations.
     """
-    excluded = sorted({*inspection.unreadable, *_few_affected(inspection)}, key=natural)
+    odd = list(inspection.odd) if _divides(inspection, inspection.odd) else []
+    excluded = sorted({*inspection.unreadable, *_few_affected(inspection), *odd}, key=natural)
+    reasons = [printable(line) for line in inspection.exclusions if odd]
     if excluded:
         inspection = inspect(inspection.path, exclude=excluded)
     try:
@@ -85,12 +87,14 @@ def starting_spec(inspection: Inspection, path: str | Path) -> str:
     used = [field for field in observed if not _left_out(inspection, field)]
     if not used:
         raise DemonstrationsError(f"{inspection.path}: no observation can be used; see what is wrong with: {look}")
-    text = _filled(inspection, str(path), observed, used)
+    text = _filled(inspection, str(path), observed, used, reasons)
     parse_spec(read_yaml(text))  # the text is a valid spec
     return text
 
 
-def _filled(inspection: Inspection, path: str, observed: Sequence[Field], used: Sequence[Field]) -> str:
+def _filled(
+    inspection: Inspection, path: str, observed: Sequence[Field], used: Sequence[Field], reasons: Sequence[str]
+) -> str:
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("ddco_pyro.data", "."),
         undefined=jinja2.StrictUndefined,
@@ -109,6 +113,7 @@ def _filled(inspection: Inspection, path: str, observed: Sequence[Field], used: 
         path=path,
         lengths=lengths,
         excluded=inspection.excluded,
+        reasons=reasons,
         masks=[name for name in ("train", "valid") if name in masks],
         other_masks=[name for name in masks if name not in ("train", "valid")],
         valid_fraction=f"{_valid_fraction(len(lengths)):.2g}",
@@ -162,12 +167,18 @@ def _few_affected(inspection: Inspection) -> list[str]:
     most = MOST_EXCLUDED * len(inspection.lengths)
     keys = [field for field in (inspection.actions, *inspection.observations) if field and inspection.everywhere(field)]
     names = {name for field in keys if len(field.affected) <= most for name in field.affected}
-    masks = {mask: [name for name in members if name not in names] for mask, members in inspection.masks.items()}
+    fits = len(names) <= most and _divides(inspection, names)
+    return [name for name in inspection.lengths if name in names] if fits else []
+
+
+def _divides(inspection: Inspection, without: Collection[str]) -> bool:
+    """Whether enough demonstrations for a fit are left without these."""
+    masks = {mask: [name for name in members if name not in without] for mask, members in inspection.masks.items()}
     try:
-        check_division([name for name in inspection.lengths if name not in names], masks)
+        check_division([name for name in inspection.lengths if name not in without], masks)
     except DemonstrationsError:
-        return []
-    return [name for name in inspection.lengths if name in names] if len(names) <= most else []
+        return False
+    return True
 
 
 def _unusable(inspection: Inspection, field: Field) -> str:
