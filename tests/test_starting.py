@@ -19,6 +19,7 @@ import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
 from ddco_pyro.data.inspection import inspect
 from ddco_pyro.data.starting import starting_spec
+from ddco_pyro.report.likelihood import stds
 from ddco_pyro.spec import Spec, load_spec
 
 
@@ -85,6 +86,7 @@ def test_what_it_writes_finds_what_was_planted_as_it_is(path: Path, tmp_path: Pa
     adam = ["compare_with=[]", "training.optimizer={name: adam, lr: 3.0e-3}"]
     assert short_of_the_truth(ddco_pyro.fit(load_spec(spec, adam))) < 0.1
     assert list(fit.baselines) == ["mixture", "flat", "flat_equal"]
+    assert ended.out.count("flat and flat of equal size have a σ that depends on the state.") == 1
     assert fit.metrics.agreement.valid[0].nmi > 0.95  # with the labels in the file
 
 
@@ -164,6 +166,10 @@ def test_pictures_alone_are_seen_by_one_network(tmp_path: Path) -> None:
     assert set(spec.hierarchy.trunk.of) == set(CAMERAS)
     fit = ddco_pyro.fit(load_spec(written, ["training.epochs=2"]))
     assert list(fit.baselines) == ["mixture", "flat_equal"]
+    assert (
+        stds(fit)
+        == "DDCO and mixture have one σ for each option; flat of equal size has a σ that depends on the state."
+    )
 
 
 CAMERAS = {"eye": (40, 80), "2nd eye": (12, 16)}

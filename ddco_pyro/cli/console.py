@@ -226,14 +226,17 @@ ONE_FIT = (
 )
 
 
-def log_likelihoods(metrics: Metrics) -> None:
-    """Log-likelihood of the model and of its baselines, as in the report."""
-    from ddco_pyro.report.likelihood import table
+def log_likelihoods(fit: Fit) -> None:
+    """Log-likelihood of the model and of its baselines, as in the report, and in what their σ differs."""
+    from ddco_pyro.report.likelihood import stds, table
 
+    metrics = fit.metrics
     show(table(metrics, 3, "log-likelihood, nats per step (higher is better)"))
     if metrics.worth:
         said = words.worth(metrics.worth, words.method(metrics.model), len(metrics.valid))
         say(said if metrics.seeds else f"{said} {ONE_FIT}")
+    if differ := stds(fit):
+        say(differ)
     for name, training in metrics.trainings.items():
         if restarts := words.restarts(training):
             say(f"{name}: {restarts}")
@@ -280,13 +283,18 @@ def successes(metrics: Metrics) -> None:
 # --- inspect ----------------------------------------------------------------------------------------------------------
 
 
+UNKNOWN_FREQUENCY = (
+    'not in the file; with h5py, file.attrs["control_frequency"] = 20 says 20 steps per second, and pages have seconds'
+)
+
+
 def inspection(facts: Inspection) -> None:
     """The contents of a file of demonstrations."""
     steps = np.array(list(facts.lengths.values()) or [0])
     lengths = f"{steps.min()} to {steps.max()} steps (median {np.median(steps):g}, {steps.sum()} in all)"
     lines = [
         f"{facts.path}: {facts.format}, {len(facts.lengths)} demonstrations of {lengths}",
-        f"control frequency: {f'{facts.frequency:g} Hz' if facts.frequency else 'not in the file'}",
+        f"control frequency: {f'{facts.frequency:g} Hz' if facts.frequency else UNKNOWN_FREQUENCY}",
         *(f"mask/{name}: {len(names)} demonstrations" for name, names in facts.masks.items()),
         *(f"names another file as a part of it: {path}" for path in facts.external),
     ]

@@ -173,7 +173,7 @@ def _fit_and_report(
             fitted = repeat(fitted, seeds, progress, jobs)
     from ddco_pyro.report import write_report  # imports matplotlib, after the fit
 
-    console.log_likelihoods(fitted.metrics)
+    console.log_likelihoods(fitted)
     console.seeds(fitted.metrics)
     console.warnings(fitted)
     if fitted.named:
@@ -272,7 +272,7 @@ def merge(
     pair = merging.chosen(before, level, options)
     with console.Progress() as progress:
         fitted = merging.merge(before, pair, folder, progress, jobs)
-    console.log_likelihoods(fitted.metrics)
+    console.log_likelihoods(fitted)
     console.merged(pair, before, fitted)
     console.warnings(fitted)
     print(f"report: {write_report(fitted, fitted.demonstrations)}")

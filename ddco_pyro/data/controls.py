@@ -119,9 +119,8 @@ class ControlDimension:
         """The values that few demonstrations make, in words; empty without any."""
         if self.values or self.discrete:
             return ""
-        by = {name: getattr(self, end) for end in ("inside", "minimum", "maximum") for name in self.made_by.get(end, ())}
-        names = {value: [name for name in by if by[name] == value] for value in by.values()}
-        return "; ".join(f"{number(value)} is common in {few(own)} alone" for value, own in names.items())
+        each = ((getattr(self, end), names) for end, names in self.made_by.items())
+        return "; ".join(f"{number(value)} is common in {few(names)} alone" for value, names in each)
 
     @property
     def note(self) -> str:
@@ -215,14 +214,13 @@ class ControlStatistics:
             if (same(low, high) & (steps >= FEWEST)).all()
         }
 
-    def _made_by(
-        self, each: np.ndarray, low: float, high: float, at_inside: np.ndarray
-    ) -> dict[str, tuple[str, ...]]:
+    def _made_by(self, each: np.ndarray, low: float, high: float, at_inside: np.ndarray) -> dict[str, tuple[str, ...]]:
         """``made_by`` of a dimension, from its columns [N, 5] and the steps [N] at its value inside."""
         ends = [np.where(same(each[:, place], end), each[:, place + 2], 0) for place, end in ((0, low), (1, high))]
-        counted = {"minimum": (ends[0], OFTEN, 2), "maximum": (ends[1], OFTEN, 2), "inside": (at_inside, ATOM, FEWEST)}
-        named = {end: self._named(_makers(at, each[:, 4], *often)) for end, (at, *often) in counted.items() if len(at)}
-        return {end: names for end, names in named.items() if names}
+        places = {end: _makers(at, each[:, 4], OFTEN, 2) for end, at in zip(("minimum", "maximum"), ends, strict=True)}
+        if len(at_inside):
+            places["inside"] = _makers(at_inside, each[:, 4], ATOM, FEWEST)
+        return {end: self._named(names) for end, names in places.items() if len(names)}
 
     def _named(self, places: np.ndarray) -> tuple[str, ...]:
         names = list(self._columns)
@@ -318,7 +316,8 @@ class _CommonValues:
             self._count(rows[:, :-1], rows[:, -1].astype(int))
             self._waiting = []
         each = [np.array([counted[number] for number in range(len(steps))]) for counted in self._each.values()]
-        made = [len(_makers(at, steps[:, dim], ATOM, FEWEST)) > 0 for at, (dim, _) in zip(each, self._values, strict=True)]
+        pairs = zip(each, self._values, strict=True)
+        made = [len(_makers(at, steps[:, dimension], ATOM, FEWEST)) > 0 for at, (dimension, _) in pairs]
         places: dict[int, int] = {}
         for place in sorted(range(len(made)), key=made.__getitem__):  # the commonest come first
             dimension, value = self._values[place]

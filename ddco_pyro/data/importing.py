@@ -15,7 +15,8 @@ from ddco_pyro.data.checks import NUMBERS, check, check_alike, check_values
 from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError, opened
 from ddco_pyro.data.pictures import resized
 from ddco_pyro.data.sources import Column, Format, Recording, Source, open_source
-from ddco_pyro.data.sources.robomimic import FREQUENCY, Parts, discard, parts_of
+from ddco_pyro.data.sources.metadata import FREQUENCY
+from ddco_pyro.data.sources.robomimic import Parts, discard, parts_of
 from ddco_pyro.errors import BadInput, nearest
 
 IDENTITY = "imported"

@@ -43,6 +43,7 @@ from ddco_pyro.data.controls import (
 from ddco_pyro.data.hdf5 import DemonstrationsError, outside_files
 from ddco_pyro.data.pictures import MOVED
 from ddco_pyro.data.sources import Column, Format, Source, open_source
+from ddco_pyro.data.sources.metadata import rate
 from ddco_pyro.spec import ControlSpec
 
 
@@ -268,6 +269,7 @@ class _Inspector:
         self.lengths: dict[str, int] = {}
         self.problems: dict[tuple[str, str], list[str]] = {}  # messages by kind and subject
         self.control, self.coincidences = ControlStatistics(), _Coincidences()
+        self.periods: dict[str, dict[str, float]] = {}  # of a step, by what says so and by demonstration
 
     def inspection(self, path: Path) -> Inspection:
         """Read everything."""
@@ -300,7 +302,7 @@ class _Inspector:
             frequency=source.frequency,
             problems=[*kinds, *_problems_of_division(source, names, masks), *_problems(fields, self.lengths)],
             control=dimensions,
-            coincidences=tuple(self.coincidences.notes(masks, dimensions)),
+            coincidences=(*self.coincidences.notes(masks, dimensions), *self._other_rates()),
             leaks=tuple(p for p, array in fields.items() if self.coincidences.leaks(p, varying, array.constant)),
             excluded=exclude,
             unreadable=tuple(unreadable),
@@ -335,11 +337,24 @@ class _Inspector:
                     found.setdefault(name, why)
         return {name: found[name] for name in self.lengths if name in found}
 
+    def _other_rates(self) -> Iterator[str]:
+        """A line for the demonstrations that were recorded at another rate than most."""
+        for place, periods in self.periods.items():
+            usual = float(np.median(list(periods.values())))
+            others = [name for name, period in periods.items() if not 1 / SAME_RATE < period / usual < SAME_RATE]
+            if others:
+                yield (
+                    f"{few(others)}: recorded at another rate than most; by {place} a step takes "
+                    f"{periods[others[0]]:.4g}, and {usual:.4g} in the median demonstration: exclude or resample"
+                )
+
     def _read(self, name: str) -> set[str]:
         """Read a demonstration; the places of its arrays."""
         recording = self.source.recording(name)
         steps = self.lengths[name] = recording.actions.shape[0] if recording.actions.shape else 0
         self.coincidences.begin(name, steps)
+        if own := rate(recording.attributes):
+            self.periods.setdefault("its attributes", {})[name] = 1 / own
         for place, column in recording.columns():
             try:
                 check_steps(name, place, column, steps)
@@ -369,6 +384,10 @@ class _Inspector:
             array.add(values, name, step, first)
             step += len(values)
         self.coincidences.end_column()
+        if step > 1 and values.shape[1] == 1 and TIME.search(array.place):
+            period = (float(values[-1, 0]) - float(first[0, 0])) / (step - 1)
+            if 0 < period < math.inf:
+                self.periods.setdefault(array.place, {})[name] = period
 
     def _problem(self, kind: str, message: str, about: str) -> None:
         self.problems.setdefault((kind, about), []).append(message)
@@ -412,6 +431,12 @@ WIDEST = 10_000
 
 FEW = 3
 """Number of values of a switch with padding."""
+
+TIME = re.compile(r"^obs/(.*[/_.])?(time|times|time_?stamps?|t)$")
+"""Places of observations that are the time."""
+
+SAME_RATE = 1.2
+"""Two steps take equally long if their times differ by less than this factor."""
 
 STILL = 0.01
 """Numbers that change by at most this part of their range are still."""
@@ -514,9 +539,7 @@ class _Coincidences:
         self._digest.update(np.ascontiguousarray(rows).tobytes())
         if not image and place != "actions" and rows.shape[1] <= WIDEST:
             ends = [rows.min(0), rows.max(0)]
-            self._low, self._high = (
-                (np.minimum(self._low, ends[0]), np.maximum(self._high, ends[1])) if first else ends
-            )
+            self._low, self._high = (np.minimum(self._low, ends[0]), np.maximum(self._high, ends[1])) if first else ends
             self._first, self._end = _joined(self._first, rows)[:LOOKED_AT], _joined(self._end, rows)[-LOOKED_AT:]
         if place == "actions":
             demo.add_controls(rows, first)

@@ -51,6 +51,9 @@ class Recipe(NamedTuple):
     epochs: int
 
 
+EXACT_EPOCHS = 500
+"""Fewest epochs where a stage takes exact steps, one over all demonstrations in each epoch."""
+
 VECTORS = Recipe(batch_steps=1000, gradient_steps=6000, epochs=200)
 """About a minute on one core. The hierarchy and the baselines converge on the files of docs/decisions.md; with a
 patience of 20, flat policies stopped too early there."""
@@ -128,7 +131,7 @@ def _filled(
         batch=batch,
         em=em,
         few=em and len(lengths) < FEW and not {"train", "valid"} & set(masks),
-        epochs=_epochs(np.array(lengths), batch, recipe),
+        epochs=max(_epochs(np.array(lengths), batch, recipe), EXACT_EPOCHS if em else 0),
     )
 
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from ddco_pyro.inference import Posterior
 from ddco_pyro.metrics import Alike, Use
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
+from ddco_pyro.spec import TrainingSpec
 
 
 def option_use(posterior: Posterior) -> list[list[Use]]:
@@ -85,20 +86,22 @@ SMALLEST_DIVERGENCE = 0.1
 Kind = Literal["unused", "redundant", "dominating", "never_persisting", "high_fitting"]
 
 ADVICE: Mapping[Kind, str] = {
-    "unused": "Fewer options may do: compare hierarchy.levels.*.count by cross-validation (ddco-pyro select), or start "
-    "from clusters with training.initialize: vq and try more restarts.",
+    "unused": "Fewer options may do: compare hierarchy.levels.*.count by cross-validation (ddco-pyro select), or try "
+    "more restarts.",
     "redundant": "Make them one and see what it costs (ddco-pyro merge), or compare hierarchy.levels.*.count by "
-    "cross-validation (ddco-pyro select). If "
-    "they should differ, start from clusters of observations and controls (training.initialize: vq_controls) or lower "
-    "control.std, below which differences do not count.",
-    "dominating": "Start from clusters (training.initialize: vq), train layer by layer (training.layerwise: true), or "
-    "give the options' policies less capacity, so that one of them cannot do all the work.",
+    "cross-validation (ddco-pyro select). If they should differ, lower control.std, below which differences do not "
+    "count.",
+    "dominating": "Train layer by layer (training.layerwise: true), or give the options' policies less capacity, so "
+    "that one of them cannot do all the work.",
     "never_persisting": "A simpler termination (network: linear), fewer options, or observations that change more "
     "slowly (differences: false) let options last.",
     "high_fitting": "Train layer by layer (training.layerwise: true), give the calling policy less capacity, or let it "
     "emit options only (emits: [options]).",
 }
 """The usual remedies."""
+
+START: Mapping[Kind, str] = {"unused": "vq", "redundant": "vq_controls", "dominating": "vq"}
+"""The initialisation from clusters that is a remedy, too, unless training starts from labels or from clusters."""
 
 
 @dataclass(frozen=True)
@@ -119,10 +122,12 @@ class Finding:
     other: int = 0
     selections: float = 0.0
 
-    @property
-    def advice(self) -> str:
-        """The usual remedy."""
-        return ADVICE[self.kind]
+    def advice(self, training: TrainingSpec) -> str:
+        """The usual remedy for a model that was trained so."""
+        start = START.get(self.kind)
+        if start is None or training.labels or {start, "vq_controls"} & {*training.starts}:
+            return ADVICE[self.kind]
+        return f"{ADVICE[self.kind]} Or start from clusters (training.initialize: {start})."
 
 
 def diagnose(options: Sequence[Sequence[Use]], divergences: Sequence[Sequence[Alike]] = ()) -> list[Finding]:

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from ddco_pyro.data.controls import ControlDimension
 from ddco_pyro.drawing.figures import Interval, Panel, interval_plot, save
 from ddco_pyro.drawing.page import Block, Cell, Section, Table, Text, note
-from ddco_pyro.drawing.words import about, effort, method, number, with_error
+from ddco_pyro.drawing.words import about, capital, effort, listed, method, number, with_error
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Compared, Metrics
 from ddco_pyro.segmenting.page import anchor
@@ -38,12 +38,27 @@ def section(fit: Fit) -> Section:
     )
     figure = draw(metrics, {name: one.held_out for name, one in fit.baselines.items()})
     blocks: list[Block] = [
-        Text(f"Nats per step; higher is better. {about(metrics.methods)}"),
+        Text(f"Nats per step; higher is better. {about(metrics.methods)} {stds(fit)}"),
         table(metrics),
         save(figure, fit.run_folder / "figures" / "likelihood.png", alt, caption),
         note(units),
     ]
     return Section("likelihood", "Held-out log-likelihood", blocks)
+
+
+def stds(fit: Fit) -> str:
+    """A sentence on the σ of each model; empty where σ is fixed or all have it in one way."""
+    ways: dict[str, list[str]] = {}
+    for name, spec in {fit.name: fit.spec, **{name: one.spec for name, one in fit.baselines.items()}}.items():
+        of_option = "one σ for each option" if spec.hierarchy else "one σ"
+        kinds = spec.control.learned_stds.values()
+        each = (
+            "a σ that depends on the state" if std.per_state else of_option if std.per_option else "one σ"
+            for std in kinds
+        )
+        ways.setdefault(" or ".join(dict.fromkeys(each)), []).append(method(name))
+    each_way = (f"{listed(own)} {'has' if len(own) == 1 else 'have'} {way}" for way, own in ways.items())
+    return f"{capital('; '.join(each_way))}." if len(ways) > 1 else ""
 
 
 def table(metrics: Metrics, digits: int = 2, title: str | None = None) -> Table:

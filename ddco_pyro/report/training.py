@@ -155,7 +155,7 @@ def degeneracies(fit: Fit) -> list[tuple[str, str]]:
         return []
     levels = fit.spec.hierarchy.levels
     return [
-        (_sign(finding, levels[finding.level - 1].name, fit.names), finding.advice)
+        (_sign(finding, levels[finding.level - 1].name, fit.names), finding.advice(fit.spec.training))
         for finding in diagnose(fit.metrics.options, fit.metrics.divergences)
         if finding.kind != "never_persisting" or levels[finding.level - 1].lasts
     ]

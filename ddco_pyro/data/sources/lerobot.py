@@ -22,7 +22,7 @@ import numpy as np
 from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError
 from ddco_pyro.data.memory import refuse_too_much
 from ddco_pyro.data.pictures import channels_last, turned
-from ddco_pyro.data.sources.metadata import check_links, filled, first_missing, inside, stored_keys
+from ddco_pyro.data.sources.metadata import check_links, filled, first_missing, inside, rate, stored_keys
 from ddco_pyro.data.sources.recording import LABEL_NAMES, Column, Format, Recording, damaged, joined, of_array
 from ddco_pyro.data.sources.video import video_column
 from ddco_pyro.errors import nearest
@@ -92,8 +92,7 @@ class LeRobot:
             raise DemonstrationsError(f"{folder}: meta/episodes holds no episodes; at least one is needed")
         self._missing = first_missing(folder, self.info.get("total_episodes"), self._episodes, "meta/episodes")
         self.names = tuple(f"demo_{index}" for index in (*self._episodes, *self._missing))
-        fps = self.info.get("fps")
-        self.frequency = float(fps) if isinstance(fps, int | float) and 0 < fps < math.inf else None
+        self.frequency = rate({"fps": self.info.get("fps")})
         self.masks = self._masks()
         robot = self.info.get("robot_type")
         self._subtasks, subtasks = self._annotations() if SUBTASK not in self.features else ({}, [])

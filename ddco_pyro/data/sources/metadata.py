@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -11,6 +12,34 @@ from ddco_pyro.data.hdf5 import DemonstrationsError
 
 _PLACEHOLDER = re.compile(r"\{(\w+)(?::0(\d\d?)d)?\}")
 _WIDEST = 12
+
+
+FREQUENCY = "control_frequency"
+"""Attribute of a file: control steps per second, Hz."""
+
+_RATES = (
+    *(FREQUENCY, "control_freq", "control_hz", "control_rate", "frequency", "freq", "hz", "rate"),
+    *("sampling_rate", "sample_rate", "fps", "frame_rate", "framerate"),
+)
+_PERIODS = ("control_dt", "control_timestep", "dt")
+
+
+def rate(said: Mapping[str, object]) -> float | None:
+    """Control steps per second, Hz, under one of the usual names; None where no usable number is under any.
+
+    Upper and lower case are the same. A number may be a text with the unit, such as ``20 Hz``. Periods are in seconds.
+    """
+    known = {name.lower(): value for name, value in said.items()}
+    for name in (*_RATES, *_PERIODS):
+        value = known.get(name)
+        try:
+            number = float(value.lower().removesuffix("hz") if isinstance(value, str) else value)  # type: ignore[arg-type]
+        except (TypeError, ValueError, OverflowError):
+            continue
+        if isinstance(value, bool) or not 0 < number < math.inf:
+            continue
+        return number if name in _RATES else float(f"{1 / number:.9g}")
+    return None
 
 
 def inside(folder: Path, relative: str | Path) -> Path:

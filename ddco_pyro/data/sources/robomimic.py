@@ -28,10 +28,8 @@ from ddco_pyro.data.hdf5 import (
     opened,
     written,
 )
+from ddco_pyro.data.sources.metadata import rate
 from ddco_pyro.data.sources.recording import Column, Format, Recording, of_dataset
-
-FREQUENCY = "control_frequency"
-"""Attribute of a file: control steps per second, Hz."""
 
 ENVIRONMENT = "env_args"
 """Attribute of the group ``data``, where robomimic's tools look for it: the environment, as JSON."""
@@ -58,7 +56,22 @@ class Robomimic:
         self.masks: Mapping[str, tuple[str, ...]] = {name: self._mask(masks, name) for name in masks}
         known = attributes_of(self._data) | attributes_of(file)
         self.attributes: Mapping[str, Attribute] = {name: known[name] for name in known if name != ALL_STEPS}
-        self.frequency = _frequency(self.attributes)
+        self.frequency = rate(self.attributes) or rate(self._environment()) or rate(self._first())
+
+    def _environment(self) -> dict[str, object]:
+        """What robomimic's description of the environment says, its arguments too."""
+        try:
+            said = json.loads(str(self.attributes.get(ENVIRONMENT, "{}")))
+            return {**said, **(said.get("env_kwargs") or {})}
+        except (ValueError, TypeError, AttributeError, RecursionError):
+            return {}
+
+    def _first(self) -> Mapping[str, Attribute]:
+        """The attributes of the first demonstration; none where it cannot be read."""
+        try:
+            return attributes_of(member(self._data, self.names[0], h5py.Group, "", self._external))
+        except DemonstrationsError:
+            return {}
 
     def recording(
         self, name: str, observations: Sequence[str] | None = None, labels: Sequence[str] | None = None
@@ -104,17 +117,6 @@ def _may_be_group(data: h5py.Group, name: str) -> bool:
         return not plain or data.get(name, getclass=True) not in (h5py.Dataset, h5py.Datatype)
     except RuntimeError:
         return True
-
-
-def _frequency(attributes: Mapping[str, Attribute]) -> float | None:
-    """The frequency in the file's own attribute, or in robomimic's description of the environment."""
-    own = attributes.get(FREQUENCY)
-    if own is None:
-        try:
-            own = json.loads(str(attributes.get(ENVIRONMENT, "{}")))["env_kwargs"]["control_freq"]
-        except (ValueError, TypeError, KeyError, RecursionError):
-            return None
-    return float(own) if isinstance(own, int | float) and own > 0 else None
 
 
 @contextmanager
