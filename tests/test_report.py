@@ -253,6 +253,29 @@ def test_what_moves_is_drawn_whatever_comes_first():
     assert position_key(demos) == "hand"
 
 
+def reaching(other, absolute, random):
+    """A hand that wanders by 0.1, and something else that moves further, in [60, 3]."""
+    steps = 0.02 * random.normal(size=3) + 0.01 * random.normal(size=(60, 3))
+    hand = np.cumsum(steps, axis=0)
+    seen = {"handle": other(np.linspace(0, 1, 60)[:, None]) * [3.0, 2.0, 1.0], "palm": hand}
+    return seen, np.vstack([hand[1:], hand[-1:]]) if absolute else np.vstack([steps[1:], 0 * steps[:1]])
+
+
+@pytest.mark.parametrize("absolute", [False, True], ids=["velocities", "targets"])
+@pytest.mark.parametrize(
+    "other",
+    [
+        lambda time: np.maximum(time - 0.7, 0),
+        lambda time: np.sqrt(np.maximum(time - 0.7, 0)),
+        lambda time: time,
+    ],
+    ids=["pulled late", "let go late", "on a belt"],
+)
+def test_the_hand_is_drawn_where_something_else_moves_further(other, absolute):
+    random = np.random.default_rng(0)
+    assert position_key(numbered(reaching(other, absolute, random) for _ in range(10))) == "palm"
+
+
 def test_nothing_is_drawn_where_nothing_moves():
     assert position_key(observing([{"goal": np.full((5, 3), 0.1)}, {"goal": np.full((1, 3), 0.7)}])) is None
 

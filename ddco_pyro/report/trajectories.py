@@ -22,8 +22,8 @@ MOST_TRAJECTORIES = 40
 MOST_POINTS = 300
 TURN = 70.0
 CHOSEN = (
-    "Among observations of three numbers or more, it moves the most within demonstrations; report.trajectory in the "
-    "spec names another. "
+    "Among observations of three numbers or more, it moves the most as the controls say; report.trajectory in the spec "
+    "names another. "
 )
 
 

@@ -277,4 +277,5 @@ class ReportSpec(Model):
     """What the report shows."""
 
     trajectory: Text | None = None
-    """Observation whose first three numbers are drawn as spatial trajectories; null: the one that moves most."""
+    """Observation whose first three numbers are drawn as spatial trajectories; null: the one that moves the most
+    as the controls say."""
