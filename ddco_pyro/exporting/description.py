@@ -38,6 +38,8 @@ def describe(hierarchy: Hierarchy, control: RolloutSpec, program: StepProgram) -
                 "shape": list(shape),
                 "image": key in encoder.images,
                 "differences": key in vectors and vectors[key].differences,
+                "angles": list(vectors[key].angles) if key in vectors else [],
+                "quaternions": list(vectors[key].quaternions) if key in vectors else [],
                 **(encoder.transforms[key].as_data() if key in encoder.images else {}),
             }
             for key, shape in ((key, encoder.shapes.get(key, (1,))) for key in [*vectors, *encoder.images])

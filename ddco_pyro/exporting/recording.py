@@ -16,7 +16,7 @@ from ddco_pyro.model.encoder import ObservationEncoder
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs, States
 from ddco_pyro.model.outputs import Outputs
-from ddco_pyro.spec import STEP
+from ddco_pyro.spec import STEP, ObservationSpec
 
 EPISODES, STEPS = 3, 20
 """Number and length of synthetic episodes. Without images the first one is a step longer than the longest
@@ -110,6 +110,10 @@ def _episode(encoder: ObservationEncoder, steps: int, random: np.random.Generato
         shape = encoder.shapes[spec.key]
         mean, std = (statistic[at : at + size].numpy() for statistic in (encoder.mean, encoder.std))
         length = int(np.prod(shape))
+        if spec.angles or spec.quaternions:
+            observations[spec.key] = _turning(spec, mean, std, random, (steps, *shape))
+            at += size
+            continue
         values = mean[:length] + std[:length] * random.normal(size=(steps, length))
         if spec.differences:
             own = slice(length, 2 * length)
@@ -118,6 +122,19 @@ def _episode(encoder: ObservationEncoder, steps: int, random: np.random.Generato
         observations[spec.key] = values.reshape(steps, *shape)
         at += size
     return observations | {key: _pictures(steps, encoder.shapes[key], random) for key in encoder.images}
+
+
+def _turning(
+    spec: ObservationSpec, mean: np.ndarray, std: np.ndarray, random: np.random.Generator, shape: tuple[int, ...]
+) -> np.ndarray:
+    """Random observations [T, ...] of this shape: angles of a turn, unit quaternions, other numbers as in training."""
+    values = random.uniform(-np.pi, np.pi, (shape[0], int(np.prod(shape[1:]))))
+    quaternions = [[first + place for place in range(4)] for first in spec.quaternions]
+    for own in quaternions:
+        values[:, own] /= np.linalg.norm(values[:, own], axis=1, keepdims=True)
+    rest = np.delete(np.arange(values.shape[1]), [*spec.angles, *np.ravel(quaternions).astype(int)])
+    values[:, rest] = mean[: len(rest)] + std[: len(rest)] * random.normal(size=(shape[0], len(rest)))
+    return values.reshape(shape)
 
 
 def _pictures(steps: int, shape: tuple[int, ...], random: np.random.Generator) -> np.ndarray:

@@ -22,7 +22,8 @@ NARROWEST = 1e-6
 
 
 class ObservationEncoder(nn.Module):
-    """Observations by name to one feature vector: differences appended, standardised where the spec says so.
+    """Observations by name to one feature vector: angles and quaternions turned into numbers that do not jump,
+    differences appended, standardised where the spec says so.
 
     Mean and standard deviation are those of the demonstrations given to :meth:`fit`, and are kept with the model. A
     dimension that varies by rounding alone (:func:`~ddco_pyro.data.checks.rounding`) is only centred, and so are
@@ -58,8 +59,9 @@ class ObservationEncoder(nn.Module):
         self.shifts = {spec.key: spec.augment.shift for spec in pictures if spec.augment}
         seen = {spec.key: _seen_shape(spec, shapes) for spec in specs}
         self.images = {spec.key: seen[spec.key] for spec in pictures}
-        self.given = [int(np.prod(shapes[spec.key])) * spec.given for spec in self.specs]
-        self.sizes = [int(np.prod(shapes[spec.key])) * spec.seen for spec in self.specs]
+        widths = [spec.turned(int(np.prod(shapes[spec.key]))) for spec in self.specs]
+        self.given = [width * spec.given for width, spec in zip(widths, self.specs, strict=True)]
+        self.sizes = [width * spec.seen for width, spec in zip(widths, self.specs, strict=True)]
         self.register_buffer("mean", torch.zeros(sum(self.sizes), dtype=torch.float64))
         self.register_buffer("std", torch.ones(sum(self.sizes), dtype=torch.float64))
         if self.has_bins:
@@ -162,7 +164,7 @@ class ObservationEncoder(nn.Module):
         columns: list[np.ndarray] = [np.zeros((steps, 0))]
         for spec in self.specs:
             values = times / float(self.longest) if spec.key == STEP else observations[spec.key]
-            column = np.asarray(values, dtype=np.float64).reshape(steps, -1)
+            column = _turned(np.asarray(values, dtype=np.float64).reshape(steps, -1), spec)
             columns.append(column)
             if spec.differences:
                 columns.append(np.diff(column, axis=0, prepend=column[:1]))
@@ -208,6 +210,18 @@ class ObservationEncoder(nn.Module):
         }
 
 
+def _turned(values: np.ndarray, spec: ObservationSpec) -> np.ndarray:
+    """Numbers [T, n] with sines and cosines of angles, and products of quaternions, behind all others."""
+    angles, first = list(spec.angles), np.array(spec.quaternions, dtype=int)
+    if not angles and not len(first):
+        return values
+    quaternions = values[:, first[:, None] + np.arange(4)]  # [T, quaternions, 4]
+    one, other = np.triu_indices(4)
+    products = (quaternions[..., one] * quaternions[..., other]).reshape(len(values), -1)
+    rest = np.delete(values, [*angles, *(first[:, None] + np.arange(4)).ravel()], axis=1)
+    return np.concatenate([rest, np.sin(values[:, angles]), np.cos(values[:, angles]), products], axis=1)
+
+
 def _ends(values: np.ndarray, bins: int) -> np.ndarray:
     """The ends [bins + 1] of bins of ``values`` [T] that hold equally many distinct values."""
     return np.asarray(np.quantile(np.unique(values), np.linspace(0, 1, bins + 1), method="nearest"))
@@ -225,6 +239,12 @@ def _seen_shape(spec: ObservationSpec, shapes: Shapes) -> tuple[int, ...]:
     stored = shapes[spec.key]
     if spec.bins and len(stored) == PICTURE_DIMENSIONS:
         raise ShapeError(f"observations: {spec.key!r} has pictures: bins are for vectors")
+    size, last = int(np.prod(stored)), max([*spec.angles, *(first + 3 for first in spec.quaternions)], default=-1)
+    if last >= 0 and (len(stored) == PICTURE_DIMENSIONS or last >= size):
+        raise ShapeError(
+            f"observations: {spec.key!r} has shape {list(stored)} at each step: angles and quaternions name numbers of "
+            f"a vector, counted from 0, and there is no number {last}"
+        )
     if spec.augment:
         _refuse_other_versions(spec.key, spec.augment, shapes)
     try:

@@ -86,6 +86,12 @@ class ObservationSpec(Model):
     """Name of the observation in the demonstrations; ``step`` is built in."""
     differences: bool = False
     """Append x_t − x_{t−1}."""
+    angles: Items[Annotated[int, Field(ge=0)]] = ()
+    """For vectors: numbers, counted from 0, that are angles in radians. Each becomes its sine and cosine, behind the
+    other numbers, so that nothing jumps where the angle does by 2π."""
+    quaternions: Items[Annotated[int, Field(ge=0)]] = ()
+    """For vectors: the first of each four numbers that are a unit quaternion, in either order. Each becomes the ten
+    products of two of its numbers, of which a rotation matrix consists, and which are the same for q and −q."""
     standardize: bool = True
     """Shift and scale to mean 0 and standard deviation 1 over the training demonstrations. Dimensions that are constant
     up to rounding are only shifted."""
@@ -111,18 +117,28 @@ class ObservationSpec(Model):
             raise invalid(("crop", "is top, left, height, width; height and width must be at least 1"))
         if self.key == STEP and self.differences:
             raise invalid(("differences", f"{STEP} grows by the same at each step; leave it out"))
+        turned = [*self.angles, *(first + place for first in self.quaternions for place in range(4))]
+        for key in ("angles", "quaternions"):
+            if getattr(self, key) and self.key == STEP:
+                raise invalid((key, f"{STEP} is no angle; leave it out"))
+            if getattr(self, key) and len(set(turned)) < len(turned):
+                raise invalid((key, "name a number twice; each is part of one angle or quaternion"))
         if self.key == STEP and self.augment:
             raise invalid(("augment", f"{STEP} is computed and has no versions; leave it out"))
         return self
 
+    def turned(self, size: int) -> int:
+        """For vectors: numbers of a step of ``size`` numbers, with angles and quaternions in their place."""
+        return size + len(self.angles) + (10 - 4) * len(self.quaternions)
+
     @property
     def given(self) -> int:
-        """For vectors: numbers before bins for each observed number."""
+        """For vectors: numbers before bins for each number of :meth:`turned`."""
         return 2 if self.differences else 1
 
     @property
     def seen(self) -> int:
-        """For vectors: network inputs for each observed number."""
+        """For vectors: network inputs for each number of :meth:`turned`."""
         return self.given * (1 + self.bins)
 
 

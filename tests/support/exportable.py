@@ -28,6 +28,7 @@ def make(
     meta_policy=None,
     vectors=True,
     bins=0,
+    turns=False,
     std=MappingProxyType({"learn": True}),
     **rollout,
 ):
@@ -40,7 +41,9 @@ def make(
         {"name": f"level-{d}", "count": k, "policy": policy | ({"emits": list(emits)} if d else {})}
         for d, k in enumerate(counts)
     ]
-    seen = [{"key": "state", "differences": True, "bins": bins}, "goal", *built_in] if vectors else []
+    turned = [{"angles": [1]}, {"quaternions": [0]}] if turns else [{}, {}]
+    state, goal = ({"key": key} | own for key, own in zip(("state", "goal"), turned, strict=True))
+    seen = [state | {"differences": True, "bins": bins}, goal, *built_in] if vectors else []
     pictures = [{"key": "camera", **(camera if isinstance(camera, dict) else {})}] if camera else []
     endings = endings or {"network": network if network in ("conv", "per_timestep") else "linear"}
     model = {
@@ -105,6 +108,7 @@ FITS = {
     "mlp": make("mlp", control="sample", options="sample"),
     "per_timestep": make("per_timestep", steps=30),
     "bins": make("mlp", bins=4),
+    "angles and quaternions": make("mlp", turns=True),
     "conv": make("conv", camera={"crop": [1, 2, 7, 9], "resize": [6, 8], "frames": 3}, options="sample"),
     "hybrid": make("mlp", (2, 3), BOTH, control="sample"),
     "σ of the state": make("mlp", (2, 3), BOTH, std={"learn": True, "per_state": True}, control="sample"),
