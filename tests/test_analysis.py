@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from ddco_pyro.model.batch import Batch, encode
 from ddco_pyro.model.emissions import Gaussian
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
-from ddco_pyro.spec import parse_spec
+from ddco_pyro.spec import TrainingSpec, parse_spec
 from ddco_pyro.training.networks import Dimensions
 
 
@@ -283,6 +284,21 @@ def lasting(duration):
 )
 def test_signs_of_a_degenerate_solution(levels, found):
     assert diagnose(levels) == found
+
+
+@pytest.mark.parametrize(
+    ("training", "clusters"),
+    [
+        ({"initialize": "equal_parts"}, True),
+        ({"initialize": "random"}, True),
+        ({"initialize": "vq_controls"}, False),
+        ({"initialize": "equal_parts", "labels": {"level": "option", "from": "phase"}}, False),
+    ],
+)
+def test_clusters_are_advised_where_neither_they_nor_labels_start(training: dict[str, Any], clusters: bool) -> None:
+    for kind in ("unused", "redundant", "dominating"):
+        advice = Finding(kind, 1, 1, 0.0).advice(TrainingSpec.model_validate(training))
+        assert ("clusters" in advice) == clusters
 
 
 def pair(first, second, divergence):

@@ -9,6 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import yaml
 from command_line import call
 from gripper import planted
 from odd_files.kinds import ROWS, drawn
@@ -179,6 +180,68 @@ def write(folder: Path, text: str) -> Path:
     path = folder / "written.yaml"
     path.write_text(text)
     return path
+
+
+def turning(path: Path) -> None:
+    """An arm that turns on and on: its angle jumps by 2π or 360, its quaternion changes sign; others only look so."""
+    random, records = np.random.default_rng(3), []
+    for number in range(8):
+        angle = np.linspace(0, 7, 50) + random.uniform(-3, 3) + 0.02 * random.normal(size=50)
+        real, other = np.cos(angle / 2), np.sin(angle / 2)
+        quaternion = (
+            np.column_stack([other, 0 * real, 0 * real, real]) * np.sign(real if number % 2 else other)[:, None]
+        )
+        place = np.cumsum(random.normal(size=(50, 3)), axis=0)
+        seen = {
+            "pose": np.hstack([place, quaternion]),
+            "yaw": np.column_stack([place[:, 0], (angle + np.pi) % (2 * np.pi) - np.pi]),
+            "degrees": np.degrees(angle)[:, None] % 360,
+            "unbound": angle[:, None],
+            "noise": random.uniform(-np.pi, np.pi, (50, 2)),
+            "steady": np.column_stack([real, 0 * real, 0 * real, other]) * np.sign(real[0]),
+        }
+        records.append((seen, np.column_stack([np.gradient(angle), angle % (2 * np.pi)])))
+    numbered(records).write(path)
+
+
+def test_what_jumps_as_an_angle_or_a_quaternion_is_read_without_its_jumps(path: Path, tmp_path: Path) -> None:
+    turning(path)
+    notes = [note for note in inspect(path).notes if "jump" in note or "change sign" in note]
+    assert [note.split(" as ")[0] for note in notes] == [
+        "actions: dimension 1 jumps by 2π",
+        "obs/degrees: dimension 0 jumps by 360",
+        "obs/pose: dimensions 3-6 change sign",
+        "obs/yaw: dimension 1 jumps by 2π",
+    ]
+    spec = load_spec(write(tmp_path, starting_spec(inspect(path), path)), ["training.epochs=2", "compare_with=[]"])
+    read = {one.key: (one.angles, one.quaternions) for one in spec.observations if one.angles or one.quaternions}
+    assert read == {"pose": ((), (3,)), "yaw": ((1,), ())}
+    encoder = ddco_pyro.fit(spec).hierarchy.encoder
+    for demo in Demonstrations.read(path):
+        pose, yaw = demo.observations["pose"].copy(), demo.observations["yaw"].copy()
+        pose[:, 3:], yaw[:, 1] = -pose[:, 3:], yaw[:, 1] + 2 * np.pi
+        same = encoder.features({**demo.observations, "pose": pose, "yaw": yaw})
+        np.testing.assert_allclose(encoder.features(demo.observations), same, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"angles": [1, 1]}, "observations.0.angles: name a number twice"),
+        ({"angles": [2], "quaternions": [0]}, "observations.0.angles: name a number twice"),
+        ({"angles": [3]}, "there is no number 3"),
+        ({"quaternions": [0]}, "there is no number 3"),
+        ({"angles": [-1]}, "observations.0.angles.0"),
+    ],
+)
+def test_angles_that_are_none_are_refused(
+    settings: dict[str, list[int]], says: str, path: Path, tmp_path: Path
+) -> None:
+    seen, levels = [{"key": "pose", **settings}], [{"count": 2}]
+    spec = {"demonstrations": {"path": str(path)}, "observations": seen, "hierarchy": {"levels": levels}}
+    ended = call("check", write(tmp_path, yaml.safe_dump(spec)))
+    assert (ended.status, ended.err.count("\n")) == (2, 1)
+    assert says in ended.err
 
 
 def test_text_alone_cannot_be_fitted(path: Path) -> None:

@@ -120,7 +120,8 @@ class ControlDimension:
         if self.values or self.discrete:
             return ""
         each = ((getattr(self, end), names) for end, names in self.made_by.items())
-        return "; ".join(f"{number(value)} is common in {few(names)} alone" for value, names in each)
+        common = [f"{number(value)} is common in {few(names)} alone" for value, names in each]
+        return "; ".join([*common, *([f"a switch but for {few(self.strays)}"] if self.strays else [])])
 
     @property
     def note(self) -> str:
@@ -217,7 +218,7 @@ class ControlStatistics:
     def _made_by(self, each: np.ndarray, low: float, high: float, at_inside: np.ndarray) -> dict[str, tuple[str, ...]]:
         """``made_by`` of a dimension, from its columns [N, 5] and the steps [N] at its value inside."""
         ends = [np.where(same(each[:, place], end), each[:, place + 2], 0) for place, end in ((0, low), (1, high))]
-        places = {end: _makers(at, each[:, 4], OFTEN, 2) for end, at in zip(("minimum", "maximum"), ends, strict=True)}
+        places = {end: _makers(at, each[:, 4], OFTEN, 1) for end, at in zip(("minimum", "maximum"), ends, strict=True)}
         if len(at_inside):
             places["inside"] = _makers(at_inside, each[:, 4], ATOM, FEWEST)
         return {end: self._named(names) for end, names in places.items() if len(names)}
@@ -236,16 +237,16 @@ def most_few(number: int) -> int:
 
 
 def _makers(at: np.ndarray, steps: np.ndarray, often: float, least: int) -> np.ndarray:
-    """The few demonstrations without which a value is rare, less than half as common as ``often``.
+    """The few demonstrations without which a value is rare.
 
     :param at: steps [N] of each demonstration at the value, of ``steps`` [N].
-    :param often: share of the steps from which on the value is common, unless it has fewer than ``least`` steps.
+    :param often: share of the steps from which on the value is common.
+    :param least: steps with which a demonstration has the value by more than chance.
     :returns: their places; empty where the value is rare with them, or common without them.
     """
-    order = np.argsort(-at, kind="stable")
-    rest = [at[order[count:]].sum() / max(steps[order[count:]].sum(), 1) for count in range(most_few(len(at)) + 1)]
-    rare = [count for count, share in enumerate(rest) if share < often / 2]
-    return order[: rare[0]] if rare and rest[0] >= often and at.sum() >= least else order[:0]
+    makes = at >= least
+    rare = at.sum() < max(2, often * steps.sum()) or at[~makes].sum() >= often * max(steps[~makes].sum(), 1)
+    return np.flatnonzero(makes) if not rare and makes.sum() <= most_few(len(at)) else np.empty(0, dtype=int)
 
 
 def _strays(each: np.ndarray) -> np.ndarray:
@@ -564,6 +565,11 @@ def _decided(dimension: ControlDimension, alone: bool) -> tuple[str, str]:
 
     :param alone: whether there is no other dimension.
     """
+    kind, why = _found(dimension, alone)
+    return kind, "; ".join(filter(None, (why, dimension.made)))
+
+
+def _found(dimension: ControlDimension, alone: bool) -> tuple[str, str]:
     if dimension.values:
         return "binary", f"takes two values, {number(dimension.minimum)} and {number(dimension.maximum)}"
     if dimension.discrete:
@@ -574,7 +580,7 @@ def _decided(dimension: ControlDimension, alone: bool) -> tuple[str, str]:
         return "hurdle", dimension.atom + ("; often at an extreme" if dimension.extremes else "")
     if dimension.extremes:
         return "clipped", "often exactly at an extreme"
-    return "gaussian", f"varies freely; {dimension.made}" if dimension.made else "varies freely"
+    return "gaussian", "varies freely"
 
 
 def _declared(dimension: ControlDimension, kind: str) -> tuple[str, str]:

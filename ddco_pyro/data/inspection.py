@@ -29,6 +29,7 @@ from ddco_pyro.data.checks import (
 )
 from ddco_pyro.data.controls import (
     FEWEST,
+    MOST_DIMENSIONS,
     ControlDimension,
     ControlStatistics,
     control_parts,
@@ -168,6 +169,7 @@ class Inspection:
     :param excluded: names of demonstrations that were skipped.
     :param unreadable: names of demonstrations that could not be read.
     :param external: other files that the HDF5 file names as parts of itself; they are not read.
+    :param turns: the angles in radians and the first numbers of quaternions that jump, by place of the array.
     :param odd: names of demonstrations that are dead or padded and change the model of all, and why.
     """
 
@@ -185,6 +187,7 @@ class Inspection:
     unreadable: tuple[str, ...] = ()
     external: tuple[str, ...] = ()
     odd: Mapping[str, str] = field(default_factory=dict)
+    turns: Mapping[str, tuple[tuple[int, ...], tuple[int, ...]]] = field(default_factory=dict)
 
     @property
     def exclusions(self) -> list[str]:
@@ -260,6 +263,74 @@ def inspect(path: str | Path, form: Format | None = None, exclude: Sequence[str]
         return _Inspector(source, tuple(exclude)).inspection(Path(path))
 
 
+@dataclass
+class _Turns:
+    """Jumps of single numbers of a vector by a turn, and of quaternions to their negative, from step to step.
+
+    :param jumps: for each turn, the number of steps [D] in which a number changes by nearly that much; ``between``
+        where it changes by a quarter of a turn or more.
+    :param unit: whether each four numbers [D - 3] have always been a unit quaternion; ``flips`` counts changes of sign.
+    :param names: of the demonstrations with any jump or flip.
+    """
+
+    jumps: np.ndarray
+    between: np.ndarray
+    unit: np.ndarray
+    flips: np.ndarray
+    names: list[str] = field(default_factory=list)
+    last: np.ndarray | None = None
+    first: np.ndarray | None = None
+
+    @classmethod
+    def of(cls, size: int) -> _Turns:
+        """Of a vector of so many numbers, before any step."""
+        four = max(size - 3, 0)
+        empty = np.zeros((len(TURNS), size), int)
+        return cls(empty, empty.copy(), np.ones(four, dtype=bool), np.zeros(four, int))
+
+    def add(self, rows: np.ndarray, name: str, begins: bool) -> None:
+        """Add steps [T, D] of a demonstration; a demonstration may begin with another sign than the first one."""
+        values = rows.astype(np.float64)
+        before = self.first if begins else self.last
+        self.first, self.last = values[:1] if self.first is None else self.first, values[-1:]
+        with np.errstate(invalid="ignore", over="ignore"):
+            if len(self.unit):
+                self.unit &= (np.abs(_fours(values * values) - 1) < UNIT).all(0)
+            pairs = values if before is None else np.concatenate([before, values])
+            changes = np.abs(np.diff(pairs[1:] if begins and before is not None else pairs, axis=0))
+            jumps = np.stack([(changes > NEARLY * turn).sum(0) for turn in TURNS.values()])
+            self.between += np.stack([(changes > turn / 4).sum(0) for turn in TURNS.values()]) - jumps
+            flips = (_fours(pairs[1:] * pairs[:-1]) < -NEARLY).sum(0) if len(self.unit) else self.flips * 0
+        self.jumps += jumps
+        self.flips += flips
+        if (jumps.any() or (flips > 0)[self.unit].any()) and name not in self.names[-1:]:
+            self.names.append(name)
+
+    @property
+    def quaternions(self) -> list[int]:
+        """The first number of each unit quaternion that flips its sign."""
+        found: list[int] = []
+        for place in np.flatnonzero(self.unit & (self.flips > 0)).tolist():
+            found += [place] if not found or place >= found[-1] + 4 else []
+        return found
+
+    def angles(self, low: np.ndarray, high: np.ndarray) -> dict[str, list[int]]:
+        """Numbers within ``low`` and ``high`` [D] that jump by a turn and never by half of one, by the unit."""
+        taken = {first + place for first in self.quaternions for place in range(4)}
+        found = {}
+        for (unit, turn), jumps, between in zip(TURNS.items(), self.jumps, self.between, strict=True):
+            spread = high.astype(np.float64) - low
+            wraps = (jumps > 0) & (10 * between <= jumps) & (spread >= NEARLY * turn) & (spread <= 1.02 * turn)
+            found[unit] = [place for place in np.flatnonzero(wraps).tolist() if place not in taken]
+        return found
+
+
+def _fours(products: np.ndarray) -> np.ndarray:
+    """Sums [T, D - 3] of each four neighbouring numbers [T, D]."""
+    sums: np.ndarray = np.lib.stride_tricks.sliding_window_view(products, 4, axis=1).sum(-1)
+    return sums
+
+
 class _Inspector:
     """One pass over all arrays of a source, which feeds every statistic."""
 
@@ -269,6 +340,7 @@ class _Inspector:
         self.lengths: dict[str, int] = {}
         self.problems: dict[tuple[str, str], list[str]] = {}  # messages by kind and subject
         self.control, self.coincidences = ControlStatistics(), _Coincidences()
+        self.turns: dict[str, _Turns] = {}
         self.periods: dict[str, dict[str, float]] = {}  # of a step, by what says so and by demonstration
 
     def inspection(self, path: Path) -> Inspection:
@@ -302,7 +374,8 @@ class _Inspector:
             frequency=source.frequency,
             problems=[*kinds, *_problems_of_division(source, names, masks), *_problems(fields, self.lengths)],
             control=dimensions,
-            coincidences=(*self.coincidences.notes(masks, dimensions), *self._other_rates()),
+            coincidences=(*self.coincidences.notes(masks, dimensions), *self._jumps(), *self._other_rates()),
+            turns={place: self._turning(place) for place in self.turns if any(self._turning(place))},
             leaks=tuple(p for p, array in fields.items() if self.coincidences.leaks(p, varying, array.constant)),
             excluded=exclude,
             unreadable=tuple(unreadable),
@@ -336,6 +409,28 @@ class _Inspector:
                 if why:
                     found.setdefault(name, why)
         return {name: found[name] for name in self.lengths if name in found}
+
+    def _turning(self, place: str) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """The angles in radians and the quaternions of an array that jump."""
+        array, turns = self.fields[place], self.turns[place]
+        return tuple(turns.angles(array.minimum, array.maximum)["2π"]), tuple(turns.quaternions)
+
+    def _jumps(self) -> Iterator[str]:
+        """A line for the angles of an array that jump by a turn, and for its quaternions that change their sign."""
+        for place, turns in self.turns.items():
+            where, observed = f"the first in {few(turns.names[:1])}", place != "actions"
+            for unit, own in turns.angles(self.fields[place].minimum, self.fields[place].maximum).items():
+                remedy = f"with angles: {own} beside its key networks read sine and cosine" if observed else "unwrap it"
+                if observed and unit != "2π":
+                    remedy = f"store radians; {remedy}"
+                if own:
+                    yield f"{place}: {listed(own)} jump{'s' * (len(own) == 1)} by {unit} as an angle, {where}: {remedy}"
+            if own := turns.quaternions:
+                remedy = f"with quaternions: {own} beside its key networks read products, the same for q and −q"
+                yield (
+                    f"{place}: {listed([first + part for first in own for part in range(4)])} change sign as a "
+                    f"quaternion, {where}: {remedy if observed else 'give all rotations one sign'}"
+                )
 
     def _other_rates(self) -> Iterator[str]:
         """A line for the demonstrations that were recorded at another rate than most."""
@@ -382,6 +477,9 @@ class _Inspector:
                 self.control.add(block, name)
             self.coincidences.add(array.place, values, step, column.image)
             array.add(values, name, step, first)
+            if array.dtype.startswith("float") and values.shape[1] <= MOST_DIMENSIONS:
+                turns = self.turns.setdefault(array.place, _Turns.of(values.shape[1]))
+                turns.add(values, name, begins=not step)
             step += len(values)
         self.coincidences.end_column()
         if step > 1 and values.shape[1] == 1 and TIME.search(array.place):
@@ -431,6 +529,15 @@ WIDEST = 10_000
 
 FEW = 3
 """Number of values of a switch with padding."""
+
+TURNS = {"2π": 2 * math.pi, "360": 360.0}
+"""A turn in radians and in degrees, and what it is called."""
+
+NEARLY = 0.85
+"""A change of an angle by this part of a turn is a jump by a turn."""
+
+UNIT = 0.02
+"""The squared length of a unit quaternion is within this distance of 1."""
 
 TIME = re.compile(r"^obs/(.*[/_.])?(time|times|time_?stamps?|t)$")
 """Places of observations that are the time."""

@@ -124,6 +124,8 @@ def _filled(
         unusable_labels=unusable_labels,
         vectors=vectors,
         versions=inspection.versions,
+        turns=inspection.turns,
+        zip=zip,
         images=images,
         pictures=not vectors,
         left_out=[(field, why) for field in observed if (why := _left_out(inspection, field))],
