@@ -215,4 +215,4 @@ def test_a_demonstration_without_which_a_dimension_would_be_a_switch_or_constant
     made["demo_4"] = np.resize(odd, 30)[:, None]
     (found,) = control_dimensions(made)
     assert found.strays == (("demo_4",) if named else ())
-    assert ("a switch but for demo_4" in found.note) == (named and len({*others, *odd}) == 3)
+    assert ("a switch without demo_4" in found.note) == (named and len({*others, *odd}) == 3)

@@ -121,7 +121,7 @@ class ControlDimension:
             return ""
         each = ((getattr(self, end), names) for end, names in self.made_by.items())
         common = [f"{number(value)} is common in {few(names)} alone" for value, names in each]
-        return "; ".join([*common, *([f"a switch but for {few(self.strays)}"] if self.strays else [])])
+        return "; ".join([*common, *([f"a switch without {few(self.strays)}"] if self.strays else [])])
 
     @property
     def note(self) -> str:
