@@ -13,7 +13,7 @@ import pytest
 from command_line import call
 from odd_files.hdf5 import instead, spoil
 from odd_files.kinds import ROWS, twins, write
-from random_demonstrations import demonstrations
+from random_demonstrations import demonstrations, numbered
 
 from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
 from ddco_pyro.data.inspection import inspect
@@ -362,6 +362,26 @@ def test_what_many_demonstrations_do_is_not_odd(name: str, tmp_path: Path) -> No
     assert not found.odd
     where = {"padded": "the last steps are the same in 10 of", "late": "nothing moves at the start of 10 of"}
     assert name == "dead" or any(note.startswith(where[name]) for note in found.notes)
+
+
+@pytest.mark.parametrize(("padding", "odd"), [(0.0, True), (1.0, False)])
+def test_a_switch_that_one_demonstration_uses_stays_unless_its_padding_does(
+    padding: float, odd: bool, tmp_path: Path
+) -> None:
+    """A gripper that stays shut elsewhere; the padding is where it is shut, or where it is open."""
+    random = np.random.default_rng(0)
+
+    def shut(number: int) -> np.ndarray:
+        actions = np.column_stack([random.normal(size=(40, 2)), np.ones(40)])
+        if number == 3:
+            actions[20:25, 2] = odd
+            actions[-5:] = [0.1, 0.2, padding]
+        return actions
+
+    numbered(({"place": random.normal(size=(40, 2))}, shut(number)) for number in range(20)).write(tmp_path / "d.hdf5")
+    found = inspect(tmp_path / "d.hdf5")
+    assert found.control[2].strays == ("demo_3",)
+    assert list(found.odd) == ["demo_3"] * odd
 
 
 @pytest.mark.parametrize("spoilt", [(3,), range(20)], ids=["one", "all"])

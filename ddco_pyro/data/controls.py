@@ -160,7 +160,7 @@ class ControlStatistics:
     """Streaming :class:`ControlDimension` statistics of controls; NaN and infinite values are ignored."""
 
     def __init__(self) -> None:
-        self._columns: dict[str, list[np.ndarray]] = {}  # by demonstration: as _columns_of, each [A]
+        self._columns: dict[str, list[np.ndarray]] = {}  # by name: minimum, maximum, steps there, steps, each [A]
         self._distinct: list[np.ndarray] = []
         self._common = _CommonValues()
         self._integer = True

@@ -248,6 +248,7 @@ class Inspection:
             "fields": [array.as_json() for array in self.fields.values()],
             "control_dimensions": [dimension.as_data() for dimension in self.control],
             "external": list(self.external),
+            "odd": dict(self.odd),
             "notes": self.notes,
             "problems": self.problems,
         }
@@ -400,6 +401,9 @@ class _Inspector:
         paddings = self.coincidences.paddings()
         for dimension in dimensions:
             made = {name: getattr(dimension, end) for end, names in dimension.made_by.items() for name in names}
+            if dimension.values:  # one in all others
+                rarer = min((dimension.at_minimum, dimension.minimum), (dimension.at_maximum, dimension.maximum))[1]
+                made |= dict.fromkeys(dimension.strays, rarer)
             for name in (*made, *dimension.strays):
                 rows = paddings.get(name, {}).items()
                 value = made.get(name, math.nan)
