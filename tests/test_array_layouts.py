@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
+import yaml
+from command_line import call
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
 from odd_files.kinds import NUMBER, ROWS, arrays
 
+import ddco_pyro
+from ddco_pyro.data.checks import reading
 from ddco_pyro.data.controls import number
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
 from ddco_pyro.data.importing import import_demonstrations
 from ddco_pyro.data.inspection import inspect
 from ddco_pyro.data.pictures import channels_last, turned
+from ddco_pyro.errors import BadInput
 
 
 def stored(path: Path, key: str) -> list[np.ndarray]:
@@ -115,3 +123,79 @@ def test_what_is_written_again_has_labels_and_the_type_of_its_controls(tmp_path:
 )
 def test_a_value_is_printed_as_it_is(value: float, text: str) -> None:
     assert number(value) == text
+
+
+# --- what networks read -----------------------------------------------------------------------------------------------
+
+CONV = {"network": "conv", "layers": [{"filters": 2, "kernel": 1}], "hidden": [4]}
+TYPES = ("u1", "u2", "i8", "?", "f2", "f4", ">f8", "c8", "S3", "O", "V4", "f4,i2")
+
+
+def an_array(shape: tuple[int, ...], dtype: str, random: np.random.Generator) -> np.ndarray:
+    if dtype == "O":
+        return np.full(shape, "pick up the cup", dtype=h5py.string_dtype())
+    values = random.integers(0, 100, shape)
+    return values.astype(f"V{dtype[1:]}" if dtype[0] == "V" else dtype)
+
+
+@given(
+    shape=st.lists(st.sampled_from((0, 1, 2, 3, 5, 6)), max_size=5).map(tuple),
+    dtype=st.sampled_from(TYPES),
+    alone=st.booleans(),
+)
+@settings(max_examples=12, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@example(shape=(4, 6, 8, 3), dtype="u1", alone=True)
+@example(shape=(4, 6, 8, 3), dtype="u1", alone=False)
+@example(shape=(6, 8, 3), dtype="u1", alone=True)
+@example(shape=(6, 8, 3), dtype="f4", alone=False)
+@example(shape=(), dtype="O", alone=False)
+@example(shape=(2,), dtype="f4,i2", alone=False)
+@example(shape=(0,), dtype="f4", alone=True)
+def test_networks_read_an_observation_or_every_command_says_why_not(
+    shape: tuple[int, ...], dtype: str, alone: bool, tmp_path: Path
+) -> None:
+    """Of any shape and type: alone or beside a vector, from a file and from memory."""
+    path, random = tmp_path / "demos.hdf5", np.random.default_rng(0)
+    made = [{**arrays(n), "obs/odd": None} for n in range(NUMBER)]
+    for each in made:
+        each["obs/odd"] = an_array((len(each["actions"]), *shape), dtype, random)
+    with h5py.File(path, "w") as file:
+        for n, each in enumerate(made):
+            for place, values in each.items():
+                if not (alone and place == "obs/pose"):
+                    file[f"data/demo_{n}/{place}"] = values
+    seen = turned(made[0]["obs/odd"])
+    kind, why = reading(seen.shape[1:], seen.dtype)
+    assert (kind == "") == (why != "")
+    assert kind in ("", "vector" if len(seen.shape) < 4 else "picture")
+    keys = ["odd"] if alone else ["pose", "odd"]
+    policy = CONV if kind == "picture" and alone else {"network": "linear"}
+    if kind == "picture" and not alone:
+        policy = {"network": "branches", "of": {"odd": CONV, "pose": {"network": "mlp", "hidden": [4]}}, "hidden": [4]}
+    data = {
+        "demonstrations": {"path": str(path)},
+        "observations": keys,
+        "baseline": {"kind": "flat", "policy": policy},
+        "training": {"epochs": 1},
+    }
+    spec, out = tmp_path / "spec.yaml", tmp_path / "out"
+    spec.write_text(yaml.safe_dump(data))
+    for command in (("inspect", path), ("init", path, "--out", out), ("check", spec), ("import", path, "--out", out)):
+        ended = call(*command)
+        said = ended.out + ended.err + (out.read_text() if command[0] == "init" and out.exists() else "")
+        out.unlink(missing_ok=True)
+        assert ended.status in (0, 2), (command, ended)
+        assert "Traceback" not in ended.err, (command, ended)
+        assert not why or ("odd" in said and (why in said or ended.status == 2)), (command, said)
+        assert ended.status == 0 or why, (command, ended)
+
+    def demonstration(n: int, each: dict[str, np.ndarray]) -> Demonstration:
+        observations = {key: each[f"obs/{key}"] for key in keys}
+        return Demonstration(f"demo_{n}", observations, each["actions"])
+
+    for given_demos in (None, lambda: Demonstrations(tuple(demonstration(n, each) for n, each in enumerate(made)))):
+        with pytest.raises(BadInput, match="odd") if why else contextlib.nullcontext():
+            fitted = ddco_pyro.fit(spec, given_demos and given_demos())
+            assert [*fitted.hierarchy.encoder.shapes] == keys
+            read = {**fitted.hierarchy.encoder.images, **dict.fromkeys(fitted.hierarchy.encoder.keys)}
+            assert {*read} == {*keys}

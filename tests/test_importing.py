@@ -258,9 +258,8 @@ def written_by_minari(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     def make(action: gymnasium.Space) -> tuple[Path, list[EpisodeBuffer]]:
         random = np.random.default_rng(0)
         arm = spaces.Dict({"joints": spaces.Box(-9, 9, (3,), np.float64)})
-        space = spaces.Dict(
-            {"arm": arm, "camera": spaces.Box(0, 255, (32, 32, 3), np.uint8), "goal": spaces.Discrete(4)}
-        )
+        camera = spaces.Box(0, 255, (32, 32, 3), np.uint8)
+        space = spaces.Dict({"arm": arm, "camera": camera, "goal": spaces.Discrete(4), "mission": spaces.Text(30)})
         action.seed(0)
         buffers = []
         for episode in range(4):
@@ -269,6 +268,7 @@ def written_by_minari(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
                 "arm": {"joints": random.normal(size=(steps + 1, 3))},
                 "camera": np.full((steps + 1, 32, 32, 3), 60 * episode, np.uint8),
                 "goal": np.full(steps + 1, episode),
+                "mission": ["go to the green ball"] * (steps + 1),
             }
             actions = batched([action.sample() for _ in range(steps)])
             ends = np.arange(steps) == steps - 1
@@ -283,7 +283,9 @@ def written_by_minari(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 def test_minari(written_by_minari, out: Path) -> None:
     folder, buffers = written_by_minari(spaces.Box(-1, 1, (2,)))
-    import_demonstrations(folder, out)
+    text = "obs/mission holds text, not numbers"
+    assert import_demonstrations(folder, out).unread == (text,)
+    assert text in inspect(folder).problems
     demos = Demonstrations.read(out)
     assert demos.lengths == (5, 6, 7, 8)
     for buffer, demo in zip(buffers, demos, strict=True):

@@ -249,7 +249,7 @@ def test_text_alone_cannot_be_fitted(path: Path) -> None:
         for group in file["data"].values():
             del group["obs/pose"], group["obs/camera"]
             group["obs/text"] = [b"a"] * len(group["actions"])
-    with pytest.raises(DemonstrationsError, match=r"no observation can be used; see what is wrong with: ddco-pyro"):
+    with pytest.raises(DemonstrationsError, match=r"no observation can be used: obs/text holds text, not numbers; see"):
         starting_spec(inspect(path), path)
 
 

@@ -301,7 +301,7 @@ def inspection(facts: Inspection) -> None:
     for line in lines:
         say(printable(line))
     rows = [
-        [field.place, str(list(field.shape)), field.dtype, _range(field), _notes(field)]
+        [field.place, str(list(field.shape)), str(field.dtype), _range(field), _notes(field)]
         for field in facts.fields.values()
     ]
     show(Table(["", "a step", "type", "range", "notes"], [list(map(printable, row)) for row in rows], range(5)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -104,8 +104,45 @@ def check(recording: Recording) -> None:
         check_steps(name, place, column, shape[0])
 
 
+PICTURES = np.dtype(np.uint8)
+"""The type of pictures that networks read."""
+
+
+def reading(shape: tuple[int, ...], dtype: np.dtype[Any] = PICTURES) -> tuple[Literal["vector", "picture", ""], str]:
+    """What networks read of an observation whose steps have this shape and type, else why they read nothing of it.
+
+    Real numbers of at most two dimensions are a vector, flattened. A picture is uint8 [H, W, C].
+
+    >>> reading((4, 4), np.dtype(np.float32)), reading((48, 64, 3))
+    (('vector', ''), ('picture', ''))
+    """
+    if dtype.kind not in NUMBERS:
+        return "", _no_numbers(dtype)
+    if 0 in shape:
+        return "", f"has shape {list(shape)} at each step, and so no numbers"
+    if len(shape) < PICTURE_DIMENSIONS:
+        return "vector", ""
+    if len(shape) > PICTURE_DIMENSIONS:
+        return "", (
+            f"has shape {list(shape)} at each step, and networks read vectors and pictures [H, W, C]; store one "
+            "picture a step (frames stacks them), or reshape it to [steps, dimensions]"
+        )
+    if dtype == PICTURES:
+        return "picture", ""
+    return "", (
+        f"has shape {list(shape)} at each step and is not uint8, as pictures have to be; scale the range that "
+        "matters to it, such as (255 * (depth / far).clip(0, 1)).astype('uint8')"
+    )
+
+
+def _no_numbers(dtype: np.dtype[Any]) -> str:
+    return f"holds {'text' if dtype.kind in 'OSTU' else dtype}, not numbers"
+
+
 def problem_of_controls(shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
     """The problem with controls whose steps have this shape, in words; empty without a problem."""
+    if dtype.kind not in NUMBERS:
+        return _no_numbers(dtype)
     if len(shape) == 1 and shape[0]:
         return ""
     if shape:
@@ -113,16 +150,6 @@ def problem_of_controls(shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
     return (
         f"is {dtype} of shape [steps]; store discrete actions as integers (astype(int)), and anything else as "
         "[steps, 1] (actions[:, None])"
-    )
-
-
-def problem_of_pictures(shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
-    """The problem with pictures whose steps have this shape; empty without a problem, and for other arrays."""
-    if len(shape) != PICTURE_DIMENSIONS or dtype == np.uint8:
-        return ""
-    return (
-        f"is {dtype} of shape {list(shape)} at each step: pictures have to be uint8; scale the range that "
-        "matters to it, such as (255 * (depth / far).clip(0, 1)).astype('uint8')"
     )
 
 

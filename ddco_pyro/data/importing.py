@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ddco_pyro.data.checks import NUMBERS, check, check_alike, check_values
+from ddco_pyro.data.checks import NUMBERS, check, check_alike, check_values, reading
 from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError, opened
 from ddco_pyro.data.pictures import resized
 from ddco_pyro.data.sources import Column, Format, Recording, Source, open_source
@@ -52,11 +52,17 @@ class Choice:
 
 @dataclass(frozen=True)
 class Imported:
-    """The result of an import: the demonstrations in the file, and the reason for each that was left out."""
+    """The result of an import.
+
+    :param names: the demonstrations in the file.
+    :param left_out: the reason for each demonstration that was left out.
+    :param unread: a line for each observation that networks cannot read, or that was left out as a video.
+    """
 
     path: Path
     names: tuple[str, ...]
     left_out: Mapping[str, str]
+    unread: tuple[str, ...] = ()
 
 
 def import_demonstrations(
@@ -81,30 +87,35 @@ def import_demonstrations(
         with parts_of(out, identity) as parts:
             if parts is None:
                 return _already(out, identity)
-            left_out = _keep(opened_source, choice, parts, on_recording)
+            left_out, unread = _keep(opened_source, choice, parts, on_recording)
             if not parts.done:
                 why = next(iter(left_out.values()))
                 raise DemonstrationsError(f"{source}: none of its demonstrations can be used: {why}")
             done = tuple(parts.done)
             parts.finish(_attributes(opened_source, source, identity, choice), _masks(opened_source, done))
-    return Imported(out, done, left_out)
+    return Imported(out, done, left_out, unread)
 
 
-def _keep(source: Source, choice: Choice, parts: Parts, on_recording: OnRecording) -> dict[str, str]:
-    """Add all missing demonstrations; the reason for each that is left out."""
+def _keep(
+    source: Source, choice: Choice, parts: Parts, on_recording: OnRecording
+) -> tuple[dict[str, str], tuple[str, ...]]:
+    """Add all missing demonstrations; the reason for each that is left out, and the observations that are not read."""
     names = _names(source, choice)
     left_out: dict[str, str] = {}
+    unread: tuple[str, ...] = ()
     first: Recording | None = None
     if not choice.skip_broken:
         _check_headers(source, names, choice)
     for number, name in enumerate(names):
         try:
-            recording = _chosen(source, name, choice)
+            whole = source.recording(name)
+            recording = _chosen(whole, choice, source.frequency)
             check(recording)
             check_alike(recording, first or recording)
             if name not in parts.done:
                 check_values(recording, pictures=choice.skip_broken)
                 parts.add(recording)
+            unread = unread if first else tuple(_unread(whole, recording))
             first = first or recording
         except DemonstrationsError as error:
             if not choice.skip_broken:
@@ -115,7 +126,17 @@ def _keep(source: Source, choice: Choice, parts: Parts, on_recording: OnRecordin
         parts.close()
     except DemonstrationsError as error:  # a picture of one that is not written yet
         raise _refused(source, names, choice, error) from None
-    return left_out
+    return left_out, unread
+
+
+def _unread(whole: Recording, chosen: Recording) -> Iterator[str]:
+    """A line for each observation that networks cannot read, and for each video that is not chosen."""
+    for key, column in whole.observations.items():
+        _, why = reading(column.shape[1:], column.dtype)
+        if why:
+            yield f"obs/{key} {why}"
+        elif column.video and key not in chosen.observations:
+            yield f"obs/{key} is a video, left out without --videos"
 
 
 def _check_headers(source: Source, names: Sequence[str], choice: Choice) -> None:
@@ -123,7 +144,7 @@ def _check_headers(source: Source, names: Sequence[str], choice: Choice) -> None
     first: Recording | None = None
     try:
         for name in names:
-            recording = _chosen(source, name, choice)
+            recording = _chosen(source.recording(name), choice, source.frequency)
             check(recording)
             check_alike(recording, first or recording)
             first = first or recording
@@ -135,7 +156,7 @@ def _refused(source: Source, names: Sequence[str], choice: Choice, error: Demons
     """The error, with the advice to leave demonstrations out where one of them can be used."""
     for name in names:
         with suppress(DemonstrationsError):
-            recording = _chosen(source, name, choice)
+            recording = _chosen(source.recording(name), choice, source.frequency)
             check(recording)
             check_values(recording, pictures=True)
             return DemonstrationsError(f"{error}; or leave such ones out with --skip-broken")
@@ -184,9 +205,8 @@ def _attributes(source: Source, path: str | Path, identity: str, choice: Choice)
     return {**source.attributes, **frequency, **facts}
 
 
-def _chosen(source: Source, name: str, choice: Choice) -> Recording:
+def _chosen(recording: Recording, choice: Choice, frequency: float | None) -> Recording:
     """A recording with the chosen observations, scaled, at the chosen rate."""
-    recording = source.recording(name)
     known = recording.observations
     names = {column.named or key: key for key, column in known.items()}
     keys = names | {key: key for key in known}
@@ -201,10 +221,11 @@ def _chosen(source: Source, name: str, choice: Choice) -> Recording:
         if column.dtype.kind in NUMBERS and not column.aside and (choice.videos or not column.video)
     ]
     if not wanted:
-        raise DemonstrationsError(f"{recording.name}: has no observation that can be used")
+        why = "; ".join(_unread(recording, replace(recording, observations={}))) or "there is none"
+        raise DemonstrationsError(f"{recording.name}: has no observation that can be used: {why}")
     observations = {key: _scaled(known[key], choice.image_size) for key in wanted}
     recording = replace(recording, observations=observations)
-    return recording if choice.hz is None else _slower(recording, _frames(source.frequency, choice.hz))
+    return recording if choice.hz is None else _slower(recording, _frames(frequency, choice.hz))
 
 
 def _frames(frequency: float | None, hz: float) -> int:

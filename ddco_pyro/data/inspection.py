@@ -22,8 +22,8 @@ from ddco_pyro.data.checks import (
     divided,
     problem_of_controls,
     problem_of_labels,
-    problem_of_pictures,
     problems_of_masks,
+    reading,
     rounding,
     usable,
 )
@@ -67,7 +67,7 @@ class Field:
 
     place: str
     shape: tuple[int, ...]
-    dtype: str
+    dtype: np.dtype[Any]
     minimum: np.ndarray
     maximum: np.ndarray
     nan: int = 0
@@ -87,20 +87,19 @@ class Field:
     @property
     def image(self) -> bool:
         """Whether a step is a picture, uint8 [H, W, C]."""
-        return self.dtype == "uint8" and len(self.shape) == 3
+        return reading(self.shape, self.dtype)[0] == "picture"
 
     @property
     def numeric(self) -> bool:
         """Whether the array holds real numbers."""
-        return np.dtype(self.dtype).kind in NUMBERS
+        return self.dtype.kind in NUMBERS
 
     @property
     def problem(self) -> str:
         """The problem with the shape or type, in words; empty without a problem."""
-        if self.place == "actions":
-            return problem_of_controls(self.shape, np.dtype(self.dtype))
-        ask = problem_of_labels if self.place.startswith("labels/") else problem_of_pictures
-        return ask(self.shape, np.dtype(self.dtype))
+        if self.place.startswith("obs/"):
+            return reading(self.shape, self.dtype)[1]
+        return (problem_of_controls if self.place == "actions" else problem_of_labels)(self.shape, self.dtype)
 
     @property
     def constant(self) -> list[int]:
@@ -113,7 +112,7 @@ class Field:
         if not self.place.startswith("obs/") or not self.numeric:
             return []
         spread = self.maximum.astype(np.float64) - self.minimum
-        rests = spread <= rounding(self.minimum, self.maximum, np.dtype(self.dtype))
+        rests = spread <= rounding(self.minimum, self.maximum, self.dtype)
         return [int(index) for index in np.flatnonzero(rests & (self.minimum != self.maximum))]
 
     @property
@@ -153,7 +152,13 @@ class Field:
             name: [float(value) if np.isfinite(value) else None for value in data[name]]
             for name in ("minimum", "maximum")
         }
-        return data | ends | {"shape": list(self.shape), "constant": self.constant, "rounding": self.rounding}
+        shown = {
+            "dtype": str(self.dtype),
+            "shape": list(self.shape),
+            "constant": self.constant,
+            "rounding": self.rounding,
+        }
+        return data | ends | shown
 
 
 @dataclass(frozen=True)
@@ -458,7 +463,7 @@ class _Inspector:
             try:
                 check_steps(name, place, column, steps)
                 none, shape = np.zeros(0), tuple(column.shape[1:])
-                array = self.fields.setdefault(place, Field(place, shape, str(column.dtype), none, none))
+                array = self.fields.setdefault(place, Field(place, shape, column.dtype, none, none))
                 check_shape(f"{name}: {place}", column, array.shape, "the first")
             except DemonstrationsError as error:
                 self._problem("shape", str(error), place)
@@ -507,9 +512,7 @@ def _problems_of_division(source: Source, names: Sequence[str], masks: Mapping[s
 
 def _problems(fields: Mapping[str, Field], lengths: Mapping[str, int]) -> Iterator[str]:
     for array in fields.values():
-        if not array.numeric:
-            yield f"{array.place} holds {array.dtype}, not numbers"
-        elif problem := array.problem:
+        if problem := array.problem:
             yield f"{array.place} {problem}"
         if array.first is not None:
             name, step = array.first

@@ -89,7 +89,8 @@ def starting_spec(inspection: Inspection, path: str | Path) -> str:
     observed = [field for field in inspection.observations if field.key not in inspection.versions.values()]
     used = [field for field in observed if not _left_out(inspection, field)]
     if not used:
-        raise DemonstrationsError(f"{inspection.path}: no observation can be used; see what is wrong with: {look}")
+        why = next((f": {field.place} {_left_out(inspection, field)}" for field in observed), "")
+        raise DemonstrationsError(f"{inspection.path}: no observation can be used{why}; see all with: {look}")
     text = _filled(inspection, str(path), observed, used, reasons)
     parse_spec(read_yaml(text))  # the text is a valid spec
     return text
@@ -188,15 +189,13 @@ def _divides(inspection: Inspection, without: Collection[str]) -> bool:
 
 def _unusable(inspection: Inspection, field: Field) -> str:
     """Why an array cannot be used; empty if it can."""
-    if not field.numeric and not field.place.startswith("labels/"):
-        return f"holds {field.dtype}, not numbers"
     if field.unusable:
         return f"has {field.unusable}"
     if not inspection.everywhere(field):
         return f"is in {field.demonstrations} of {len(inspection.lengths)} demonstrations"
     if 0 in inspection.lengths.values():
         return "has no steps in some demonstration"
-    return field.problem or ("has no dimensions" if 0 in field.shape else "")
+    return field.problem
 
 
 def _left_out(inspection: Inspection, field: Field) -> str:

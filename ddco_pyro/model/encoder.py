@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ddco_pyro.data.checks import rounding
+from ddco_pyro.data.checks import reading, rounding
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.pictures import PICTURE_DIMENSIONS, Observed, Pictures, Transform, TransformError
 from ddco_pyro.model.frames import Frames
@@ -39,7 +39,7 @@ class ObservationEncoder(nn.Module):
     The built-in observation :data:`~ddco_pyro.spec.STEP` is made here: the number of the step divided by ``longest``,
     the steps of the longest demonstration given to :meth:`fit`.
 
-    :raises ShapeError: an observation cannot be cropped, scaled, binned or augmented as the spec says.
+    :raises ShapeError: an observation cannot be read, cropped, scaled, binned or augmented as the spec says.
     """
 
     mean: Tensor
@@ -53,8 +53,13 @@ class ObservationEncoder(nn.Module):
         super().__init__()
         shapes = {**shapes, STEP: (1,)}
         self.shapes = {spec.key: tuple(shapes[spec.key]) for spec in specs if spec.key != STEP}
-        self.specs = tuple(spec for spec in specs if len(shapes[spec.key]) < PICTURE_DIMENSIONS)
-        pictures = [spec for spec in specs if len(shapes[spec.key]) == PICTURE_DIMENSIONS]
+        kinds = {}
+        for spec in specs:
+            kinds[spec.key], why = reading(tuple(shapes[spec.key]))
+            if why:
+                raise ShapeError(f"observations: {spec.key!r} {why}")
+        self.specs = tuple(spec for spec in specs if kinds[spec.key] == "vector")
+        pictures = [spec for spec in specs if kinds[spec.key] == "picture"]
         self.transforms = {spec.key: _transform(spec) for spec in pictures}
         self.shifts = {spec.key: spec.augment.shift for spec in pictures if spec.augment}
         seen = {spec.key: _seen_shape(spec, shapes) for spec in specs}

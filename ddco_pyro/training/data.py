@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ddco_pyro.data.checks import check, check_trained, problem_of_pictures
+from ddco_pyro.data.checks import check, check_trained, reading
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError, extent
 from ddco_pyro.data.memory import refuse_too_much
 from ddco_pyro.data.sources.recording import Recording
@@ -80,14 +80,15 @@ def tuning_split(spec: Spec, dimensions: Dimensions, train: Demonstrations) -> t
 
 
 def refuse_unfit(spec: Spec, demos: Demonstrations) -> None:
-    """Refuse pictures that networks cannot read, and a division that leaves too few demonstrations to train with.
+    """Refuse observations that networks cannot read, and a division that leaves too few demonstrations to train with.
 
     :raises DemonstrationsError: one of both is the case.
     """
     for key in spec.observed:
         observed = demos[0].observations[key]
-        if problem := problem_of_pictures(observed.shape[1:], observed.dtype):
-            raise DemonstrationsError(f"obs/{key} {problem}")
+        _, why = reading(observed.shape[1:], observed.dtype)
+        if why:
+            raise DemonstrationsError(f"obs/{key} {why}")
     own = spec.training
     if own.tune_fraction > 0 or own.optimizer.name != "em" or spec.compare_with:  # or one is enough
         check_trained(parts(spec, demos)["train"].names)

@@ -93,7 +93,7 @@ class Minari:
 
 
 def _leaves(observations: Any, key: str, bare: str = BARE) -> Iterator[tuple[str, np.ndarray]]:
-    """Path and array of each nested observation; text is left out.
+    """Path and array of each nested observation or action.
 
     :param bare: the path of an array that is not nested.
     """
@@ -103,8 +103,9 @@ def _leaves(observations: Any, key: str, bare: str = BARE) -> Iterator[tuple[str
     elif isinstance(observations, tuple):
         for number, below in enumerate(observations):
             yield from _leaves(below, f"{key}/{number}" if key else str(number))
-    elif isinstance(observations, np.ndarray):
-        yield key or bare, observations if observations.ndim > 1 else observations[:, None]
+    else:
+        observations = np.asarray(observations)  # a list of text
+        yield key or bare, observations[:, None] if observations.ndim == 1 else observations
 
 
 def _stored(folder: Path) -> set[int]:

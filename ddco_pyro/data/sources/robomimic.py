@@ -154,7 +154,9 @@ def write_recording(data: h5py.Group, recording: Recording) -> None:
     group.attrs.update({**recording.attributes, STEPS: recording.actions.shape[0]})
     for place, column in recording.columns():
         chunks = {"chunks": (1, *column.shape[1:]), "compression": "gzip", "compression_opts": 1}
-        dataset = group.create_dataset(place, column.shape, column.dtype, **(chunks if column.image else {}))
+        dataset = group.create_dataset(
+            place, column.shape, column.dtype, **(chunks if column.image and 0 not in column.shape else {})
+        )
         at = 0
         for block in column.blocks():
             dataset[at : at + len(block)] = block
