@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from ddco_pyro import encoding, inference
     from ddco_pyro.acting.controller import Controller
     from ddco_pyro.acting.monitor import Monitor
+    from ddco_pyro.cli.console import Progress
     from ddco_pyro.comparison import compare
     from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
     from ddco_pyro.estimator import OptionSegmenter
@@ -28,6 +29,7 @@ _PLACES = {
     "Fit": "fitting.fitted",
     "Monitor": "acting.monitor",
     "OptionSegmenter": "estimator",
+    "Progress": "cli.console",
     "Spec": "spec",
     "compare": "comparison",
     "export": "exporting",
@@ -47,6 +49,7 @@ __all__ = [
     "Fit",
     "Monitor",
     "OptionSegmenter",
+    "Progress",
     "Spec",
     "compare",
     "encoding",

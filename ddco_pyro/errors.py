@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import shlex
 from collections.abc import Iterable
+from numbers import Integral
 from typing import Any
 
 
@@ -14,6 +15,15 @@ class BadInput(ValueError):
 
 class Failed(RuntimeError):
     """A failure with valid input: one line with the problem, the place and the remedy (exit status 1)."""
+
+
+def check_whole(name: str, given: Any, least: int = 0) -> None:
+    """Refuse a setting that is not a whole number from ``least`` on; numpy's are.
+
+    :raises BadInput: it is not.
+    """
+    if not isinstance(given, Integral) or given < least:
+        raise BadInput(f"{name}={given!r}: has to be a whole number from {least} on")
 
 
 def command(*words: object) -> str:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from numbers import Integral
 from typing import Any, Self
 
 import numpy as np
@@ -13,12 +14,21 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.errors import BadInput
+from ddco_pyro.errors import BadInput, check_whole
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.inference.engines import log_likelihood
-from ddco_pyro.spec import Spec, parse_spec
+from ddco_pyro.spec import Spec, SpecError, parse_spec
 
-Arrays = np.ndarray | Sequence[np.ndarray]
+Arrays = Any
+"""An array or a data frame [ΣT, D], or a sequence of them, one for each demonstration."""
+
+PARAMETERS = {
+    "hierarchy.levels.0.count": "n_options",
+    "hierarchy.levels.0.policy.network": "policy",
+    "control.kind": "control",
+    "seed": "random_state",
+}
+"""The parameter behind a key path of the spec."""
 
 SEEDS = 2**31 - 1
 """Seeds that are drawn are smaller."""
@@ -28,8 +38,9 @@ class OptionSegmenter(BaseEstimator):
     """Options of observations X and controls U, as an estimator: one level, option h as label h − 1.
 
     Sequences are a list of arrays, or one array of all steps with the ``lengths`` of the sequences; without ``lengths``
-    an array is one sequence. Arrays have a row for each step. ``score``, ``decode``, ``predict`` and ``predict_proba``
-    condition on all of a sequence.
+    an array is one sequence. Arrays have a row for each step. Data frames and series of pandas and polars count as
+    arrays: their columns have to be named as in the fit, and an index is not read. ``score``, ``decode``, ``predict``
+    and ``predict_proba`` condition on all of a sequence.
 
     Without U, as in hmmlearn, X is emitted by the options, and there is no observation: a hidden Markov model with the
     transition matrix diag(1 − ψ) + ψ ηᵀ, ``transmat_``. A one-dimensional second argument is hmmlearn's ``lengths``.
@@ -89,7 +100,7 @@ class OptionSegmenter(BaseEstimator):
     def predict(self, X: Arrays, U: Arrays | None = None, lengths: Sequence[int] | None = None) -> np.ndarray:
         """The option at each step of the most likely path, int64 [ΣT], from 0."""
         demos = self._demonstrations(X, U, lengths)
-        return _joined(demos, self.fit_.segment(demos)[0]) - 1
+        return np.concatenate(self.fit_.segment(demos)[0]) - 1
 
     def predict_proba(self, X: Arrays, U: Arrays | None = None, lengths: Sequence[int] | None = None) -> np.ndarray:
         """The posterior probability of each option at each step, u of §4.1, [ΣT, k]."""
@@ -108,7 +119,7 @@ class OptionSegmenter(BaseEstimator):
         for piece in self.fit_.infer(demos):
             clamped = piece.tables.clamp(1, piece.path.choices[0])
             total += float(log_likelihood(clamped, piece.batch.lengths).sum())
-        return total, _joined(demos, self.fit_.segment(demos)[0]) - 1
+        return total, np.concatenate(self.fit_.segment(demos)[0]) - 1
 
     def sample(
         self, X: Any = 1, lengths: Sequence[int] | None = None, random_state: Any = None
@@ -118,8 +129,10 @@ class OptionSegmenter(BaseEstimator):
         :param X: the observations to which the controls react; for a fit without U, the number of steps.
         """
         check_is_fitted(self)
+        if not self._has_controls:
+            check_whole("X", X, 1)
         observed = self._rows(X, None, lengths)[::2] if self._has_controls else (np.zeros((X, 1)), np.array([X]))
-        first = int(check_random_state(random_state).randint(SEEDS))
+        first = _drawn(random_state)
         controller = Controller(self.fit_.hierarchy, "sample", "sample")
         controls, options = [], []
         for number, rows in enumerate(self._split(*observed)):
@@ -131,8 +144,11 @@ class OptionSegmenter(BaseEstimator):
 
     def _spec(self) -> Spec:
         seed, linear = self.random_state, self.policy == "linear"
-        if seed is None or isinstance(seed, np.random.RandomState):
-            seed = int(check_random_state(seed).randint(SEEDS))
+        settings = {} if self.settings is None else self.settings
+        if not isinstance(settings, Mapping) or not all(isinstance(path, str) for path in settings):
+            raise BadInput(
+                f"settings={settings!r}: has to be a mapping of key paths, such as {{'training.restarts': 5}}"
+            )
         network = {"network": "linear"}
         data = {
             "demonstrations": {"path": "arrays in memory", "valid_fraction": 0},
@@ -148,9 +164,14 @@ class OptionSegmenter(BaseEstimator):
                 "patience": 50,
                 "tune_fraction": 0 if linear else 0.1,
             },
-            "seed": seed,
+            "seed": seed if isinstance(seed, Integral) else _drawn(seed),
         }
-        return parse_spec(data, self.settings)
+        try:
+            return parse_spec(data, settings)
+        except SpecError as error:
+            paths = {path: name for path, name in PARAMETERS.items() if path not in settings}
+            problems = (problem.split(":", 1) for problem in error.problems)
+            raise SpecError(*(f"{paths.get(path, path)}:{said}" for path, said in problems)) from None
 
     def _demonstrations(
         self, X: Arrays, U: Arrays | None, lengths: Sequence[int] | None, fitting: bool = False
@@ -173,19 +194,35 @@ class OptionSegmenter(BaseEstimator):
         self, X: Any, U: Any, lengths: Any, fitting: bool = False
     ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
         """X and U with a row for each step, and the lengths of the sequences."""
-        if U is not None and len(U) and np.ndim(U[0]) == 0:
+        X, U = (list(given) if isinstance(given, Iterator) else given for given in (X, U))
+        if U is not None and _dimensions(U) == 1:
             if lengths is not None:
                 raise BadInput("U has one dimension; give controls as [steps, dimensions]")
             U, lengths = None, U
-        if isinstance(X, list | tuple) and len(X) and np.ndim(X[0]) == 2:
-            if lengths is not None:
-                raise BadInput("a list of sequences has its own lengths; leave lengths out")
-            lengths = [len(rows) for rows in X]
-            if U is not None and [len(rows) for rows in U] != lengths:
-                raise BadInput("X and U must be lists of sequences with equal numbers of steps")
-            X, U = np.concatenate(X), None if U is None else np.concatenate(U)
-        X = validate_data(self, X, reset=fitting, dtype=np.float64, ensure_min_samples=2 if fitting else 1)
-        U = None if U is None else check_array(U, input_name="U")
+        try:
+            if 3 in (_dimensions(X), _dimensions(U)):
+                if lengths is not None:
+                    raise BadInput("a list of sequences has its own lengths; leave lengths out")
+                if _dimensions(X) != 3:
+                    raise BadInput("X and U must be lists of sequences [steps, dimensions]")
+                lengths = [len(rows) for rows in X]
+                for number, rows in enumerate(X):  # the names and the number of columns
+                    validate_data(self, rows, reset=fitting and number == 0, skip_check_array=True)
+                X = check_array(np.concatenate([np.asarray(rows) for rows in X]), dtype=np.float64, input_name="X")
+                if U is not None:
+                    each = [np.asarray(rows) for rows in U]
+                    if [len(rows) for rows in each] != lengths:
+                        raise BadInput("X and U must be lists of sequences with equal numbers of steps")
+                    self._check_controls(next(iter(U)), fitting)
+                    U = np.concatenate([rows[:, None] if rows.ndim == 1 else rows for rows in each])
+            else:
+                X = validate_data(self, X, reset=fitting, dtype=np.float64, ensure_min_samples=2 if fitting else 1)
+                self._check_controls(U, fitting)
+            U = None if U is None else check_array(U, input_name="U")
+        except BadInput:
+            raise
+        except ValueError as error:
+            raise BadInput(" ".join(str(error).split())) from None
         if U is not None and len(U) != len(X):
             raise BadInput(f"X has {len(X)} steps, and U has {len(U)}; give both for the same steps")
         lengths = np.array([len(X)] if lengths is None else lengths)
@@ -193,9 +230,38 @@ class OptionSegmenter(BaseEstimator):
             raise BadInput(f"lengths must be whole numbers from 1 on whose sum is {len(X)}, the steps of X")
         return X, U, lengths
 
+    def _check_controls(self, U: Any, fitting: bool) -> None:
+        """Refuse a data frame of controls whose columns are in another order than in the fit."""
+        names = [*map(str, U.columns)] if hasattr(U, "columns") else None
+        if fitting:
+            self._control_names = names
+        elif names and self._control_names and names != self._control_names:
+            raise BadInput(f"U has the columns {', '.join(names)}; the fit had {', '.join(self._control_names)}")
+
     @staticmethod
     def _split(rows: np.ndarray, lengths: np.ndarray) -> list[np.ndarray]:
         return np.split(rows, np.cumsum(lengths)[:-1])
+
+
+def _dimensions(values: Any) -> int:
+    """The dimensions of an array, a data frame, or a sequence of them, which may have different lengths."""
+    if hasattr(values, "columns") or not isinstance(values, Iterable):
+        return np.ndim(values)
+    first = next(iter(values), None)
+    return 1 if first is None else 1 + np.ndim(first)
+
+
+def _drawn(random_state: Any) -> int:
+    """A seed drawn from a random state.
+
+    :raises BadInput: it is none.
+    """
+    try:
+        return int(check_random_state(random_state).randint(SEEDS))
+    except ValueError:
+        raise BadInput(
+            f"random_state={random_state!r}: has to be a whole number, a numpy.random.RandomState, or None"
+        ) from None
 
 
 def _joined(demos: Demonstrations, padded: np.ndarray | torch.Tensor) -> np.ndarray:

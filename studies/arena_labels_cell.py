@@ -83,7 +83,7 @@ def measured(fitted: Fit, kinds: list[int]) -> dict[str, float]:
     """
     valid = parts(fitted.spec, fitted.demonstrations)["valid"]
     truth = [demo.labels[LABELS] for demo in valid]
-    segments = [own[own >= 0] for own in fitted.segment(valid)[0]]
+    segments = fitted.segment(valid)[0]
     trained = fitted.metrics.trained_labels
     names = dict(enumerate(trained.values if trained else kinds, start=1))
     right = [names.get(option) == phase for own, phases in zip(segments, truth, strict=True)

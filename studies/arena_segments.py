@@ -20,7 +20,7 @@ def scored(fitted: Fit, labels: str) -> dict[str, Scores]:
     hierarchy, truth = fitted.spec.hierarchy, [demo.labels[labels] for demo in valid]
     assert hierarchy is not None  # it is what init writes
     count, observations = hierarchy.levels[0].count, fitted.spec.observations
-    segments = {OURS: [own[own >= 0] for own in fitted.segment(valid)[0]]}
+    segments = {OURS: fitted.segment(valid)[0]}
     segments |= {name: segment(name, train, valid, count, fitted.spec.seed, observations) for name in BASELINES}
     return {name: flat(agreement(own, truth)) for name, own in segments.items()}
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -166,12 +166,9 @@ def scores(segments: list[np.ndarray], truth: list[np.ndarray]) -> dict[str, Any
     return found and found.model_dump()
 
 
-def crossed(levels: Iterable[np.ndarray], demos: Demonstrations) -> list[dict[str, Any]]:
-    """Agreement of each level's options, padded with -1, with each of the labels."""
-    return [
-        {label: scores([row[row >= 0] for row in rows], [demo.labels[label] for demo in demos]) for label in LABELS}
-        for rows in levels
-    ]
+def crossed(levels: Iterable[Sequence[np.ndarray]], demos: Demonstrations) -> list[dict[str, Any]]:
+    """Agreement of each level's options with each of the labels."""
+    return [{label: scores(rows, [demo.labels[label] for demo in demos]) for label in LABELS} for rows in levels]
 
 
 def references(demos: Demonstrations, valid: Demonstrations, seed: int) -> dict[str, dict[str, Any]]:

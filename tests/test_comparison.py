@@ -215,7 +215,7 @@ def test_agreement_is_that_of_each_run_on_what_was_held_out(found, folders, held
     for row in found.agreement:
         fitted = by_run[row["run"]]
         (level,) = fitted.segment(held_out)
-        options = np.concatenate([path[: len(demo)] for path, demo in zip(level, held_out, strict=True)])
+        options = np.concatenate(level)
         assert (row["level"], row["labels"]) == (fitted.spec.hierarchy.levels[0].name, "phase")
         assert row["nmi"] == pytest.approx(normalized_mutual_info_score(phases, options))
         (scores,) = fitted.metrics.agreement.valid

@@ -50,7 +50,7 @@ def test_it_is_the_fit_of_its_spec(fitted: OptionSegmenter) -> None:
     fit = ddco_pyro.fit(fitted.spec_, demos)
     assert fitted.spec_.seed == 3
     assert fitted.score(X, U) == fit.log_likelihood(demos).sum()
-    np.testing.assert_array_equal(fitted.predict(X, U), fit.segment(demos)[0].ravel() - 1)
+    np.testing.assert_array_equal(fitted.predict(X, U), np.concatenate(fit.segment(demos)[0]) - 1)
     np.testing.assert_array_equal(fitted.predict_proba(X, U), fit.posterior(demos).u[0].flatten(0, 1)[:, 1:])
 
 
@@ -102,6 +102,19 @@ def test_perceptrons_and_other_settings() -> None:
         (lambda model, X, U: model.predict(X, U, [16] * 5), "leave lengths out"),
         (lambda model, X, U: model.fit(X[0], U[0][:, 0], [16]), "one dimension"),
         (lambda model, X, U: model.set_params(settings={"training.epoch": 3}).fit(X, U), "training.epochs"),
+        (lambda model, X, U: model.set_params(settings=["training.epochs"]).fit(X, U), "has to be a mapping"),
+        (lambda model, X, U: model.set_params(n_options=2.5).fit(X, U), "^n_options: must be a whole number"),
+        (lambda model, X, U: model.set_params(policy="x").fit(X, U), "^policy: no network is called 'x'"),
+        (lambda model, X, U: model.set_params(random_state="x").fit(X, U), "^random_state='x': has to be a whole"),
+        (lambda model, X, U: model.sample(X, random_state="x"), "^random_state='x': has to be a whole"),
+        (lambda model, X, U: model.predict([np.hstack([x, x]) for x in X], U), "X has 4 features, but"),
+        (lambda model, X, U: model.score(X, [np.hstack([u, u]) for u in U]), r"actions has shape \(4,\)"),
+        (lambda model, X, U: model.decode(X, [u[:, :1] for u in U]), r"actions has shape \(1,\)"),
+        (lambda model, X, U: model.predict_proba(X, [np.nan * u for u in U]), "U contains NaN"),
+        (lambda model, X, U: model.predict("demos.hdf5", U), "lists of sequences"),
+        (lambda model, X, U: model.predict([x[:, 0] for x in X], U), "lists of sequences"),
+        (lambda model, X, U: model.predict(None, U[0]), "Expected 2D array"),
+        (lambda model, X, U: model.predict(X[0], U[0], [8.5, 7.5]), "whole numbers"),
     ],
 )
 def test_wrong_arrays_are_refused_in_a_line(ask: Any, says: str, fitted: OptionSegmenter) -> None:
@@ -110,6 +123,81 @@ def test_wrong_arrays_are_refused_in_a_line(ask: Any, says: str, fitted: OptionS
         ask(fitted, *two_options())
     fitted.set_params(**before)
     assert "\n" not in str(refused.value)
+
+
+def listed(values: Any, make: Any) -> list[Any]:
+    return [make(each) for each in values]
+
+
+def objects(values: Any) -> np.ndarray:
+    found = np.empty(len(values), object)
+    found[:] = values
+    return found
+
+
+KINDS = {
+    "a 3-D array": lambda _, X, U: (np.array(X), np.array(U)),
+    "an array of arrays": lambda _, X, U: (objects(X), objects(U)),
+    "an iterator": lambda _, X, U: (iter(X), iter(U)),
+    "pandas": lambda pd, X, U: (listed(X, lambda x: pd.DataFrame(x, index=range(9, 25))), listed(U, pd.DataFrame)),
+    "a series of frames": lambda pd, X, U: (pd.Series(listed(X, pd.DataFrame), index=[*"edcba"]), U),
+    "a frame, lengths in a series": lambda pd, X, U: (
+        pd.DataFrame(np.concatenate(X), index=[f"row {n}" for n in range(80)], columns=["a", "b"]),
+        pd.DataFrame(np.concatenate(U))[::-1][::-1],
+        pd.Series([16] * 5, index=[*"edcba"]),
+    ),
+    "polars": lambda pl, X, U: (listed(X, pl.DataFrame), listed(U, pl.DataFrame)),
+    "a polars frame, lengths in a series": lambda pl, X, U: (
+        pl.DataFrame(np.concatenate(X)),
+        pl.DataFrame(np.concatenate(U)),
+        pl.Series([16] * 5),
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.filterwarnings("ignore:X has feature names")
+def test_the_data_that_people_hold_are_taken(kind: str, fitted: OptionSegmenter) -> None:
+    package = "polars" if "polars" in kind else "pandas" if "frame" in kind or "pandas" in kind else "numpy"
+    given = KINDS[kind](pytest.importorskip(package), *two_options())
+    assert fitted.score(*given) == pytest.approx(fitted.score(*two_options()))
+    given = KINDS[kind](pytest.importorskip(package), *two_options())
+    again = OptionSegmenter(np.int64(2), random_state=np.int64(3)).fit(*given)
+    np.testing.assert_array_equal(again.predict(*two_options()), fitted.predict(*two_options()))
+
+
+def test_one_control_may_be_a_list_of_columns(fitted: OptionSegmenter) -> None:
+    X, U = two_options()
+    model = OptionSegmenter(2, settings=QUICK).fit(X, [u[:, 0] for u in U])
+    assert model.score(X, [u[:, 0] for u in U]) == model.score(X, [u[:, :1] for u in U])
+
+
+def test_the_columns_of_a_frame_have_to_be_those_of_the_fit() -> None:
+    pandas = pytest.importorskip("pandas")
+    X, U = (listed(each, lambda rows: pandas.DataFrame(rows, columns=["a", "b"])) for each in two_options())
+    model = OptionSegmenter(2, settings=QUICK).fit(X, U)
+    assert model.feature_names_in_.tolist() == ["a", "b"]
+    with pytest.raises(BadInput, match="feature names should match"):
+        model.predict(listed(X, lambda rows: rows[["b", "a"]]), U)
+    with pytest.raises(BadInput, match="U has the columns b, a; the fit had a, b"):
+        model.predict(X, listed(U, lambda rows: rows[["b", "a"]]))
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"n_options": np.uint8(2), "random_state": np.uint32(0), "policy": np.str_("linear")},
+        {"settings": {"training.epochs": np.int64(12), "training.layerwise": np.bool_(True)}},
+        {"settings": {"training.epochs": np.array(12), "control.std.floor": np.float64(0.01)}},
+        {"differences": np.bool_(True), "control": np.str_("auto")},
+    ],
+)
+def test_settings_may_be_numpys(given: dict[str, Any]) -> None:
+    X, U = two_options()
+    plain = OptionSegmenter(2, settings={"control.std.floor": 0.01, **QUICK}).fit(X, U)
+    settings = {"control.std.floor": 0.01, **QUICK, **given.get("settings", {})}
+    model = OptionSegmenter(**{"n_options": 2, **given, "settings": settings}).fit(X, U)
+    assert model.score(X, U) == plain.score(X, U)
 
 
 # --- hmmlearn ---------------------------------------------------------------------------------------------------------
@@ -159,7 +247,7 @@ def test_sequences_are_the_samples_of_model_selection() -> None:
     scores = cross_val_score(OptionSegmenter(2, settings=QUICK), X, U, cv=3)
     model = OptionSegmenter(2, settings=QUICK).fit(X[2:], U[2:])
     assert scores[0] == pytest.approx(model.score(X[:2], U[:2]), rel=1e-6)
-    found = GridSearchCV(OptionSegmenter(settings=QUICK), {"n_options": [1, 2]}, cv=2).fit(X, U)
+    found = GridSearchCV(OptionSegmenter(settings=QUICK), {"n_options": np.arange(1, 3)}, cv=2).fit(X, U)
     assert found.best_params_ == {"n_options": 2}
 
 

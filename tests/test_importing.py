@@ -283,9 +283,10 @@ def written_by_minari(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 def test_minari(written_by_minari, out: Path) -> None:
     folder, buffers = written_by_minari(spaces.Box(-1, 1, (2,)))
-    text = "obs/mission holds text, not numbers"
-    assert import_demonstrations(folder, out).unread == (text,)
-    assert text in inspect(folder).problems
+    assert import_demonstrations(folder, out).unread == (
+        "networks do not read obs/mission: it holds text, not numbers",
+    )
+    assert "obs/mission holds text, not numbers" in inspect(folder).problems
     demos = Demonstrations.read(out)
     assert demos.lengths == (5, 6, 7, 8)
     for buffer, demo in zip(buffers, demos, strict=True):

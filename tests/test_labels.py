@@ -321,7 +321,7 @@ def test_each_level_is_measured_with_its_own_labels(tmp_path, monkeypatch, label
     measured = zip(fit.segment(valid), names, metrics.valid, metrics.confusion, strict=True)
     for level, name, found, table in measured:
         truth = [demo.labels[name] for demo in valid]
-        assert found == agreement(list(level), truth)
+        assert found == agreement(level, truth)
         assert np.sum(table.steps) == sum((one >= 0).sum() for one in truth)
     if labels == "half":
         return

@@ -50,6 +50,156 @@ def in_memory(commanded: Path) -> ddco_pyro.Fit:
     return ddco_pyro.fit(commanded / "spec.yaml", two_skills())
 
 
+# --- the same questions as the command asks ---------------------------------------------------------------------------
+
+READ = "log_likelihood", "posterior", "segment", "draws", "monitor"
+"""Methods of a fit that take demonstrations."""
+
+
+def one(place: object = np.ones((8, 2)), actions: object = np.ones((8, 2)), **observations: object) -> Demonstration:
+    return Demonstration("demo", {"place": place, "turn": np.ones((8, 1)), **observations}, actions)
+
+
+NOT_READ = {
+    "a control too many": (
+        lambda: [one(actions=np.ones((8, 3)))],
+        r"demo: actions has shape \(3,\) at each step, .*\(2,\)",
+    ),
+    "a control too few": (lambda: [one(actions=np.ones((8, 1)))], r"demo: actions has shape \(1,\)"),
+    "a wide observation": (lambda: [one(np.ones((8, 3)))], r"demo: obs/place has shape \(3,\)"),
+    "a picture": (lambda: [one(np.ones((8, 6, 6, 3), np.uint8))], r"demo: obs/place has shape \(6, 6, 3\)"),
+    "a missing observation": (
+        lambda: [Demonstration("demo", {"plce": np.ones((8, 2))}, np.ones((8, 2)))],
+        r"demo: there is no observation 'place' \(did you mean 'plce'\?\)",
+    ),
+    "a huge number": (lambda: [one(np.full((8, 2), 1e20))], "demo: obs/place at step 0 is 1e"),
+    "a name twice": (lambda: [one(), one()], "demo: there are two demonstrations of this name"),
+    "none": (list, "there are no demonstrations"),
+    "one without a list": (one, "got Demonstration"),
+    "an array": (lambda: np.ones((8, 2)), "got ndarray"),
+    "a mapping": (lambda: {"place": np.ones((8, 2))}, "got dict"),
+    "a path": (lambda: "demos.hdf5", r"Demonstrations\.read\(FILE\); got str"),
+    "a number": (lambda: 3, "got int"),
+}
+
+
+@pytest.mark.parametrize("method", READ)
+@pytest.mark.parametrize("fault", NOT_READ)
+def test_demonstrations_that_a_fit_cannot_read_are_refused_in_a_line(
+    method: str, fault: str, in_memory: ddco_pyro.Fit
+) -> None:
+    give, says = NOT_READ[fault]
+    with pytest.raises(BadInput, match=says) as refused:
+        getattr(in_memory, method)(give())
+    assert "\n" not in str(refused.value)
+
+
+SEEN = {"place": np.zeros(2), "turn": np.ones(1)}
+UNSEEN = {
+    "missing": ({"turn": np.ones(1)}, "the observation has no 'place'"),
+    "wide": ({**SEEN, "place": np.zeros(3)}, r"'place' has shape \(3,\), the demonstrations had \(2,\)"),
+    "NaN": ({**SEEN, "place": [np.nan, 0]}, "'place' is not finite"),
+    "text": ({**SEEN, "place": ["a", "b"]}, "'place' is <U1, it has to be numbers"),
+    "ragged": ({**SEEN, "place": [[1], [1, 2]]}, "'place' is no array"),
+    "huge": ({**SEEN, "place": [1e20, 0]}, r"'place' is 1e\+20 once it is scaled"),
+    "huge as float32": ({**SEEN, "place": [1e300, 0]}, "'place' is too large"),
+    "an array": (np.zeros(2), "has to be a mapping, such as {'place': array}; got ndarray"),
+    "nothing": (None, "got NoneType"),
+}
+UNAPPLIED = {
+    "missing": (None, "the control applied since the last observation is needed"),
+    "wide": (np.zeros(3), r"the control has shape \(3,\)"),
+    "NaN": ([np.nan, 0], "the control is not finite"),
+    "text": (["a", "b"], "the control is <U1"),
+    "huge": ([1e25, 0], "the control is .*e.* once it is scaled.*units"),
+}
+
+
+@pytest.mark.parametrize("fault", [*UNSEEN, *(f"control: {name}" for name in UNAPPLIED)])
+def test_what_cannot_be_acted_on_is_refused_in_a_line_and_changes_nothing(fault: str, in_memory: ddco_pyro.Fit) -> None:
+    of_control, applied = fault.startswith("control: "), np.zeros(2)
+    wrong, says = UNAPPLIED[fault.removeprefix("control: ")] if of_control else UNSEEN[fault]
+    monitor, controller, found = in_memory.monitor(), in_memory.controller(), []
+    for refuse in (False, True):
+        monitor.reset()
+        controller.reset()
+        monitor.step(SEEN)
+        controller.act(SEEN)
+        asks = [lambda: monitor.step(*((SEEN, wrong) if of_control else (wrong, applied)))]
+        asks += [] if of_control else [lambda: controller.act(wrong)]
+        for ask in asks if refuse else ():
+            with pytest.raises(BadInput, match=says) as refused:
+                ask()
+            assert "\n" not in str(refused.value)
+        found.append((monitor.step(SEEN, applied), monitor.log_likelihood, controller.act(SEEN).tolist()))
+    assert found[0] == found[1]
+
+
+@pytest.mark.parametrize(
+    ("ask", "says"),
+    [
+        (lambda fit: fit.controller(-1), "seed=-1: has to be a whole number from 0 on"),
+        (lambda fit: ddco_pyro.Controller(fit), "a Fit in place of networks: give fit.hierarchy"),
+        (lambda fit: ddco_pyro.Monitor(fit), "give fit.hierarchy"),
+        (
+            lambda fit: ddco_pyro.Controller(fit.hierarchy, "average"),
+            "control='average': has to be one of mean, sample",
+        ),
+        (lambda fit: ddco_pyro.Controller(fit.hierarchy, options="likely"), "options='likely'"),
+        (lambda fit: fit.controller().act_all([SEEN, SEEN]), "there are 1 episodes and 2 observations"),
+        (lambda fit: fit.draws(two_skills(), 0), "draws=0: has to be a whole number from 1 on"),
+        (lambda fit: fit.draws(two_skills(), 2, seed="x"), "seed='x'"),
+        (lambda fit: fit.draws(two_skills(), 2).boundaries("skill", 0, np.ones(8)), "there is no level 'skill'"),
+        (lambda fit: fit.draws(two_skills(), 2).boundaries("option", 0, np.ones(8), mass=9), "mass=9"),
+        (lambda fit: fit.monitor().progress({"skill": []}), "order: there is no 'skill'"),
+        (lambda fit: fit.monitor().progress({"option": ["reach"]}), "order: there is no 'reach'"),
+        (lambda fit: ddco_pyro.fit(fit.spec, np.ones((8, 2))), "got ndarray"),
+        (lambda fit: Demonstrations((np.ones(3),)), "got ndarray"),
+        (lambda fit: Demonstration("a", np.ones(3), np.ones((3, 1))), "observations have to be a mapping"),
+        (lambda fit: Demonstration("a", {"x": [[1], [1, 2]]}, np.ones((2, 1))), "a: obs/x is no array"),
+        (lambda fit: two_skills().split(1.5, 0), "valid_fraction=1.5"),
+        (lambda fit: two_skills().split(0.5, -1), "seed=-1"),
+    ],
+)
+def test_wrong_arguments_are_refused_in_a_line(ask, says: str, in_memory: ddco_pyro.Fit) -> None:
+    with pytest.raises(BadInput, match=says) as refused:
+        ask(in_memory)
+    assert "\n" not in str(refused.value)
+
+
+# --- what is printed --------------------------------------------------------------------------------------------------
+
+
+def test_what_is_printed_is_a_few_lines(in_memory: ddco_pyro.Fit) -> None:
+    demos = replace(two_skills(), masks={"valid": ("demo_3",)})
+    values, counts = in_memory.metrics.log_likelihood_per_step, in_memory.metrics.demonstrations
+    assert str(in_memory).splitlines() == [
+        "ddco",
+        "  option: option 1, option 2",
+        f"  log-likelihood, nats per step: {values.train:.3f} ({counts.train} trained with), {values.valid:.3f} "
+        f"({counts.valid} held out)",
+    ]
+    arrays = ["  actions [2] float64", "  obs/place [2] float64", "  obs/turn [1] float64"]
+    assert repr(demos[1]).splitlines() == ["demo_1: 9 steps", *arrays]
+    assert repr(demos).splitlines() == ["12 demonstrations of 8 to 10 steps", *arrays, "  mask/valid: 1"]
+
+
+def test_segments_are_a_table_of_the_most_likely_path(in_memory: ddco_pyro.Fit) -> None:
+    demos = two_skills()
+    (options,) = in_memory.segment(demos)
+    assert list(map(len, options)) == list(demos.lengths)
+    assert (options.level, options.names, options.demonstrations) == ("option", in_memory.names["option"], demos.names)
+    rows = options.segments
+    for demo, path in zip(demos, options, strict=True):
+        own = [row for row in rows if row.demonstration == demo.name]
+        assert [row.option for row in own for _ in range(row.steps)] == path.tolist()
+        assert [row.start for row in own] == [0, *np.cumsum([row.steps for row in own])[:-1]]
+        assert all(row.name == options.names[row.option] for row in own)
+    assert str(options).startswith(f"option: 12 demonstrations, {len(rows)} segments\n  demo_0: {rows[0].name} (")
+    table = pytest.importorskip("pandas").DataFrame(rows)
+    assert [*table.columns] == ["demonstration", "level", "option", "name", "start", "steps"]
+
+
 # --- a fit without a folder -------------------------------------------------------------------------------------------
 
 
@@ -207,7 +357,9 @@ def test_pieces_say_what_the_whole_says(in_memory: ddco_pyro.Fit, monkeypatch: p
             assert float(total) == pytest.approx(piece.log_likelihood[own], rel=1e-6)
             row += 1
     assert in_memory.posterior(demos).u[0].shape == whole.posterior.u[0].shape
-    np.testing.assert_array_equal(in_memory.segment(demos)[0], whole.path.choices[0])
+    (segments,) = in_memory.segment(demos)
+    for own, row in zip(segments, whole.path.choices[0], strict=True):
+        np.testing.assert_array_equal(own, row[: len(own)])
 
 
 def test_demonstrations_are_taken_as_they_are_needed(in_memory: ddco_pyro.Fit, monkeypatch) -> None:

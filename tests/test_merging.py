@@ -37,7 +37,7 @@ def planted():
 def table(run, truth):
     """Steps of each option (rows) with each true one (columns), held out."""
     valid = parts(run.spec, run.demonstrations)["valid"]
-    found = np.concatenate([own[own >= 0] for own in run.segment(valid)[0]])
+    found = np.concatenate(run.segment(valid)[0])
     true = np.concatenate([truth[demo.name][: len(demo)] for demo in valid])
     return found, true
 
@@ -65,7 +65,7 @@ def test_what_training_begins_from(planted, monkeypatch, options, labels):
     demo = run.demonstrations[0]
     short = {key: seen[:5] for key, seen in demo.observations.items()}
     demos = Demonstrations((replace(demo, observations=short, actions=demo.actions[:5], labels={}),))
-    monkeypatch.setattr(type(run), "segment", lambda self, demos: (np.array([[1, 2, 3, 0, 2, -1, -1]]),))
+    monkeypatch.setattr(type(run), "segment", lambda self, demos: ([np.array([1, 2, 3, 0, 2])],))
     (labelled,) = merged_labels(replace(run, given=demos), Pair(0, options, None))
     assert labelled.labels[LABELS].tolist() == labels
 

@@ -35,7 +35,7 @@ def test_what_it_says_at_the_end_is_what_the_demonstration_says(counts, network)
     for t in [0, 1, 2, *range(6)]:
         if t == 0:
             monitor.reset()
-        belief = monitor.step({"state": demo.observations["state"][t]}, demo.actions[t - 1] if t else None)
+        active = monitor.step({"state": demo.observations["state"][t]}, demo.actions[t - 1] if t else None)
     with torch.no_grad():
         batch = encode(Demonstrations([demo]), hierarchy.encoder, hierarchy.scaling)
         tables = hierarchy.tabulate(batch)
@@ -44,8 +44,9 @@ def test_what_it_says_at_the_end_is_what_the_demonstration_says(counts, network)
             table[:, -1] = 0.0
         expected = posterior(tables, batch.lengths)
     assert monitor.log_likelihood == pytest.approx(float(before), rel=1e-6)
-    for d, level in enumerate(belief.levels):
+    for d, level in enumerate(monitor.belief.levels):
         torch.testing.assert_close(level[0].sum(-1), expected.u[d][0, -1], atol=1e-6, rtol=0)
+        assert list(active[f"level-{1 + d}"].values()) == pytest.approx(level[0].sum(-1).tolist())
         torch.testing.assert_close(level[0, :, 1], expected.v[d][0, -1], atol=1e-6, rtol=0)
 
 
@@ -57,7 +58,7 @@ def test_the_control_comes_with_every_observation_but_the_first():
     monitor.step(state)
     with pytest.raises(ObservationError, match=r"shape \(2,\); got none"):
         monitor.step(state)
-    with pytest.raises(ObservationError, match=r"got one of shape \(3,\)"):
+    with pytest.raises(ObservationError, match=r"has shape \(3,\), the demonstrations had \(2,\)"):
         monitor.step(state, np.zeros(3))
 
 
@@ -120,7 +121,7 @@ def test_without_demonstrations_no_fraction_is_known(phases):
 
 
 def test_runs_end_where_the_choice_changes_and_with_the_demonstration():
-    found = run_lengths(np.array([[1, 1, 2, 2, 2, 1], [0, 1, -1, -1, -1, -1]]), 3)
+    found = run_lengths([np.array([1, 1, 2, 2, 2, 1]), np.array([0, 1])], 3)
     assert [lengths.tolist() for lengths in found] == [[1], [1, 1, 2], [3], []]
 
 

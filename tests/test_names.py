@@ -124,8 +124,8 @@ def test_names_are_shown_wherever_options_are(files):
     controller, monitor = fit.controller(), fit.monitor()
     controller.act({"place": place})
     assert controller.active == {"skill": fit.names["skill"][controller.choices[0]]}
-    belief = monitor.step({"place": place})
-    assert monitor.by_name(belief)["skill"]["pick & place"] == pytest.approx(float(belief.choices[0][0, 2]))
+    active = monitor.step({"place": place})
+    assert active["skill"]["pick & place"] == pytest.approx(float(monitor.belief.choices[0][0, 2]))
     write_numpy(fit, files)
     about = json.loads((files / "controller.json").read_text())
     assert about["names"] == {"skill": ["control", "<go>", "pick & place", "on"]}

@@ -15,7 +15,7 @@ from odd_files import Row, lerobot, rows, snapshot
 
 MEMORY = 500 * 10**6
 ROWS = rows()
-PROGRESS = re.compile(r"\w+: \d+/\d+")
+PROGRESS = re.compile(r"\w+: \d+/\d+|note: ")
 
 
 def commands(path: Path, out: Path, run: Path) -> Iterator[tuple[object, ...]]:

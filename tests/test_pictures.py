@@ -236,7 +236,7 @@ def test_a_streamed_fit_is_that_in_memory(kept: Path, chunks: bool, monkeypatch:
     stored, memory = Demonstrations.read(kept), demonstrations()
     np.testing.assert_array_equal(streamed.log_likelihood(stored), whole.log_likelihood(memory))
     np.testing.assert_array_equal(streamed.posterior(stored).u[0], whole.posterior(memory).u[0])
-    np.testing.assert_array_equal(streamed.segment(stored)[0], whole.segment(memory)[0])
+    assert streamed.segment(stored)[0].segments == whole.segment(memory)[0].segments
 
 
 def test_a_controller_sees_what_networks_were_trained_on(kept: Path) -> None:

@@ -86,7 +86,7 @@ def test_what_is_loaded_is_what_was_fitted(toy_run, demos):
     loaded = ddco_pyro.load(toy_run.folder)
     np.testing.assert_array_equal(loaded.log_likelihood(demos), toy_run.log_likelihood(demos))
     for one, other in zip(loaded.segment(demos), toy_run.segment(demos), strict=True):
-        np.testing.assert_array_equal(one, other)
+        assert one.segments == other.segments
     assert loaded.metrics == toy_run.metrics
 
 
@@ -124,7 +124,7 @@ def test_only_the_training_demonstrations_standardise(toy_run, parts, toy_spec):
 def test_agreement_with_the_labels_can_be_computed_again(toy_run, parts):
     for name, part in parts.items():
         (segments,) = toy_run.segment(part)
-        found = np.concatenate([row[: len(demo)] for row, demo in zip(segments, part, strict=True)])
+        found = np.concatenate(segments)
         truth = np.concatenate([demo.labels["phase"] for demo in part])
         (scores,) = getattr(toy_run.metrics.agreement, name)
         assert scores.nmi == pytest.approx(normalized_mutual_info_score(truth, found))

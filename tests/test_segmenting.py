@@ -86,8 +86,9 @@ def test_they_are_the_fits_own(toy_run, toy_spec, file, at_once, monkeypatch):
     assert [one.name for one in found.segments] == list(demos.names)
     for row, (one, demo) in enumerate(zip(found.segments, demos, strict=True)):
         level = one.levels["option"]
-        np.testing.assert_array_equal(level.options, path[row, : len(demo)])
+        np.testing.assert_array_equal(level.options, path[row])
         np.testing.assert_allclose(level.probability, u[row, np.arange(len(demo)), level.options], rtol=1e-6)
+        np.testing.assert_array_equal(level.boundaries, path.starts[row])
         assert level.boundaries[0]
         assert level.boundaries[1:][np.diff(level.options) != 0].all()
         assert [option for option, a, b in level.runs() for _ in range(a, b)] == level.options.tolist()
@@ -262,7 +263,7 @@ def test_the_page_marks_what_was_held_out_and_says_how_labels_agree(toy_run, toy
     scores = {}
     for name, part in split.items():
         (path,) = toy_run.segment(part)
-        found = np.concatenate([row[: len(demo)] for row, demo in zip(path, part, strict=True)])
+        found = np.concatenate(path)
         scores[name] = normalized_mutual_info_score(np.concatenate([demo.labels["phase"] for demo in part]), found)
     assert "Agreement with the label “phase”" in text
     assert f"<td>options, 3 held out</td><td>{scores['valid']:.2f}</td>" in text

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -13,12 +13,25 @@ from torch import Tensor
 
 from ddco_pyro.acting.window import Window
 from ddco_pyro.drawing.words import option_name
+from ddco_pyro.errors import BadInput, check_whole
 from ddco_pyro.inference.logspace import arrive
 from ddco_pyro.model.ahmm import Acting, Tabulated, choose
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import States
 from ddco_pyro.model.tables import Step, complete
 from ddco_pyro.spec import OptionExecution, RolloutSpec
+
+ControlExecution = Literal["mean", "sample"]
+
+
+def fitted(hierarchy: Hierarchy) -> Hierarchy:
+    """The networks of a fit, for acting.
+
+    :raises BadInput: it is something else.
+    """
+    if not isinstance(hierarchy, Hierarchy):
+        raise BadInput(f"a {type(hierarchy).__name__} in place of networks: give fit.hierarchy")
+    return hierarchy.eval()
 
 
 class Controller:
@@ -39,17 +52,21 @@ class Controller:
         the largest ``marginal`` p(h_t | s_0, ..., s_t), which accumulates the probability that options have ended.
     :param seed: of the first episode.
     :param names: the names of the choices of each level, lowest first, such as ``fit.names``.
+    :raises BadInput: one of these is something else.
     """
 
     def __init__(
         self,
         hierarchy: Hierarchy,
-        control: Literal["mean", "sample"] = "mean",
+        control: ControlExecution = "mean",
         options: OptionExecution = "sample",
         seed: int = 0,
         names: Mapping[str, Sequence[str]] = MappingProxyType({}),
     ) -> None:
-        self.hierarchy, self.names = hierarchy.eval(), names
+        self.hierarchy, self.names = fitted(hierarchy), names
+        for name, given, known in (("control", control, ControlExecution), ("options", options, OptionExecution)):
+            if given not in get_args(known):
+                raise BadInput(f"{name}={given!r}: has to be one of {', '.join(get_args(known))}")
         self.control, self.options = control, options
         self.reset(seed)
 
@@ -69,7 +86,12 @@ class Controller:
         self.reset_all([seed])
 
     def reset_all(self, seeds: Sequence[int]) -> None:
-        """Begin N episodes, each with its own seed."""
+        """Begin N episodes, each with its own seed.
+
+        :raises BadInput: a seed is not a whole number from 0 on.
+        """
+        for seed in seeds:
+            check_whole("seed", seed)
         self.seeds, self.time = list(seeds), 0
         self._window = Window(self.hierarchy.encoder)
         self._choices: tuple[Tensor, ...] | None = None
@@ -111,6 +133,10 @@ class Controller:
 
         :raises ObservationError: an observation is missing, not finite, or of another shape than in training.
         """
+        if len(observations) != len(self.seeds):
+            raise BadInput(
+                f"there are {len(self.seeds)} episodes and {len(observations)} observations; give one for each"
+            )
         generators = [np.random.default_rng([seed, self.time]) for seed in self.seeds]
         with torch.no_grad():
             outputs, self._states = self.hierarchy.advance(self._window.inputs(observations), self._states)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -10,7 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ddco_pyro.acting.window import ObservationError, Window
+from ddco_pyro.acting.controller import fitted
+from ddco_pyro.acting.window import ObservationError, Window, numbers, refuse_large
+from ddco_pyro.drawing.words import choice_names
+from ddco_pyro.errors import BadInput, nearest
 from ddco_pyro.inference.filtering import Belief, Filter
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import States
@@ -21,20 +24,19 @@ Lengths = Mapping[str, Sequence[np.ndarray]]
 """How many steps each choice of a level remains active: for each level, an array of lengths for each choice."""
 
 
-def run_lengths(choices: np.ndarray, count: int) -> list[np.ndarray]:
+def run_lengths(choices: Iterable[np.ndarray], count: int) -> list[np.ndarray]:
     """The lengths of the runs of each choice 0 to ``count``; a run lasts while the choice is the same.
 
-    >>> run_lengths(np.array([[1, 1, 2, 1], [2, 2, -1, -1]]), 2)
+    >>> run_lengths([np.array([1, 1, 2, 1]), np.array([2, 2])], 2)
     [array([], dtype=int64), array([1, 2]), array([1, 2])]
 
-    :param choices: [N, T], -1 past a demonstration's end.
+    :param choices: of each demonstration, [T].
     """
     found: list[list[int]] = [[] for _ in range(1 + count)]
     for row in choices:
-        known = row[row >= 0]
-        starts = np.flatnonzero(np.diff(known, prepend=-1))
-        for start, length in zip(starts, np.diff(starts, append=len(known)), strict=True):
-            found[known[start]].append(int(length))
+        starts = np.flatnonzero(np.diff(row, prepend=-1))
+        for start, length in zip(starts, np.diff(starts, append=len(row)), strict=True):
+            found[row[start]].append(int(length))
     return [np.sort(np.array(lengths, int)) for lengths in found]
 
 
@@ -60,17 +62,21 @@ class Progress(NamedTuple):
 class Monitor:
     """An online filter of another agent's options: call :meth:`step` with each observation and the previous control.
 
-    >>> monitor = ddco_pyro.Monitor(fit.hierarchy)
+    >>> monitor = fit.monitor()
     >>> demo = demos[0]
-    >>> belief = monitor.step({"place": demo.observations["place"][0]})
+    >>> active = monitor.step({"place": demo.observations["place"][0]})
     >>> for t in range(1, 4):
-    ...     belief = monitor.step({"place": demo.observations["place"][t]}, demo.actions[t - 1])
-    >>> belief.choices[0].shape, round(float(belief.choices[0].sum()), 6)  # control and two options
-    (torch.Size([1, 3]), 1.0)
+    ...     active = monitor.step({"place": demo.observations["place"][t]}, demo.actions[t - 1])
+    >>> list(active["option"]), round(sum(active["option"].values()), 6)
+    (['control', 'option 1', 'option 2'], 1.0)
 
-    :param names: the names of the choices of each level, lowest first, such as ``fit.names``.
+    :param names: the names of the choices of each level, lowest first, such as ``fit.names``; by default numbers.
     :param lengths: how long choices remain active, for :meth:`progress`; ``fit.monitor(demos)`` has those of ``demos``.
+    :ivar belief: the exact belief after :meth:`step`, with the probabilities that options have just been selected.
+    :raises BadInput: ``hierarchy`` is something else.
     """
+
+    belief: Belief
 
     def __init__(
         self,
@@ -78,7 +84,9 @@ class Monitor:
         names: Mapping[str, Sequence[str]] = MappingProxyType({}),
         lengths: Lengths = MappingProxyType({}),
     ) -> None:
-        self.hierarchy, self.names, self.lengths = hierarchy.eval(), names, lengths
+        self.hierarchy, self.lengths = fitted(hierarchy), lengths
+        counts = enumerate(level.count for level in self.hierarchy.option_levels())
+        self.names = names or {f"level-{1 + number}": choice_names(count) for number, count in counts}
         self.reset()
 
     def reset(self) -> None:
@@ -93,11 +101,6 @@ class Monitor:
         """log p of the controls so far, nats."""
         return float(self._filter.log_likelihood)
 
-    def by_name(self, belief: Belief) -> dict[str, dict[str, float]]:
-        """The probability of each choice of each level that ``names`` has, by name."""
-        levels = zip(self.names.items(), belief.choices, strict=False)
-        return {level: dict(zip(own, each[0].tolist(), strict=True)) for (level, own), each in levels}
-
     def progress(self, order: Mapping[str, Sequence[str]] = MappingProxyType({})) -> dict[str, Progress]:
         """The active option of each level that ``names`` has, and how far its run is, after :meth:`step`.
 
@@ -107,7 +110,12 @@ class Monitor:
         1
 
         :param order: for a level, the names of options in the order that they follow each other, for ``whole``.
+        :raises BadInput: there is no such level or option.
         """
+        for level, ordered in order.items():
+            for name, known in ((level, self.names), *((name, self.names.get(level, ())) for name in ordered)):
+                if name not in known:
+                    raise BadInput(f"order: there is no {name!r}{nearest(name, known)}; there is: {', '.join(known)}")
         return {level: self._progress(level, order.get(level, ())) for level in self._active}
 
     def _progress(self, level: str, order: Sequence[str]) -> Progress:
@@ -120,36 +128,46 @@ class Monitor:
                 whole = (order.index(name) + fraction) / len(order)
         return Progress(option, name, steps, fraction, whole)
 
-    def step(self, observation: Mapping[str, np.ndarray], control: np.ndarray | None = None) -> Belief:
-        """p(h_t, b_t | s_0..t, a_0..t-1) of every level.
+    def step(
+        self, observation: Mapping[str, np.ndarray], control: np.ndarray | None = None
+    ) -> dict[str, dict[str, float]]:
+        """The probability of each choice of each level by name, p(h_t | s_0..t, a_0..t-1).
 
         :param control: a_{t-1} [A], in the control's own units; None at the first step, and only there.
-        :raises ObservationError: an observation or the control is missing, or of another shape than in training.
+        :raises ObservationError: an observation or the control is missing, not finite, or of another shape than in
+            training. The monitor stays as it was.
         """
+        if self._outputs is None and control is not None:
+            raise ObservationError("no control comes before the first observation: leave it out")
+        scaled = None if self._outputs is None else self._scaled(control)
         with torch.no_grad():
             inputs = self._window.inputs([observation])
             if self._outputs is not None:
-                emission = complete(self._outputs.tables(self._scaled(control)), ONE_STEP).steps()[0].emission
+                assert scaled is not None
+                emission = complete(self._outputs.tables(scaled), ONE_STEP).steps()[0].emission
                 assert emission is not None  # the control is known
                 self._filter.update(emission)
-            elif control is not None:
-                raise ObservationError("no control comes before the first observation: leave it out")
             self._outputs, self._states = self.hierarchy.advance(inputs, self._states)
-            belief = self._filter.predict(complete(self._outputs.tables(), ONE_STEP).steps()[0])
-        for level, choices in zip(self.names, belief.choices, strict=False):
+            self.belief = self._filter.predict(complete(self._outputs.tables(), ONE_STEP).steps()[0])
+        found = {}
+        for (level, own), choices in zip(self.names.items(), self.belief.choices, strict=True):
+            found[level] = dict(zip(own, choices[0].tolist(), strict=True))
             option = int(choices[0].argmax())
             before, steps = self._active.get(level, (option, 0))
             self._active[level] = (option, steps + 1 if option == before else 1)
-        return belief
+        return found
 
     def _scaled(self, control: np.ndarray | None) -> Tensor:
-        size = self.hierarchy.scaling.size
-        if control is None or np.shape(control) != (size,):
-            got = "none" if control is None else f"one of shape {np.shape(control)}"
+        scaling = self.hierarchy.scaling
+        if control is None:
             raise ObservationError(
-                f"the control applied since the last observation is needed, shape ({size},); got {got}"
+                f"the control applied since the last observation is needed, shape ({scaling.size},); got none"
             )
-        scaled = self.hierarchy.scaling.scaled(np.asarray(control, float)[None])
+        row = numbers("the control", control, (scaling.size,))[None]
+        if problem := scaling.impossible("the control", row):
+            raise ObservationError(f"{problem}; is it in the demonstrations' units?")
+        scaled = scaling.scaled(row)
+        refuse_large("the control", scaled)
         return torch.as_tensor(scaled).float().reshape(1, 1, -1)
 
 

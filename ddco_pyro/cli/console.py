@@ -55,6 +55,9 @@ WIDE = 200
 class Progress:
     """Shows events: a bar with the time left on a terminal, elsewhere a plain line every ten seconds.
 
+    >>> with ddco_pyro.Progress() as progress:
+    ...     fit = ddco_pyro.fit("mine.yaml", demos, on_event=progress)
+
     :param label: the work on demonstrations, such as ``importing``.
     """
 

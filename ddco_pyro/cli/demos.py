@@ -149,7 +149,7 @@ def import_(
     for name, reason in imported.left_out.items():
         print(f"left out {name}: {reason}", file=sys.stderr)
     for line in imported.unread:
-        print(f"networks do not read: {line}", file=sys.stderr)
+        print(f"note: {line}", file=sys.stderr)
     print(f"{out}: {len(imported.names)} demonstrations")
 
 

@@ -124,7 +124,7 @@ def compare(runs: Sequence[str | Path], allow_code: bool = False) -> Comparison:
     rows = [_row(rank, fits[run], values[run], best, demos[0].lengths) for rank, run in enumerate(order)]
     ranked = [fits[run] for run in order]
     agreement = [level for fit in ranked for level in _agreement(fit)]
-    sorted_by = next((str(fit) for fit in ranked if fit.spec.hierarchy), str(ranked[0]))
+    sorted_by = next((fit.place for fit in ranked if fit.spec.hierarchy), ranked[0].place)
     return Comparison(rows, demos[0].names, demos[0].lengths, agreement, _paired_rollouts(ranked), sorted_by)
 
 
@@ -134,7 +134,7 @@ def _row(rank: int, fit: Fit, values: np.ndarray, best: np.ndarray, lengths: Seq
     se, dse = (pair.standard_error for pair in (own, paired(best, values, steps)))
     return Row(
         rank,
-        str(fit),
+        fit.place,
         fit.name,
         fit.metrics.parameters,
         total=float(values.sum()),
@@ -157,7 +157,7 @@ def _shared(fits: Sequence[Fit]) -> list[Demonstrations]:
     for fit, demos in zip(fits, own, strict=True):
         if demos is None:
             raise CompareError(
-                f"{fit}: held nothing out (demonstrations.valid_fraction: 0); there is nothing to compare"
+                f"{fit.place}: held nothing out (demonstrations.valid_fraction: 0); there is nothing to compare"
             )
         if shared:
             _check_same(fits[0], shared[0], fit, demos)
@@ -168,7 +168,7 @@ def _shared(fits: Sequence[Fit]) -> list[Demonstrations]:
 
 def _check_same(first: Fit, ours: Demonstrations, second: Fit, theirs: Demonstrations) -> None:
     """Held-out demonstrations have the same names, controls, and observations where both runs see them."""
-    lead = f"{first} and {second} were not held out on the same data"
+    lead = f"{first.place} and {second.place} were not held out on the same data"
     only = sorted(set(ours.names) ^ set(theirs.names))
     if only:
         where = first if only[0] in ours.names else second
@@ -194,7 +194,7 @@ def _check_measure(first: Fit, second: Fit) -> None:
         dimension = min(ours ^ theirs)
         scored, left = (first, second) if dimension in ours else (second, first)
         raise CompareError(
-            f"{first} and {second} score different things: control dimension {dimension} is in the "
+            f"{first.place} and {second.place} score different things: control dimension {dimension} is in the "
             f"likelihood of {scored} and not in that of {left}; fit both to the same demonstrations, "
             "with the same version"
         )
@@ -213,7 +213,7 @@ def _log_likelihoods(fit: Fit, demos: Demonstrations) -> np.ndarray:
     values = np.concatenate([piece.log_likelihood for piece in fit.infer(demos, held_out=True)])
     for name, value in zip(demos.names, values, strict=True):
         if not fit.was_held_out(name, float(value)):
-            raise CompareError(f"{fit}: {name} has changed since this run was fitted to it; fit it again")
+            raise CompareError(f"{fit.place}: {name} has changed since this run was fitted to it; fit it again")
     return values
 
 
@@ -228,7 +228,7 @@ def _agreement(fit: Fit) -> Iterator[dict[str, Any]]:
     for level, labels, scores in zip(fit.spec.hierarchy.levels, record.labels, record.valid, strict=True):
         found = {key: scores and getattr(scores, key) for key in UNMATCHED}
         accuracy = scores and scores.matched_globally.accuracy
-        yield {"run": str(fit), "level": level.name, "labels": labels, **found, "accuracy": accuracy}
+        yield {"run": fit.place, "level": level.name, "labels": labels, **found, "accuracy": accuracy}
 
 
 def _paired_rollouts(fits: Sequence[Fit]) -> list[dict[str, Any]]:
@@ -244,7 +244,7 @@ def _paired_rollouts(fits: Sequence[Fit]) -> list[dict[str, Any]]:
         if fit.spec.task == first.spec.task and seeds:
             left, right = [ours[seed] for seed in seeds], [theirs[seed] for seed in seeds]
             rates = {"rate": rate(int(sum(left)), len(left)), "other_rate": rate(int(sum(right)), len(right))}
-            pairs.append({"run": str(first), "other": str(fit), **paired_difference(left, right), **rates})
+            pairs.append({"run": first.place, "other": fit.place, **paired_difference(left, right), **rates})
     return pairs
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -201,6 +201,32 @@ def check_shape(where: str, column: Column, expected: tuple[int, ...], first: st
         )
 
 
+def check_fitted(recording: Recording, shapes: Mapping[str, tuple[int, ...]], control_size: int) -> None:
+    """Refuse a demonstration that a model cannot read which was fitted to other shapes.
+
+    :param shapes: of the model's observations at one step.
+    :param control_size: A of the fit.
+    :raises DemonstrationsError: an observation is missing, or it or the control has another shape or type.
+    """
+    known = recording.observations
+    for key in shapes:
+        if key not in known:
+            raise DemonstrationsError(
+                f"{recording.name}: there is no observation {key!r}{nearest(key, known)}, which the run was fitted to; "
+                f"there is: {', '.join(known)}"
+            )
+    fitted: dict[str, tuple[Column, tuple[int, ...]]] = {"actions": (recording.actions, (control_size,))}
+    fitted |= {f"obs/{key}": (known[key], tuple(shape)) for key, shape in shapes.items()}
+    for place, (column, expected) in fitted.items():
+        if column.shape[1:] != expected:
+            raise DemonstrationsError(
+                f"{recording.name}: {place} has shape {column.shape[1:]} at each step, the run was fitted to {expected}"
+            )
+        _, why = reading(column.shape[1:], column.dtype)
+        if why:
+            raise DemonstrationsError(f"{recording.name}: {place} {why}")
+
+
 # --- training and validation ------------------------------------------------------------------------------------------
 
 LEAST = 3
@@ -267,6 +293,6 @@ def problems_of_masks(masks: Mapping[str, Sequence[str]], names: Sequence[str]) 
             yield f"mask/{mask}: {unknown(missing[0], names)}"
 
 
-def unknown(name: str, names: Sequence[str]) -> str:
+def unknown(name: str, names: Iterable[str]) -> str:
     """The problem with an unknown demonstration, in words."""
     return f"there is no demonstration {name!r}{nearest(name, names)}"

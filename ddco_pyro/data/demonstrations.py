@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+from numbers import Real
 from pathlib import Path
 from typing import Any, overload
 
@@ -23,11 +24,12 @@ from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError
 from ddco_pyro.data.memory import PROGRAM, Extent, refuse_too_much
 from ddco_pyro.data.pictures import Observed, Pictures
 from ddco_pyro.data.sources import refuse_foreign
-from ddco_pyro.data.sources.recording import Recording, of_array
+from ddco_pyro.data.sources.recording import Column, Recording, of_array
 from ddco_pyro.data.sources.robomimic import Robomimic, open_robomimic, robomimic_file, write_recording
+from ddco_pyro.errors import check_whole
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Demonstration:
     """One demonstration of T steps, s_0 a_0 ... s_{T-1} a_{T-1}.
 
@@ -51,10 +53,13 @@ class Demonstration:
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if not self.name or "/" in self.name:
+        if not isinstance(self.name, str) or not self.name or "/" in self.name:
             raise DemonstrationsError(
-                f"{self.name!r} cannot be the name of a demonstration; it must not be empty or have a /"
+                f"{self.name!r} cannot be the name of a demonstration; it must be a text, not empty, without a /"
             )
+        for what, arrays in (("observations", self.observations), ("labels", self.labels)):
+            if not isinstance(arrays, Mapping) or not all(isinstance(key, str) for key in arrays):
+                raise DemonstrationsError(f"{self.name}: {what} have to be a mapping of names to arrays [T, ...]")
         recording = self.recording()
         check(recording)
         check_values(recording, f"repair it, or leave {self.name} out (demonstrations.exclude)")
@@ -81,12 +86,27 @@ class Demonstration:
 
     def recording(self) -> Recording:
         """The demonstration as a recording, for writing."""
-        observations = {key: of_array(values) for key, values in self.observations.items()}
-        labels = {key: of_array(values) for key, values in self.labels.items()}
-        return Recording(self.name, observations, of_array(self.actions), labels, self.attributes)
+        observations = {key: self._column(f"obs/{key}", values) for key, values in self.observations.items()}
+        labels = {key: self._column(f"labels/{key}", values) for key, values in self.labels.items()}
+        return Recording(self.name, observations, self._column("actions", self.actions), labels, self.attributes)
+
+    def _column(self, place: str, values: Any) -> Column:
+        try:
+            return of_array(values)
+        except (ValueError, TypeError, RuntimeError) as error:
+            raise DemonstrationsError(f"{self.name}: {place} is no array: {' '.join(str(error).split())}") from None
 
     def __len__(self) -> int:
         return len(self.actions)
+
+    def __repr__(self) -> str:
+        return f"{self.name}: {len(self)} steps{_shapes(self)}"
+
+
+def _shapes(demo: Demonstration) -> str:
+    """The arrays of a demonstration, a line each."""
+    columns = dict(demo.recording().columns())
+    return "".join(f"\n  {place} {list(column.shape[1:])} {column.dtype}" for place, column in columns.items())
 
 
 def _numbers(values: Any) -> Observed:
@@ -96,7 +116,7 @@ def _numbers(values: Any) -> Observed:
     return array if array.dtype == np.uint8 else array.astype(np.float64)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Demonstrations(Sequence[Demonstration]):
     """Demonstrations with the same observations, of the same shapes, and controls of the same size.
 
@@ -118,6 +138,9 @@ class Demonstrations(Sequence[Demonstration]):
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        for demo in self.demonstrations:
+            if not isinstance(demo, Demonstration):
+                raise not_demonstrations(demo)
         if not self.demonstrations:
             raise DemonstrationsError("there are no demonstrations; at least one is needed")
         if len(set(self.names)) < len(self):
@@ -170,6 +193,12 @@ class Demonstrations(Sequence[Demonstration]):
     def __iter__(self) -> Iterator[Demonstration]:
         return iter(self.demonstrations)
 
+    def __repr__(self) -> str:
+        fewest, most = min(self.lengths), max(self.lengths)
+        steps = f"{most}" if fewest == most else f"{fewest} to {most}"
+        masks = "".join(f"\n  mask/{mask}: {len(members)}" for mask, members in self.masks.items())
+        return f"{len(self)} demonstrations of {steps} steps{_shapes(self[0])}{masks}"
+
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the demonstrations, in order."""
@@ -208,8 +237,11 @@ class Demonstrations(Sequence[Demonstration]):
         The split follows the masks ``train`` and ``valid``; one mask leaves the rest to the other. Without these masks,
         ``valid_fraction`` of the demonstrations are drawn with ``seed`` for validation.
 
-        :raises DemonstrationsError: one part is empty, or the masks overlap.
+        :raises DemonstrationsError: one part is empty, the masks overlap, or the fraction is not from 0 to below 1.
         """
+        check_whole("seed", seed)
+        if not isinstance(valid_fraction, Real) or not 0 <= valid_fraction < 1:
+            raise DemonstrationsError(f"valid_fraction={valid_fraction!r}: has to be a number from 0 to below 1")
         masks = self.masks
         if not masks.keys() & {"train", "valid"}:
             number = min(max(round(valid_fraction * len(self)), 1), len(self) - 1)
@@ -217,6 +249,14 @@ class Demonstrations(Sequence[Demonstration]):
             masks = {"valid": tuple(self.names[index] for index in sorted(drawn))}
         train, valid = divided(self.names, masks)
         return self.select(train), self.select(valid)
+
+
+def not_demonstrations(given: object) -> DemonstrationsError:
+    """The error about something else in place of demonstrations, or of one of them."""
+    return DemonstrationsError(
+        "demonstrations have to be a list of ddco_pyro.Demonstration(name, observations, actions), or "
+        f"ddco_pyro.Demonstrations.read(FILE); got {type(given).__name__}"
+    )
 
 
 def extent(path: str | Path, observations: Sequence[str], exclude: Sequence[str] = ()) -> Extent:

@@ -134,7 +134,7 @@ def _unread(whole: Recording, chosen: Recording) -> Iterator[str]:
     for key, column in whole.observations.items():
         _, why = reading(column.shape[1:], column.dtype)
         if why:
-            yield f"obs/{key} {why}"
+            yield f"networks do not read obs/{key}: it {why}"
         elif column.video and key not in chosen.observations:
             yield f"obs/{key} is a video, left out without --videos"
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from itertools import pairwise
+from typing import NamedTuple, overload
 
 import numpy as np
 import torch
 
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.checks import check_fitted
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, not_demonstrations
 from ddco_pyro.data.memory import INFERENCE
 from ddco_pyro.inference.engines import log_likelihood
 from ddco_pyro.inference.paths import Path, most_likely_path, sample_paths
@@ -164,15 +166,99 @@ def started(options: np.ndarray, terminations: np.ndarray, lasts: bool) -> np.nd
     return found
 
 
+class Segment(NamedTuple):
+    """One segment of a demonstration: consecutive steps in which a level keeps its choice.
+
+    A segment ends with a new choice, which may be the same option.
+
+    :param option: the choice, 1 to k; 0 where the caller emits the control.
+    :param start: the first step.
+    :param steps: how many steps.
+    """
+
+    demonstration: str
+    level: str
+    option: int
+    name: str
+    start: int
+    steps: int
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Segmentation(Sequence[np.ndarray]):
+    """The most likely choices of a level: for each demonstration an array [T], from 0 (control) to k.
+
+    :param level: its name.
+    :param demonstrations: their names.
+    :param names: of the choices, control first.
+    :param choices: of each demonstration.
+    :param starts: whether a segment begins at a step, :func:`started`, bool [T], of each demonstration.
+    """
+
+    level: str
+    demonstrations: tuple[str, ...]
+    names: tuple[str, ...]
+    choices: tuple[np.ndarray, ...]
+    starts: tuple[np.ndarray, ...]
+
+    def __len__(self) -> int:
+        return len(self.choices)
+
+    @overload
+    def __getitem__(self, index: int) -> np.ndarray: ...
+    @overload
+    def __getitem__(self, index: slice) -> tuple[np.ndarray, ...]: ...
+    def __getitem__(self, index: int | slice) -> np.ndarray | tuple[np.ndarray, ...]:
+        return self.choices[index]
+
+    @property
+    def segments(self) -> list[Segment]:
+        """Every segment in order; ``pandas.DataFrame(segments)`` is a table of them."""
+        found = []
+        for demo, own, starts in zip(self.demonstrations, self.choices, self.starts, strict=True):
+            edges = [*np.flatnonzero(starts).tolist(), len(own)]
+            for start, stop in pairwise(edges):
+                option = int(own[start])
+                found.append(Segment(demo, self.level, option, self.names[option], start, stop - start))
+        return found
+
+    def __repr__(self) -> str:
+        rows = self.segments
+        lines = [f"{self.level}: {len(self)} demonstrations, {len(rows)} segments"]
+        for demo in self.demonstrations[:SHOWN]:
+            each = (f"{row.name} ({row.steps})" for row in rows if row.demonstration == demo)
+            lines.append(f"  {demo}: {', '.join(each)}")
+        return "\n".join([*lines, *(["  ..."] if len(self) > SHOWN else [])])
+
+
+SHOWN = 5
+"""Demonstrations that are printed."""
+
+
 def infer(hierarchy: Hierarchy, demonstrations: Iterable[Demonstration]) -> Iterator[Inferred]:
     """Inference for demonstrations in order, as many together as the networks take at once.
 
     :param demonstrations: in memory, or an iterable that reads one after the other.
-    :raises DemonstrationsError: there are none, their shapes differ, or a number is too large for networks.
+    :raises DemonstrationsError: there are none, a shape is another than in the fit, or a number is too large for
+        networks.
     """
-    for group in _groups(demonstrations, hierarchy.steps_at_once):
+    for group in _groups(_read(demonstrations, hierarchy), hierarchy.steps_at_once):
         demos = Demonstrations(tuple(group))
         yield Inferred(demos.names, encode(demos, hierarchy.encoder, hierarchy.scaling, fitted=True), hierarchy)
+
+
+def _read(demonstrations: Iterable[Demonstration], hierarchy: Hierarchy) -> Iterator[Demonstration]:
+    """Demonstrations that the model can read.
+
+    :raises DemonstrationsError: one of them is something else.
+    """
+    if isinstance(demonstrations, str | Mapping) or not isinstance(demonstrations, Iterable):
+        raise not_demonstrations(demonstrations)
+    for demo in demonstrations:
+        if not isinstance(demo, Demonstration):
+            raise not_demonstrations(demo)
+        check_fitted(demo.recording(), hierarchy.encoder.shapes, hierarchy.scaling.size)
+        yield demo
 
 
 def _groups(demonstrations: Iterable[Demonstration], steps: int) -> Iterator[list[Demonstration]]:

@@ -29,7 +29,7 @@ def export_policy(fit: Fit, folder: Path) -> None:
         raise BadInput(f"{folder}: holds what was not exported, such as {others[0]}; choose another --lerobot")
     with tempfile.TemporaryDirectory() as made:
         if not write_numpy(fit, Path(made)):
-            raise BadInput(f"{fit}: has networks that numpy cannot evaluate; export with --out, for torch")
+            raise BadInput(f"{fit.place}: has networks that numpy cannot evaluate; export with --out, for torch")
         about = json.loads((Path(made) / "controller.json").read_text(encoding="utf-8"))
         with np.load(Path(made) / "weights.npz", allow_pickle=False) as file:
             weights = {name.replace(".", "/"): np.ascontiguousarray(file[name]) for name in file.files}

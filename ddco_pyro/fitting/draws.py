@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import torch
 
-from ddco_pyro.errors import BadInput
+from ddco_pyro.errors import BadInput, check_whole, nearest
 from ddco_pyro.evaluation.inferred import Boundary, Inferred, boundaries
 
 if TYPE_CHECKING:
@@ -44,7 +44,14 @@ class Draws:
         :param path: the options of the path [T], such as of ``fit.segment``.
         :param starts: the first steps of its segments, bool [T]; None: where the option changes.
         :param mass: as in :func:`~ddco_pyro.evaluation.inferred.boundaries`.
+        :raises BadInput: there is no such level, or ``mass`` is not a share.
         """
+        if level not in self.options:
+            raise BadInput(
+                f"there is no level {level!r}{nearest(level, self.options)}; there is: {', '.join(self.options)}"
+            )
+        if not 0 < mass <= 1:
+            raise BadInput(f"mass={mass!r}: has to be a number above 0, at most 1")
         steps = len(path) if (path >= 0).all() else int(np.argmax(path < 0))
         options, chosen = (
             each[level][:, :, demonstration, :steps].reshape(-1, steps) for each in (self.options, self.starts)
@@ -110,7 +117,10 @@ def draw(
 
     :param models: the inference of each model.
     :param seeds: the training seed of each model.
+    :raises BadInput: ``draws`` or ``seed`` is no such number.
     """
+    check_whole("draws", draws, 1)
+    check_whole("seed", seed)
     chains = [_chain(model, draws, (seed, number)) for number, model in enumerate(models)]
     first = chains[0]
     shape = len(names), len(chains), draws, len(first.paths), max(path.shape[-1] for path in first.paths)

@@ -112,7 +112,7 @@ def _finite(fit: Fit, piece: Inferred) -> np.ndarray:
     for name, value in zip(piece.names, piece.log_likelihood, strict=True):
         if not np.isfinite(value):
             raise NotFinite(
-                f"{fit}: the log-likelihood of {name} under the fitted model is {value}; look at its values "
+                f"{fit.place}: the log-likelihood of {name} under the fitted model is {value}; look at its values "
                 "(ddco-pyro inspect), lower training.optimizer.lr, or leave it out (demonstrations.exclude)"
             )
     return piece.log_likelihood

@@ -6,7 +6,7 @@ import importlib.metadata
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from ddco_pyro.data.controls import measure
-from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import leftovers
 from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.memory import allowed
@@ -53,7 +53,7 @@ PACKAGES = ("ddco-pyro", "torch", "pyro-ppl", "numpy", "dm-control", "mujoco", "
 
 def fit(
     spec: Spec | str | Path,
-    demonstrations: Demonstrations | str | Path | None = None,
+    demonstrations: Iterable[Demonstration] | str | Path | None = None,
     out: str | Path | None = None,
     on_event: OnEvent = ignore,
     jobs: int = 1,
@@ -79,7 +79,7 @@ def fit(
         those that the spec names.
     :param out: the run folder, as ``ddco-pyro fit`` makes it, with a copy of demonstrations from memory; None to write
         nothing. An unfinished run is continued; a finished one is loaded.
-    :param on_event: called with progress events (:mod:`ddco_pyro.events`).
+    :param on_event: called with progress events (:mod:`ddco_pyro.events`), such as :class:`ddco_pyro.Progress`.
     :param jobs: processes that train restarts, or baselines beside the model, -1 for one on each core; 1 for this
         process alone. The result is the same for any number. In a script, more than one needs the usual
         ``if __name__ == "__main__":``.
@@ -98,6 +98,8 @@ def fit(
     allowed()  # or $DDCO_PYRO_MEMORY is wrong
     clock, given = Clock(), None
     with clock("demonstrations"):
+        if isinstance(demonstrations, Iterable) and not isinstance(demonstrations, str | Demonstrations):
+            demonstrations = Demonstrations(tuple(demonstrations))
         if isinstance(demonstrations, Demonstrations):
             ordered = demonstrations.select(sorted(demonstrations.names, key=natural))  # as they are read back
             given = replace(ordered, masks=demonstrations.masks)

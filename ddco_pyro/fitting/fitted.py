@@ -14,10 +14,11 @@ from torch import Tensor
 
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.monitor import Monitor, run_lengths
+from ddco_pyro.data.checks import unknown
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.drawing.words import choice_names
 from ddco_pyro.errors import BadInput
-from ddco_pyro.evaluation.inferred import Inferred, infer
+from ddco_pyro.evaluation.inferred import Inferred, Segmentation, infer, started
 from ddco_pyro.fitting.digest import record, recorded
 from ddco_pyro.fitting.draws import Draws, draw
 from ddco_pyro.fitting.names import Named, checked, read_names, write_names
@@ -33,7 +34,7 @@ TOLERANCE = 1e-4
 """Relative; a log-likelihood computed again on another machine differs in the last digits of float32."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Fit:
     """A fitted model.
 
@@ -58,8 +59,22 @@ class Fit:
     apart: Mapping[str, Hierarchy] | None = field(default=None, repr=False)
     named: Named = field(default_factory=dict, repr=False)
 
-    def __str__(self) -> str:
+    @property
+    def place(self) -> str:
+        """The run folder, or ``this fit`` without one, for messages."""
         return str(self.folder or "this fit")
+
+    def __str__(self) -> str:
+        sizes = [f"{name}: {', '.join(choices[1:])}" for name, choices in self.names.items()]
+        lines = [f"{self.name}{f' in {self.folder}' if self.folder else ''}", *sizes]
+        if self.metrics is not None:
+            counts, values = self.metrics.demonstrations, self.metrics.log_likelihood_per_step
+            each = {"trained with": (counts.train, values.train), "held out": (counts.valid, values.valid)}
+            known = [f"{value:.3f} ({number} {part})" for part, (number, value) in each.items() if value is not None]
+            lines.append(f"log-likelihood, nats per step: {', '.join(known)}")
+        return "\n  ".join(lines)
+
+    __repr__ = __str__
 
     @property
     def run_folder(self) -> Path:
@@ -152,12 +167,15 @@ class Fit:
 
         :param demos: :class:`~ddco_pyro.Demonstrations`, or an iterable that reads one after the other.
         :param held_out: with ``demonstrations.leave_one_out``, each by the model that was trained without it.
-        :raises DemonstrationsError: there are none, or a number is too large for networks.
+        :raises DemonstrationsError: there are none, an observation or the control has another shape than in the fit, or
+            a number is too large for networks.
         """
         if not (held_out and self.without):
             yield from infer(self.hierarchy, demos)
         else:
             for demo in demos:
+                if demo.name not in self.without:
+                    raise BadInput(f"{demo.name}: no model was trained without it; {unknown(demo.name, self.without)}")
                 yield from infer(self.without[demo.name], [demo])
 
     def log_likelihood(self, demos: Iterable[Demonstration]) -> np.ndarray:
@@ -180,15 +198,30 @@ class Fit:
             *(tuple(_stacked(level, 0.0) for level in zip(*kind, strict=True)) for kind in zip(*parts, strict=True))
         )
 
-    def segment(self, demos: Iterable[Demonstration]) -> tuple[np.ndarray, ...]:
-        """Choices of the most likely path, a [N, T] for each level, lowest first; -1 past a demonstration's end.
+    def segment(self, demos: Iterable[Demonstration]) -> tuple[Segmentation, ...]:
+        """Choices of the most likely path, for each level, lowest first: of each demonstration an array [T].
 
         >>> (options,) = fit.segment(demos)
-        >>> options.shape, sorted(set(options[options >= 0].tolist()) - {1, 2})
-        ((6, 10), [])
+        >>> len(options), options[0].shape, options.names
+        (6, (10,), ('control', 'option 1', 'option 2'))
+        >>> segment = options.segments[0]  # pandas.DataFrame(options.segments) is a table
+        >>> segment.demonstration, segment.name == options.names[segment.option], segment.start
+        ('demo_0', True, 0)
+
+        :raises DemonstrationsError: as :meth:`infer`.
         """
-        parts = [piece.path.choices for piece in self.infer(demos)]
-        return tuple(_stacked(level, -1).numpy() for level in zip(*parts, strict=True))
+        levels = self.spec.hierarchy.levels if self.spec.hierarchy else ()
+        names: list[str] = []
+        found: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in levels]
+        for piece in self.infer(demos):
+            names += piece.names
+            for own, level, choices, ends in zip(found, levels, *piece.path, strict=True):
+                for steps, row, last in zip(piece.lengths, choices.numpy(), ends.numpy(), strict=True):
+                    own.append((row[:steps].copy(), started(row[:steps], last[:steps], level.lasts)))
+        return tuple(
+            Segmentation(name, tuple(names), known, *zip(*own, strict=True))
+            for own, (name, known) in zip(found, self.names.items(), strict=True)
+        )
 
     def draws(self, demos: Sequence[Demonstration], draws: int = 100, seed: int = 0) -> Draws:
         """Draws of the options from their posterior p(ζ | ξ), from this fit and its :attr:`repetitions`.
@@ -206,7 +239,7 @@ class Fit:
         :raises BadInput: the model has no options.
         """
         if not self.names:
-            raise BadInput(f"{self}: is a {self.name} policy without options; name a run with a hierarchy")
+            raise BadInput(f"{self.place}: is a {self.name} policy without options; name a run with a hierarchy")
         fits = (self, *self.repetitions)
         seeds = [fit.spec.seed if (own := fit.spec.training.seed) is None else own for fit in fits]
         return draw([fit.infer(demos) for fit in fits], self.names, seeds, draws, seed)
@@ -215,14 +248,13 @@ class Fit:
         """The model as a policy that acts, as the spec's ``rollout`` says."""
         return Controller.from_spec(self.hierarchy, self.spec.rollout, seed, self.names)
 
-    def monitor(self, demos: Iterable[Demonstration] = ()) -> Monitor:
+    def monitor(self, demos: Iterable[Demonstration] | None = None) -> Monitor:
         """A live monitor of the active options while another policy, or a person, acts.
 
         :param demos: demonstrations that tell :meth:`Monitor.progress` how long options last.
         """
-        demos = list(demos)
-        segments = zip(self.names.items(), self.segment(demos) if demos else (), strict=False)
-        lengths = {level: run_lengths(choices, len(names) - 1) for (level, names), choices in segments}
+        segments = () if demos is None else self.segment(demos)
+        lengths = {own.level: run_lengths(own, len(own.names) - 1) for own in segments}
         return Monitor(self.hierarchy, self.names, lengths)
 
 

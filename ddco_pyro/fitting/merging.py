@@ -105,14 +105,16 @@ def chosen(run: Fit, level: str | None = None, options: tuple[int, int] | None =
     levels = run.spec.hierarchy.levels if run.spec.hierarchy else ()
     names = [one.name for one in levels]
     if not names:
-        raise MergeError(f"{run}: is a policy without options; there are none to merge")
+        raise MergeError(f"{run.place}: is a policy without options; there are none to merge")
     if level is not None and level not in names:
         raise MergeError(f"there is no level {level!r}{nearest(level, names)}; there is: {', '.join(names)}")
     number = 0 if level is None else names.index(level)
     count, alike = levels[number].count, _divergences(run, number)
     if options is None:
         if not alike:
-            raise MergeError(f"{run}: no two options of level {names[number]!r} are used; there are none to merge")
+            raise MergeError(
+                f"{run.place}: no two options of level {names[number]!r} are used; there are none to merge"
+            )
         options = min(alike, key=alike.__getitem__)
     first, second = sorted(options)
     if not 1 <= first < second <= count:
@@ -159,9 +161,6 @@ def merged_labels(run: Fit, pair: Pair) -> Demonstrations:
         joined = np.where(choices == second, first, choices)
         return np.where(joined > second, joined - 1, joined) - 1
 
-    segments = run.segment(demos)[pair.level]
-    each = zip(demos, segments, strict=True)
-    labelled = (
-        replace(demo, labels=dict(demo.labels) | {LABELS: renumbered(choices[: len(demo)])}) for demo, choices in each
-    )
+    each = zip(demos, run.segment(demos)[pair.level], strict=True)
+    labelled = (replace(demo, labels=dict(demo.labels) | {LABELS: renumbered(choices)}) for demo, choices in each)
     return replace(demos, demonstrations=tuple(labelled))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -90,7 +90,7 @@ def label_names(demos: Demonstrations) -> dict[str, list[str]]:
 
 
 def proposed(
-    spec: Spec, train: Demonstrations, segments: tuple[np.ndarray, ...], trained: TrainedLabels | None = None
+    spec: Spec, train: Demonstrations, segments: Sequence[Sequence[np.ndarray]], trained: TrainedLabels | None = None
 ) -> Named:
     """Names of options from the labels of the demonstrations that they were trained with.
 
@@ -99,7 +99,7 @@ def proposed(
     more than half of its labelled steps have that label, and more than half of the label's steps are in the option.
     Other options stay without a name, and so does a level without any match.
 
-    :param segments: the most likely choices of each level [N, T], -1 past a demonstration's end.
+    :param segments: the most likely choices of each level, of each demonstration [T].
     """
     assert spec.hierarchy is not None  # or there are no segments
     levels, known = spec.hierarchy.levels, label_names(train)
@@ -122,10 +122,9 @@ def proposed(
     return named
 
 
-def _clear_matches(choices: np.ndarray, train: Demonstrations, label: str) -> list[tuple[int, int]]:
+def _clear_matches(choices: Sequence[np.ndarray], train: Demonstrations, label: str) -> list[tuple[int, int]]:
     """Options with their labels, where each is in most of the other's steps."""
-    rows = [row[: len(demo)] for row, demo in zip(choices, train, strict=True)]
-    table = confusion(rows, [demo.labels[label] for demo in train])
+    table = confusion(choices, [demo.labels[label] for demo in train])
     steps, found = np.array(table.steps), []
     for place, (option, value) in enumerate(zip(table.options, table.matched, strict=True)):
         if option and value is not None:

@@ -35,7 +35,7 @@ def policies(fit: Fit) -> dict[str, Policy | str]:
     :raises RunError: the spec has no task, or names a scripted policy that the task lacks.
     """
     if fit.spec.task is None:
-        raise RunError(f"{fit}: its spec has no task, so there is nothing to roll out in")
+        raise RunError(f"{fit.place}: its spec has no task, so there is nothing to roll out in")
     known = find_task(fit.spec.task).policies
     unknown = [name for name in fit.spec.rollout.policies if name not in known]
     if unknown:

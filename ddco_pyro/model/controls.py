@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from ddco_pyro.data.controls import ControlPart, number, same
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
+from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
 from ddco_pyro.model.emissions import Binary, Categorical, Clipped, Emission, Gaussian, Hurdle, Product
 from ddco_pyro.spec import ControlSpec, LearnedStd
 
@@ -110,9 +110,12 @@ class ControlScaling(nn.Module):
                 rows[:, list(dims)] = np.where(same(own, np.array(known)), known, own)
         return rows
 
-    def impossible(self, demonstration: Demonstration) -> str:
-        """The first control of probability 0 in a demonstration, in words; empty without one."""
-        scaled = self.scaled(demonstration.actions)
+    def impossible(self, name: str, actions: np.ndarray) -> str:
+        """The first control of probability 0 among ``actions`` [T, A], in words; empty without one.
+
+        :param name: of the demonstration.
+        """
+        scaled = self.scaled(actions)
         for dims, part in zip(self.groups, self.parts, strict=True):
             if not part.continuous:
                 own = scaled[:, list(dims)]
@@ -121,9 +124,9 @@ class ControlScaling(nn.Module):
                     allowed &= own.sum(1, keepdims=True) == 1
                 if not allowed.all():
                     step, place = np.argwhere(~allowed)[0]
-                    value = demonstration.actions[step, part.dims[place]]
+                    value = actions[step, part.dims[place]]
                     return (
-                        f"{demonstration.name}: control dimension {part.dims[place]} is {number(value)} at step "
+                        f"{name}: control dimension {part.dims[place]} is {number(value)} at step "
                         f"{step}, which {part.name} ({part.kind}) cannot be"
                     )
         return ""
@@ -270,6 +273,6 @@ def refuse_impossible(demonstrations: Demonstrations, scaling: ControlScaling, f
     :raises DemonstrationsError: a switch or a discrete action has a value that the model does not know.
     """
     for demonstration in demonstrations:
-        if problem := scaling.impossible(demonstration):
+        if problem := scaling.impossible(demonstration.name, demonstration.actions):
             declare, repair = "declare another kind in control.parts", f"repair it, or leave {demonstration.name} out"
             raise DemonstrationsError(f"{problem}; {repair if fitted else declare}")

@@ -9,11 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
+from ddco_pyro.data.checks import check_fitted
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.hdf5 import DemonstrationsError
 from ddco_pyro.data.memory import Extent, refuse_too_much
 from ddco_pyro.data.sources import Recording, Source, open_source
-from ddco_pyro.errors import BadInput, nearest
+from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.inferred import Inferred, started
 from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
 from ddco_pyro.fitting.fitted import Fit
@@ -133,7 +134,7 @@ def segments(fit: Fit, source: Source, on_event: OnEvent = ignore, intervals: bo
     """
     hierarchy = fit.spec.hierarchy
     if hierarchy is None:
-        raise BadInput(f"{fit}: is a {fit.name} policy without options; name a run with a hierarchy")
+        raise BadInput(f"{fit.place}: is a {fit.name} policy without options; name a run with a hierarchy")
     counts = {level.name: level.count for level in hierarchy.levels}
     chosen = chosen_names(source, fit)
     labels: dict[str, dict[str, np.ndarray]] = {}
@@ -218,21 +219,8 @@ def _demonstration(recording: Recording, fit: Fit) -> Demonstration:
     :raises DemonstrationsError: an observation is missing, or it or the control has another shape than in the fit.
     """
     shapes, known = fit.hierarchy.encoder.shapes, recording.observations
-    for key, shape in shapes.items():
-        if key not in known:
-            there = ", ".join(known)
-            raise DemonstrationsError(
-                f"{recording.name}: there is no observation {key!r}{nearest(key, known)}, which the run was fitted to; "
-                f"there is: {there}"
-            )
-        _check_shape(f"{recording.name}: obs/{key}", known[key].shape[1:], tuple(shape))
-    _check_shape(f"{recording.name}: actions", recording.actions.shape[1:], (fit.hierarchy.scaling.size,))
+    check_fitted(recording, shapes, fit.hierarchy.scaling.size)
     return Demonstration(recording.name, {key: known[key].observed() for key in shapes}, recording.actions.array())
-
-
-def _check_shape(where: str, shape: tuple[int, ...], fitted: tuple[int, ...]) -> None:
-    if tuple(shape) != fitted:
-        raise DemonstrationsError(f"{where} has shape {shape} at each step, the run was fitted to {fitted}")
 
 
 def _segments(

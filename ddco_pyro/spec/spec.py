@@ -288,9 +288,9 @@ def edited(data: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]
     :raises SpecError: a key path leads nowhere.
     """
     copy: dict[str, Any] = plain(data)
-    for path, value in values.items():
+    for path, value in plain(values).items():
         if path == MODEL:
-            _set_model(copy, plain(value))
+            _set_model(copy, value)
             continue
         node, last = _find(copy, path)
         node[last] = value
@@ -331,9 +331,10 @@ def _set_model(data: dict[str, Any], value: Any) -> None:
 
 
 def plain(data: Any) -> Any:
-    """A deep copy of plain data, with dicts for mappings and lists for sequences."""
+    """A deep copy of plain data, with dicts for mappings, lists for sequences, and Python's numbers for numpy's."""
     if isinstance(data, Mapping):
         return {key: plain(value) for key, value in data.items()}
+    data = data.tolist() if hasattr(data, "tolist") else data
     return [plain(value) for value in data] if isinstance(data, list | tuple) else data
 
 
