@@ -213,7 +213,8 @@ class OptionSegmenter(BaseEstimator):
                     each = [np.asarray(rows) for rows in U]
                     if [len(rows) for rows in each] != lengths:
                         raise BadInput("X and U must be lists of sequences with equal numbers of steps")
-                    self._check_controls(next(iter(U)), fitting)
+                    for number, rows in enumerate(U):
+                        self._check_controls(rows, fitting and number == 0)
                     U = np.concatenate([rows[:, None] if rows.ndim == 1 else rows for rows in each])
             else:
                 X = validate_data(self, X, reset=fitting, dtype=np.float64, ensure_min_samples=2 if fitting else 1)
@@ -245,8 +246,10 @@ class OptionSegmenter(BaseEstimator):
 
 def _dimensions(values: Any) -> int:
     """The dimensions of an array, a data frame, or a sequence of them, which may have different lengths."""
-    if hasattr(values, "columns") or not isinstance(values, Iterable):
-        return np.ndim(values)
+    if hasattr(values, "columns"):
+        return 2
+    if getattr(values, "ndim", 0) > 1 or not isinstance(values, Iterable):
+        return int(getattr(values, "ndim", 0))
     first = next(iter(values), None)
     return 1 if first is None else 1 + np.ndim(first)
 

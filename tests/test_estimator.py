@@ -156,7 +156,7 @@ KINDS = {
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.filterwarnings("ignore:X has feature names")
+@pytest.mark.filterwarnings("ignore:X (has|does not have) (valid )?feature names")
 def test_the_data_that_people_hold_are_taken(kind: str, fitted: OptionSegmenter) -> None:
     package = "polars" if "polars" in kind else "pandas" if "frame" in kind or "pandas" in kind else "numpy"
     given = KINDS[kind](pytest.importorskip(package), *two_options())

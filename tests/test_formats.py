@@ -244,6 +244,15 @@ def test_observations_that_lerobot_cannot_tell_apart_are_refused(tmp_path):
     assert not (tmp_path / "dataset").exists()
 
 
+@pytest.mark.parametrize("kind", [Annotated, RLDS])
+def test_text_among_the_observations_is_left_out_and_named(kind, planted):
+    with h5py.File(planted.file, "r+") as file:
+        for demo in file["data"].values():
+            demo["obs/mission"] = [b"go"] * len(demo["actions"])
+    planted.write(kind, "written")
+    assert planted.said.endswith(", without obs/mission (no numbers)")
+
+
 def test_annotations_are_imported_as_labels_with_names(tmp_path):
     """As the page on which LeRobot's users label keeps them, for some episodes."""
     planted = Planted(tmp_path, ORDERED)

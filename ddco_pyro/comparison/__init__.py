@@ -171,7 +171,7 @@ def _check_same(first: Fit, ours: Demonstrations, second: Fit, theirs: Demonstra
     lead = f"{first.place} and {second.place} were not held out on the same data"
     only = sorted(set(ours.names) ^ set(theirs.names))
     if only:
-        where = first if only[0] in ours.names else second
+        where = (first if only[0] in ours.names else second).place
         remedy = "fit both with the same demonstrations, valid_fraction and seed"
         raise CompareError(f"{lead}: {only[0]} was held out by {where} alone; {remedy}")
     for mine, yours in zip(ours, theirs.select(ours.names), strict=True):

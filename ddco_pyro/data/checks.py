@@ -10,13 +10,10 @@ import numpy as np
 from ddco_pyro.data.controls import number
 from ddco_pyro.data.hdf5 import DemonstrationsError, natural
 from ddco_pyro.data.pictures import PICTURE_DIMENSIONS
-from ddco_pyro.data.sources.recording import Column, Recording
+from ddco_pyro.data.sources.recording import NUMBERS, Column, Recording
 from ddco_pyro.errors import nearest
 
 # --- values -----------------------------------------------------------------------------------------------------------
-
-NUMBERS = "fiub"
-"""Kinds of numpy types that are real numbers."""
 
 LARGEST = 1e30
 """Largest usable number: networks are float32, which ends at 3e38, and variances are float64, which ends at 1e308."""
@@ -136,7 +133,8 @@ def reading(shape: tuple[int, ...], dtype: np.dtype[Any] = PICTURES) -> tuple[Li
 
 
 def _no_numbers(dtype: np.dtype[Any]) -> str:
-    return f"holds {'text' if dtype.kind in 'OSTU' else dtype}, not numbers"
+    kind = "text" if dtype.kind in "STU" else "text or other objects" if dtype.kind == "O" else str(dtype)
+    return f"holds {kind}, not numbers"
 
 
 def problem_of_controls(shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:

@@ -28,6 +28,9 @@ from ddco_pyro.data.pictures import (
 LABEL_NAMES = "label_names"
 """Attribute of a file of demonstrations: JSON, the names of labels 0, 1, ... for each name of labels."""
 
+NUMBERS = "fiub"
+"""Kinds of numpy types that are real numbers."""
+
 Format = Literal["robomimic", "minari", "lerobot", "maniskill", "act", "d4rl", "ogbench", "jigsaws"]
 
 
@@ -91,6 +94,11 @@ class Recording:
     def __post_init__(self) -> None:
         object.__setattr__(self, "actions", _discrete(self.actions))
         object.__setattr__(self, "labels", {name: _flat(column) for name, column in self.labels.items()})
+
+    @property
+    def numbers(self) -> dict[str, Column]:
+        """The observations that hold real numbers."""
+        return {key: column for key, column in self.observations.items() if column.dtype.kind in NUMBERS}
 
     def columns(self) -> Iterator[tuple[str, Column]]:
         """Every array with its place: ``actions``, ``obs/<key>``, ``labels/<name>``."""

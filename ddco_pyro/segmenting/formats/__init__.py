@@ -47,6 +47,13 @@ class Asked:
         names = self.fit.names[self.level]
         return [name_in_level(option, self.level, names) for option in range(len(names))]
 
+    @cached_property
+    def without(self) -> str:
+        """The observations that writers of demonstrations leave out, in words; empty without any."""
+        first = self.source.recording(self.source.names[0])
+        keys = [f"obs/{key}" for key in first.observations if key not in first.numbers]
+        return f", without {', '.join(keys)} (no numbers)" if keys else ""
+
 
 class Writer(ABC):
     """Writes segments in one format.

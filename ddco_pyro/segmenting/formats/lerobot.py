@@ -265,7 +265,7 @@ class Annotated(Writer):
             self.form.write(dataset, Subtasks(self.asked.names, runs, self.order(segmented)))
             if self.out.exists():
                 raise _SameFolder if _same(self.out, temporary) else self._taken()
-        return str(self.out)
+        return f"{self.out}{'' if kept else self.asked.without}"
 
     def _taken(self) -> BadInput:
         return BadInput(f"{self.out}: exists; choose another {self.option}")

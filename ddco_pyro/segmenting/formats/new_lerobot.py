@@ -109,7 +109,7 @@ def _columns(
     """The observations and controls of an episode as columns, and the entries of their features."""
     columns, features = dict[str, pyarrow.Array](), dict[str, Mapping[str, Any]]()
     vectors = dict[str, np.ndarray]()
-    for key, column in recording.observations.items():
+    for key, column in recording.numbers.items():
         name = "observation." + key.replace("/", ".")
         if name in columns.keys() | vectors.keys():
             raise BadInput(f"obs/{key} and another observation are both {name} in LeRobot; rename one")

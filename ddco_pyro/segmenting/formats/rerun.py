@@ -33,7 +33,7 @@ class Rerun(Writer):
         with whole_folder(self.out) as folder:
             for demo in segmented.segments:
                 self._write(str(folder / f"{demo.name}.rrd"), demo, segmented.frequency)
-        return f"{self.out}: {len(segmented)} recordings; look at them with: rerun {self.out}/*.rrd"
+        return f"{self.out}: {len(segmented)} recordings{self.asked.without}; look at them with: rerun {self.out}/*.rrd"
 
     def _write(self, path: str, demo: Segments, frequency: float | None) -> None:
         import rerun
@@ -56,7 +56,7 @@ class Rerun(Writer):
             starts = np.array([start for _, start, _ in runs])
             log(f"segments/{_entity(name)}", starts, rerun.StateChange.columns(state=states))
             log(f"probability/{_entity(name)}", steps, rerun.Scalars.columns(scalars=level.probability))
-        for key, column in {**recording.observations, "control": recording.actions}.items():
+        for key, column in {**recording.numbers, "control": recording.actions}.items():
             if column.image:
                 pictures = [
                     rerun.Image(picture).compress(jpeg_quality=90) for block in column.blocks() for picture in block

@@ -24,7 +24,7 @@ class RLDS(Writer):
                 last = np.arange(len(demo)) == len(demo) - 1
                 options = demo.levels[self.asked.level].options
                 steps = {
-                    **{f"observation/{key}": column.array() for key, column in recording.observations.items()},
+                    **{f"observation/{key}": column.array() for key, column in recording.numbers.items()},
                     "action": recording.actions.array(),
                     "is_first": np.arange(len(demo)) == 0,
                     "is_last": last,
@@ -34,4 +34,4 @@ class RLDS(Writer):
                     "subtask": np.array(self.asked.names)[options],
                 }
                 np.savez_compressed(folder / f"{demo.name}.npz", **steps)
-        return f"{self.out}: {len(segmented)} episodes"
+        return f"{self.out}: {len(segmented)} episodes{self.asked.without}"
