@@ -67,8 +67,8 @@ class Monitor:
     >>> active = monitor.step({"place": demo.observations["place"][0]})
     >>> for t in range(1, 4):
     ...     active = monitor.step({"place": demo.observations["place"][t]}, demo.actions[t - 1])
-    >>> list(active["option"]), round(sum(active["option"].values()), 6)
-    (['control', 'option 1', 'option 2'], 1.0)
+    >>> active["option"]["control"], round(sum(active["option"].values()), 6)  # and a number for each option
+    (0.0, 1.0)
 
     :param names: the names of the choices of each level, lowest first, such as ``fit.names``; by default numbers.
     :param lengths: how long choices remain active, for :meth:`progress`; ``fit.monitor(demos)`` has those of ``demos``.
@@ -135,7 +135,7 @@ class Monitor:
 
         :param control: a_{t-1} [A], in the control's own units; None at the first step, and only there.
         :raises ObservationError: an observation or the control is missing, not finite, or of another shape than in
-            training. The monitor stays as it was.
+            training. A refused step changes nothing.
         """
         if self._outputs is None and control is not None:
             raise ObservationError("no control comes before the first observation: leave it out")

@@ -202,8 +202,8 @@ class Fit:
         """Choices of the most likely path, for each level, lowest first: of each demonstration an array [T].
 
         >>> (options,) = fit.segment(demos)
-        >>> len(options), options[0].shape, options.names
-        (6, (10,), ('control', 'option 1', 'option 2'))
+        >>> len(options), options[0].shape, options.names[0]
+        (6, (10,), 'control')
         >>> segment = options.segments[0]  # pandas.DataFrame(options.segments) is a table
         >>> segment.demonstration, segment.name == options.names[segment.option], segment.start
         ('demo_0', True, 0)
