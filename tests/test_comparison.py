@@ -108,10 +108,21 @@ def test_the_verdict_says_whether_a_difference_is_outside_its_error(each, said):
     )
 
 
-def row(name, rank, each, model="ddco"):
-    return Row(
-        rank, name, model, 3, sum(each), 0.1, 0.0, 0.0, sum(each) / len(each), tuple(each), made_metrics().training
+def row(name, rank, each, model="ddco", in_training=1.0):
+    mean = sum(each) / len(each)
+    return Row(rank, name, model, 3, sum(each), 0.1, 0.0, 0.0, mean, in_training, tuple(each), made_metrics().training)
+
+
+def test_a_run_that_fell_apart_comes_first_in_the_verdict():
+    """And nothing is concluded from its lead over a mixture that fell apart, too."""
+    runs = [("a", "flat", [4.0] * 4, 4.1), ("b", "ddco", [-9.0, -8.0] * 2, 6.0), ("c", "mixture", [-20.0] * 4, 5.0)]
+    rows = [row(name, rank, each, model, own) for rank, (name, model, each, own) in enumerate(runs)]
+    said = page.verdict(Comparison(rows, tuple("klmn"), (1, 1, 1, 1), [], [], "b"))
+    assert said.startswith(
+        "B fell apart on held-out demonstrations: −8.50 nats per step there, 6.00 in training. C fell"
     )
+    assert "B is below a by 12.50 ± 0.29 nats per step" in said
+    assert "explain held-out controls" not in said
 
 
 def test_demonstrations_are_listed_worst_first_by_the_best_hierarchy(toy_run, found, folders, held_out):

@@ -2,6 +2,7 @@ import html
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from made_metrics import compared, made_metrics
 from random_demonstrations import numbered
 from time_lines import tracks
 
+from ddco_pyro.cli import console
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.drawing import words
 from ddco_pyro.drawing.shown import movement, position_key
@@ -17,7 +19,7 @@ from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.fitted import load
 from ddco_pyro.metrics import Metrics
 from ddco_pyro.report import rollouts as rolling
-from ddco_pyro.report import write_report
+from ddco_pyro.report import training, write_report
 from ddco_pyro.report.activity import Activity, LevelActivity, activity, bins
 from ddco_pyro.report.options import row_order, shares, terminations
 from ddco_pyro.simulation.episodes import Episode, paired_difference, summarize
@@ -307,6 +309,51 @@ def test_movement_by_hand():
 )
 def test_the_verdict_is_honest(mean, error, held_out, said):
     assert said in words.verdict(made_metrics(held_out, comparison={"flat": compared(mean, error)}))
+
+
+@pytest.mark.parametrize(
+    ("ours", "flat", "first", "concludes"),
+    [
+        ((16.5, -9.7), (15.9, 15.4), "DDCO fell apart on held-out demonstrations: −9.70 nats per step there,", False),
+        ((-17.0, -409.0), (-3.0, -3.3), "DDCO fell apart on held-out demonstrations: −409.00 nats", False),
+        ((2.0, 1.0), (2.0, 1.4), "DDCO is below flat by 0.40 ± 0.05 nats per step on held-out", True),
+        ((2.0, 1.0), (9.0, 0.5), "Flat fell apart on held-out demonstrations: 0.50 nats per step there, 9.00", True),
+    ],
+)
+def test_a_fit_that_fell_apart_comes_first(ours, flat, first, concludes, capsys):
+    """Far below its training likelihood, or below flat: on the page and the console, with what to do."""
+    metrics = made_metrics(
+        10,
+        log_likelihood_per_step={"train": ours[0], "valid": ours[1]},
+        comparison={"flat": compared(ours[1] - flat[1], 0.05, train=flat[0], valid=flat[1])},
+        worth={"memory": {"nats_per_step": 0.5, "standard_error": 0.1}},
+    )
+    console.log_likelihoods(metrics)
+    for said in (words.verdict(metrics), capsys.readouterr().out):
+        assert first in said
+        assert ("explain held-out controls better" in said) == concludes
+        assert "Take " in said
+    assert words.verdict(metrics).startswith(first)
+
+
+def test_like_warnings_are_one_with_a_list():
+    """Of nineteen unused options the ten least used; a finding alone is a sentence of its own."""
+    use = {"selected": 1.0, "demonstrations": 1.0, "duration": 9.0}
+    options = [[use | {"choice": h, "share": 0.0005 * h if h < 20 else 0.2} for h in range(24)]]
+    pairs = [[{"options": (20, 21), "divergence": 0.01}]]
+    levels = [SimpleNamespace(name="skill", lasts=True)]
+    fit = SimpleNamespace(
+        spec=SimpleNamespace(hierarchy=SimpleNamespace(levels=levels)),
+        names={"skill": []},
+        metrics=made_metrics(options=options, divergences=pairs),
+    )
+    unused, alike = (what for what, _ in training.degeneracies(fit))
+    assert unused.startswith("19 options of level “skill” are unused; their shares of all steps are 0.1 % (option 1), ")
+    assert unused.endswith("0.5 % (option 10) and so on for 9 more.")
+    assert alike == (
+        "Option 20 and option 21 of level “skill” act alike; while either is active they differ, in nats per step, by "
+        "0.010."
+    )
 
 
 def test_numbers_in_words():

@@ -235,8 +235,10 @@ def log_likelihoods(fit: Fit) -> None:
 
     metrics = fit.metrics
     show(table(metrics, 3, "log-likelihood, nats per step (higher is better)"))
+    if caution := words.caution(metrics):
+        say(caution)
     if metrics.worth:
-        said = words.worth(metrics.worth, words.method(metrics.model), len(metrics.valid))
+        said = words.worth(metrics.worth, words.method(metrics.model), len(metrics.valid), words.sound(metrics))
         say(said if metrics.seeds else f"{said} {ONE_FIT}")
     if differ := stds(fit):
         say(differ)
@@ -253,7 +255,7 @@ def seeds(metrics: Metrics) -> None:
     rows = [[words.method(name), *words.spread(values)] for name, values in found.held_out.items()]
     title = f"held-out nats per step over training seeds {words.listed(map(str, found.training_seeds))}"
     show(Table(["Method", "mean", "95 % interval", "range"], rows, title=title))
-    say(words.over_seeds(found, words.method(metrics.model), len(metrics.valid)))
+    say(words.over_seeds(found, words.method(metrics.model), len(metrics.valid), words.sound(metrics)))
 
 
 def merged(pair: Pair, before: Fit, after: Fit) -> None:

@@ -41,6 +41,7 @@ class Row:
     :param total: Σ log p(ξ_n), and its standard error ``se``; None for a single trajectory.
     :param difference: the best run's total minus this one's, and its standard error ``dse``. The trajectories are the
         same, so ``dse`` is smaller than the two ``se`` suggest.
+    :param per_step: Σ log p(ξ_n) per step, and the same ``in_training``.
     :param each: log p(ξ_n) of every trajectory.
     """
 
@@ -53,6 +54,7 @@ class Row:
     difference: float
     dse: float | None
     per_step: float
+    in_training: float
     each: tuple[float, ...]
     training: Training
 
@@ -142,6 +144,7 @@ def _row(rank: int, fit: Fit, values: np.ndarray, best: np.ndarray, lengths: Seq
         difference=float((best - values).sum()),
         dse=dse and dse * sum(lengths),
         per_step=own.nats_per_step,
+        in_training=fit.metrics.log_likelihood_per_step.train,
         each=tuple(values.tolist()),
         training=fit.metrics.training,
     )

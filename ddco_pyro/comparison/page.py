@@ -16,7 +16,7 @@ from ddco_pyro.drawing import words
 from ddco_pyro.drawing.figures import Interval, Panel, interval_plot, save, style
 from ddco_pyro.drawing.page import Block, Cell, Page, Picture, Section, Table, Text, note
 from ddco_pyro.evaluation.agreement import UNMATCHED
-from ddco_pyro.evaluation.worth import worth
+from ddco_pyro.evaluation.worth import paired, worth
 from ddco_pyro.metrics import Difference, Rate
 from ddco_pyro.report.likelihood import SHOWN
 from ddco_pyro.segmenting.agreement import measure_names
@@ -121,8 +121,22 @@ def verdict(compared: Comparison) -> str:
         for row in others
     }
     rising = words.rising(row.name for row in compared.rows if not row.training.converged)
-    parts = _worth(compared)
-    return f"{words.explains(best.name, differences, len(compared.trajectories))}{' ' * bool(parts)}{parts}{rising}"
+    said = [_caution(compared), words.explains(best.name, differences, len(compared.trajectories)), _worth(compared)]
+    return f"{' '.join(filter(None, said))}{rising}"
+
+
+def _caution(compared: Comparison) -> str:
+    """The runs that fell apart, those with options below the best flat one, and what to do; empty where there are
+    none.
+    """
+    rows, flat = compared.rows, next((row for row in compared.rows if row.model in words.FLAT), None)
+    steps = np.array(compared.steps, dtype=float)
+    below = {
+        row.name: (flat.name, paired(np.array(row.each), np.array(flat.each), steps))
+        for row in rows
+        if flat and row.model == HIERARCHY
+    }
+    return words.cautions({row.name: (row.in_training, row.per_step) for row in rows}, below, len(steps))
 
 
 def _worth(compared: Comparison) -> str:
@@ -130,7 +144,10 @@ def _worth(compared: Comparison) -> str:
     models = [row.model for row in compared.rows]
     alone = {row.model: np.array(row.each) for row in compared.rows if models.count(row.model) == 1}
     found = worth(HIERARCHY, alone, compared.steps)
-    return words.worth(found, words.method(HIERARCHY), len(compared.trajectories)) if found else ""
+    sound = not any(
+        words.apart(row.in_training, row.per_step) for row in compared.rows if row.model in (HIERARCHY, words.MIXTURE)
+    )
+    return words.worth(found, words.method(HIERARCHY), len(compared.trajectories), sound) if found else ""
 
 
 def _links(compared: Comparison, folder: Path) -> dict[str, str]:

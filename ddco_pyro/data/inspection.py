@@ -486,7 +486,7 @@ class _Inspector:
                 self.control.add(block, name)
             self.coincidences.add(array.place, values, step, column.image)
             array.add(values, name, step, first)
-            if array.dtype.startswith("float") and values.shape[1] <= MOST_DIMENSIONS:
+            if array.dtype.kind == "f" and values.shape[1] <= MOST_DIMENSIONS:
                 turns = self.turns.setdefault(array.place, _Turns.of(values.shape[1]))
                 turns.add(values, name, begins=not step)
             step += len(values)

@@ -13,6 +13,7 @@ from ddco_pyro.metrics import (
     Counts,
     Difference,
     Metrics,
+    PerStep,
     Rate,
     Rollouts,
     Seeds,
@@ -28,9 +29,17 @@ CONFIDENCE = 0.95
 SMALLEST = 0.01
 """The smallest useful difference in nats per step: each step's control is exp(0.01) times as probable, 1 % more."""
 
+FAR = 2.0
+"""Nats per step that no sound model loses from training to held-out demonstrations: a control is e² = 7 times less
+probable there."""
+
 NAT = "one nat more per step means that the control of a step is e = 2.7 times as probable"
 
 P_VALUE = "p: McNemar’s exact test, two-sided, not corrected for the number of comparisons."
+
+MIXTURE = "mixture"
+FLAT = ("flat", "flat_equal")
+"""Flat baselines; a hierarchy is compared with the first one that a fit has."""
 
 METHODS = {
     "ddco": "DDCO",
@@ -146,7 +155,68 @@ def capital(text: str) -> str:
 def verdict(metrics: Metrics) -> str:
     """The verdict on a run: differences on held-out demonstrations, and the models that have not converged."""
     names = (method(name) for name, training in metrics.trainings.items() if not training.converged)
-    return f"{_explained(metrics)}{rising(names)}"
+    return f"{caution(metrics)} {_explained(metrics)}{rising(names)}".lstrip()
+
+
+def caution(metrics: Metrics) -> str:
+    """What comes first in a verdict: the models that fell apart, a model below flat, and what to do; else empty.
+
+    The same for several runs is :func:`cautions`.
+    """
+    flats = {name: metrics.comparison[name].difference for name in FLAT if name in metrics.comparison}
+    ours = method(metrics.model)
+    lowest = min(flats, key=lambda name: flats[name].nats_per_step, default=None)
+    below = {} if lowest is None else {ours: (method(lowest), flats[lowest])}
+    values = {method(name): _of_parts(one.log_likelihood_per_step) for name, one in metrics.methods.items()}
+    return cautions(values, below, len(metrics.valid))
+
+
+def cautions(
+    values: Mapping[str, tuple[float, float]], flats: Mapping[str, tuple[str, Difference]], held_out: int
+) -> str:
+    """Sentences on the models that fell apart, and on those below flat, with what to do; empty where all are sound.
+
+    A model fell apart that loses more than :data:`FAR` from training to held-out demonstrations. It is below flat where
+    the 95 % interval of their difference says so, or by more than that.
+
+    :param values: nats per step of each model in training, and held out.
+    :param flats: the difference of a model to a flat one, with that one's name.
+    """
+    said = [
+        f"{capital(name)} fell apart on held-out demonstrations: {number(held)} nats per step there, "
+        f"{number(trained)} in training."
+        for name, (trained, held) in values.items()
+        if apart(trained, held)
+    ]
+    if said:
+        said.append(
+            "Such a fit follows its training demonstrations too closely, and comparisons with it say nothing. Take "
+            "fewer options or observations, larger ridges (training.optimizer.ridge), or more demonstrations."
+        )
+    for name, (flat, difference) in flats.items():
+        if _direction(difference, held_out) < 0 or difference.nats_per_step < -FAR:
+            by = f"{number(-difference.nats_per_step)} ± {number(difference.standard_error)}"
+            said.append(
+                f"{capital(name)} is below {flat} by {by} nats per step on held-out demonstrations. Take {flat}, or "
+                "compare numbers of options and their networks by cross-validation (ddco-pyro select)."
+            )
+    return " ".join(said)
+
+
+def apart(trained: float, held: float) -> bool:
+    """Whether a model with these nats per step in training, and held out, fell apart."""
+    return trained - held > FAR
+
+
+def _of_parts(value: PerStep) -> tuple[float, float]:
+    """Nats per step in training, and held out; the same number twice where nothing was held out."""
+    return value.train, value.train if value.valid is None else value.valid
+
+
+def sound(metrics: Metrics) -> bool:
+    """Whether differences between the hierarchy and the mixture mean something: neither fell apart."""
+    both = (one for name, one in metrics.methods.items() if name in (metrics.model, MIXTURE))
+    return not any(apart(*_of_parts(one.log_likelihood_per_step)) for one in both)
 
 
 def division(counts: Counts) -> str:
@@ -175,9 +245,9 @@ def _explained(metrics: Metrics) -> str:
     if metrics.demonstrations.left_out:
         said.append("Every demonstration trains the model; each is held out from a fit without it.")
     if metrics.worth:
-        said.append(worth(metrics.worth, ours, held_out))
+        said.append(worth(metrics.worth, ours, held_out, sound(metrics)))
     if metrics.seeds:
-        said.append(over_seeds(metrics.seeds, ours, held_out))
+        said.append(over_seeds(metrics.seeds, ours, held_out, sound(metrics)))
     return " ".join(said)
 
 
@@ -195,13 +265,16 @@ def explains(name: str, differences: Mapping[str, Difference], held_out: int) ->
     return f"{text} (± is one standard error over {held_out} held-out demonstrations, for one fit of each model)."
 
 
-def worth(found: Worth, ours: str, held_out: int) -> str:
+def worth(found: Worth, ours: str, held_out: int, sound: bool = True) -> str:
     """The worth of several experts and of options that last, in one fit of each model.
 
     :param ours: what the hierarchy is called.
+    :param sound: whether neither model fell apart; otherwise nothing is concluded.
     """
     total = signed(found.total.nats_per_step) if found.total else ""
     parts = _divided(found, ours, f"{total} nats per step", "Held-out nats per step", with_error)
+    if not sound:
+        return parts
     decided = {
         1: "In this fit options that last explain held-out controls better; one fit of each model is no verdict.",
         0: "This fit does not show that options that last are worth anything.",
@@ -270,16 +343,17 @@ def of_episodes(pair: Against | None) -> str:
     return f"{_more(pair)} (p = {p_value(pair.p_value)})".replace("= <", "<")
 
 
-def over_seeds(found: Seeds, ours: str, held_out: int) -> str:
+def over_seeds(found: Seeds, ours: str, held_out: int, sound: bool = True) -> str:
     """The parts of the worth over training seeds, and the verdict, which is about options that last.
 
     :param ours: what the hierarchy is called.
     :param held_out: number of held-out demonstrations.
+    :param sound: as of :func:`worth`.
     """
     parts = _parts(found.worth, ours)
     said = f": {listed(parts)} nats per step" if parts else ""
     text = f"Over {len(found.training_seeds)} training seeds, with the same demonstrations held out{said}."
-    if "memory" not in found.worth:
+    if "memory" not in found.worth or not sound:
         return text
     return f"{text} {_lasting(found.worth['memory'], found.standard_error['memory'], held_out)}"
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from typing import Literal
 
 import numpy as np
@@ -43,34 +42,39 @@ def divergences(pieces: Iterable[tuple[Outputs, Posterior]]) -> list[list[Alike]
 
     :param pieces: outputs of the networks and posteriors of demonstrations.
     """
-    levels: list[dict[tuple[int, int], Tensor]] = []
+    levels: list[Tensor | float] = []
     for outputs, posterior in pieces:
-        levels = levels or [{} for _ in posterior.u]
-        for level, own, u in zip(levels, outputs.callers[:-1], posterior.u, strict=True):
-            for pair in combinations(range(u.shape[-1] - 1), 2):
-                level[pair] = level.get(pair, 0.0) + _divergence(own, *pair, u)
+        levels = levels or [0.0 for _ in posterior.u]
+        for place, (own, u) in enumerate(zip(outputs.callers[:-1], posterior.u, strict=True)):
+            own = own.map(Tensor.double)
+            levels[place] = levels[place] + torch.stack([_divergence(own, i, u) for i in range(u.shape[-1] - 1)])
     return [
         [
-            Alike(options=(i + 1, j + 1), divergence=float(total / weight) if weight > 0 else None)
-            for (i, j), (total, weight) in level.items()
+            Alike(options=(i + 1, j + 1), divergence=total / weight if weight > 0 else None)
+            for i, row in enumerate(level.tolist())
+            for j, (total, weight) in enumerate(row)
+            if i < j
         ]
         for level in levels
+        if isinstance(level, Tensor)
     ]
 
 
-def _divergence(own: CallerOutputs, i: int, j: int, u: Tensor) -> Tensor:
-    """Weighted sum over the steps, and the sum of the weights, [2]."""
-    steps = torch.zeros(u.shape[:2], dtype=torch.float64)
-    control = torch.ones_like(steps)  # mean probability of emitting the control
+def _divergence(own: CallerOutputs, i: int, u: Tensor) -> Tensor:
+    """Of option i and each option: the weighted sum over the steps, and the sum of the weights, [k, 2]."""
+    options = u[..., 1:]
+    steps = torch.zeros_like(options)
+    control = torch.ones_like(options)  # mean probability of emitting the control
     if own.selection is not None:
-        p, q = (own.selection[:, :, option].double() for option in (i, j))
+        q = own.selection
+        p = q[:, :, i : i + 1]
         both = torch.isfinite(p) & torch.isfinite(q)  # callers of a level emit the same kinds of choices
         steps = torch.where(both, 0.5 * (p.exp() - q.exp()) * (p - q), 0.0).sum(-1)
         control = 0.5 * (p[..., 0].exp() + q[..., 0].exp())
     if own.emission is not None:
-        steps = steps + control * own.emission.divergence(i, j)
-    weight = u[..., i + 1] + u[..., j + 1]
-    return torch.stack([(weight * steps).sum(), weight.sum()])
+        steps = steps + control * own.emission.divergence(i)
+    weight = options[..., i : i + 1] + options
+    return torch.stack([(weight * steps).sum((0, 1)), weight.sum((0, 1))], dim=-1)
 
 
 UNUSED_SHARE = 0.01

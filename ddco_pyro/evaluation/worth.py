@@ -7,12 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from ddco_pyro.drawing.words import FLAT, MIXTURE
 from ddco_pyro.metrics import Difference, SuccessWorth, Worth
 from ddco_pyro.simulation.episodes import paired_difference
-
-MIXTURE = "mixture"
-FLAT = ("flat", "flat_equal")
-"""Flat baselines; a hierarchy is compared with the first one that a fit has."""
 
 
 def paired(ours: np.ndarray, theirs: np.ndarray, lengths: np.ndarray) -> Difference:

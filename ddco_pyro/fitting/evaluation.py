@@ -11,12 +11,13 @@ import torch
 from torch import Tensor
 
 from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.drawing.words import MIXTURE
 from ddco_pyro.errors import Failed
 from ddco_pyro.evaluation.agreement import agreement, confusion
 from ddco_pyro.evaluation.branch_use import branch_use
 from ddco_pyro.evaluation.inferred import Inferred, infer
 from ddco_pyro.evaluation.options import divergences, option_use
-from ddco_pyro.evaluation.worth import MIXTURE, mean_run, paired, worth
+from ddco_pyro.evaluation.worth import mean_run, paired, worth
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.inference import Posterior
 from ddco_pyro.inference.posteriors import Decomposition

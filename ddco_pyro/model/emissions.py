@@ -17,7 +17,6 @@ from typing import Any, Protocol, Self
 import numpy as np
 import torch
 from torch import Tensor
-from torch.distributions import Normal, kl_divergence
 from torch.nn.functional import logsigmoid, one_hot, pad
 from torch.special import ndtr
 
@@ -81,8 +80,8 @@ class Emission(ABC):
         """The controls [..., K, A] that standard normal numbers [..., noise] stand for."""
 
     @abstractmethod
-    def divergence(self, i: int, j: int) -> Tensor:
-        """Mean of KL(π_i ‖ π_j) and KL(π_j ‖ π_i) of two callers, [...] nats."""
+    def divergence(self, i: int) -> Tensor:
+        """Mean of KL(π_i ‖ π_j) and KL(π_j ‖ π_i) of caller i and each caller j, float64 [..., K] nats."""
 
     def steps(self) -> list[Self]:
         """One emission for each step: tensors with as many dimensions as the first field differ from step to step."""
@@ -171,15 +170,19 @@ class Gaussian(Emission):
         """μ + σ·z."""
         return self.mean + self.std * noise.unsqueeze(-2)
 
-    def divergence(self, i: int, j: int) -> Tensor:
+    def divergence(self, i: int) -> Tensor:
         """½ Σ (μ_i - μ_j)² / σ² where callers share σ."""
-        return 0.5 * (self.relative_entropy(i, j) + self.relative_entropy(j, i))
+        to, back = self.relative_entropies(i)
+        return 0.5 * (to + back)
 
-    def relative_entropy(self, i: int, j: int) -> Tensor:
-        """KL(π_i ‖ π_j) of two callers, [...] nats."""
-        mean, std = self.mean.double(), self.std.double().expand(self.mean.shape)
-        first, second = (Normal(mean[..., k, :], std[..., k, :], validate_args=False) for k in (i, j))
-        return kl_divergence(first, second).sum(-1)
+    def relative_entropies(self, i: int) -> tuple[Tensor, Tensor]:
+        """KL(π_i ‖ π_j) and KL(π_j ‖ π_i) of caller i and each caller j, float64 [..., K] nats."""
+        mean = self.mean.double()
+        variance = self.std.double().square().expand(*self.std.shape[:-2], *self.shape[-2:])
+        own = variance[..., i : i + 1, :]
+        square, ratio = (mean - mean[..., i : i + 1, :]).square(), variance / own
+        to = (square / variance + 1 / ratio + ratio.log() - 1).sum(-1)
+        return 0.5 * to, 0.5 * (square / own + ratio - ratio.log() - 1).sum(-1)
 
 
 @dataclass(frozen=True)
@@ -278,12 +281,11 @@ class Hurdle(Emission):
         at = ndtr(noise[..., -1:]).unsqueeze(-2) < self.logit.sigmoid()
         return torch.where(at, 0.0, self.slab.draw(noise[..., :-1]))
 
-    def divergence(self, i: int, j: int) -> Tensor:
+    def divergence(self, i: int) -> Tensor:
         """That of the parts, and that of the slabs weighted by 1 - p."""
-        first, second = (self.logit[..., caller, 0].double() for caller in (i, j))
-        slabs = (-first).sigmoid() * self.slab.relative_entropy(i, j)
-        slabs = slabs + (-second).sigmoid() * self.slab.relative_entropy(j, i)
-        return _of_switch(first, second) + 0.5 * slabs
+        each = self.logit[..., 0].double()
+        own, (to, back) = each[..., i : i + 1], self.slab.relative_entropies(i)
+        return _of_switch(own, each) + 0.5 * ((-own).sigmoid() * to + (-each).sigmoid() * back)
 
 
 def _at_value(actions: Tensor) -> Tensor:
@@ -325,9 +327,10 @@ class Binary(Emission):
         """On where Φ(z) is less than logistic(y)."""
         return (ndtr(noise).unsqueeze(-2) < self.logits.sigmoid()).to(self.logits.dtype)
 
-    def divergence(self, i: int, j: int) -> Tensor:
+    def divergence(self, i: int) -> Tensor:
         """½ Σ (p_i - p_j)(y_i - y_j)."""
-        return _of_switch(self.logits[..., i, :].double(), self.logits[..., j, :].double()).sum(-1)
+        logits = self.logits.double()
+        return _of_switch(logits[..., i : i + 1, :], logits).sum(-1)
 
 
 @dataclass(frozen=True)
@@ -385,10 +388,11 @@ class Categorical(Emission):
         uniform = ndtr(noise[..., :1].double()).unsqueeze(-2)
         return self._action((total <= uniform * total[..., -1:]).sum(-1).clamp(max=total.shape[-1] - 1))
 
-    def divergence(self, i: int, j: int) -> Tensor:
+    def divergence(self, i: int) -> Tensor:
         """½ Σ (p_i - p_j)(log p_i - log p_j)."""
-        first, second = (self.logits[..., caller, :].double().log_softmax(-1) for caller in (i, j))
-        return 0.5 * ((first.exp() - second.exp()) * (first - second)).sum(-1)
+        each = self.logits.double().log_softmax(-1)
+        own = each[..., i : i + 1, :]
+        return 0.5 * ((own.exp() - each.exp()) * (own - each)).sum(-1)
 
     def _action(self, index: Tensor) -> Tensor:
         actions = one_hot(index, self.logits.shape[-1]) if bool(self.rows) else index.unsqueeze(-1)
@@ -445,9 +449,9 @@ class Product(Emission):
             first = last
         return self._joined(draws)
 
-    def divergence(self, i: int, j: int) -> Tensor:
+    def divergence(self, i: int) -> Tensor:
         """The sum of the groups' divergences."""
-        return reduce(add, (emission.divergence(i, j) for _, emission in self.groups))
+        return reduce(add, (emission.divergence(i) for _, emission in self.groups))
 
     def steps(self) -> list[Self]:
         """One for each step."""

@@ -53,6 +53,15 @@ class CallerOutputs:
             return Selection(self.logits, 1 + self.options - self.logits.shape[-1])
         return LogTable(pad(torch.zeros(*self.shape, 1), (0, self.options), value=NEVER))
 
+    def map(self, change: Callable[[Tensor], Tensor]) -> CallerOutputs:
+        """The outputs of changed tensors."""
+        return CallerOutputs(
+            self.options,
+            None if self.logits is None else change(self.logits),
+            None if self.emission is None else self.emission.map(change),
+            None if self.numbers is None else change(self.numbers),
+        )
+
     def density_link(self, actions: Tensor) -> Link:
         """log π(a | s) of each caller, [N, T, K], not computed; -inf for a caller that emits no control."""
         if self.emission is None:
@@ -105,17 +114,5 @@ class Outputs:
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Outputs:
         """The outputs of changed tensors."""
-
-        def changed(tensor: Tensor | None) -> Tensor | None:
-            return None if tensor is None else change(tensor)
-
-        callers = (
-            CallerOutputs(
-                caller.options,
-                changed(caller.logits),
-                None if caller.emission is None else caller.emission.map(change),
-                changed(caller.numbers),
-            )
-            for caller in self.callers
-        )
-        return Outputs(tuple(callers), tuple(changed(logit) for logit in self.termination_logits))
+        logits = (None if logit is None else change(logit) for logit in self.termination_logits)
+        return Outputs(tuple(caller.map(change) for caller in self.callers), tuple(logits))

@@ -153,29 +153,56 @@ def degeneracies(fit: Fit) -> list[tuple[str, str]]:
     """Signs of a degenerate solution in ``metrics.json``, each in words with its number, and the usual remedy."""
     if fit.spec.hierarchy is None:
         return []
-    levels = fit.spec.hierarchy.levels
+    levels, groups = fit.spec.hierarchy.levels, dict[tuple[int, str], list[Finding]]()
+    for finding in diagnose(fit.metrics.options, fit.metrics.divergences):
+        if finding.kind != "never_persisting" or levels[finding.level - 1].lasts:
+            groups.setdefault((finding.level, finding.kind), []).append(finding)
     return [
-        (_sign(finding, levels[finding.level - 1].name, fit.names), finding.advice(fit.spec.training))
-        for finding in diagnose(fit.metrics.options, fit.metrics.divergences)
-        if finding.kind != "never_persisting" or levels[finding.level - 1].lasts
+        (_sign(found, levels[level - 1].name, fit.names), found[0].advice(fit.spec.training))
+        for (level, _), found in groups.items()
     ]
 
 
-def _sign(finding: Finding, level: str, names: Mapping[str, Sequence[str]]) -> str:
-    """A sign of a degenerate solution in words."""
-    option = f"{words.capital(words.numbered_name(finding.choice, names[level]))} of level “{level}”"
-    other = words.numbered_name(finding.other or 0, names[level])
-    share = percent(finding.value, 1)
-    return {
-        "unused": f"{option} is unused: it is active in {share} of all steps.",
-        "dominating": f"{option} dominates: it is active in {share} of all steps.",
-        "redundant": f"{option} acts like {other}: they differ by {number(finding.value, 3)} nats per "
-        "step while either is active.",
-        "never_persisting": f"{option} never persists: it lasts {number(finding.value)} steps on average and is "
-        f"selected {number(finding.selections, 1)} times in each demonstration that has it.",
-        "high_fitting": f"High-fitting: the caller of level “{level}” emits the control itself in {share} of its "
-        "steps, past its options.",
-    }[finding.kind]
+LISTED = 10
+"""Options, or pairs of options, that a sign lists, the clearest first."""
+
+
+def _sign(found: Sequence[Finding], level: str, names: Mapping[str, Sequence[str]]) -> str:
+    """The findings of one kind in a level as one sign of a degenerate solution, in words."""
+    if found[0].kind == "high_fitting":
+        share = percent(found[0].value, 1)
+        return f"High-fitting: the caller of level “{level}” emits the control itself in {share} of its steps."
+    many = len(found) > 1
+    said = {
+        "unused": "are unused; their shares of all steps are" if many else "is unused; its share of all steps is",
+        "dominating": "dominates; its share of all steps is",
+        "redundant": "act alike; while either is active they differ, in nats per step, by",
+        "never_persisting": "never persist; on average they last" if many else "never persists; on average it lasts",
+    }[found[0].kind]
+    ordered = sorted(found, key=lambda finding: finding.value)
+    each = [_value(finding) for finding in ordered[:LISTED]]
+    who = [_who(finding, names[level]) for finding in ordered[:LISTED]]
+    left = len(found) - LISTED
+    if many:
+        values = [f"{value} ({name})" for value, name in zip(each, who, strict=True)]
+        kind = "pairs of options" if found[0].kind == "redundant" else "options"
+        more = [f"so on for {left} more"] if left > 0 else []
+        return f"{len(found)} {kind} of level “{level}” {said} {words.listed([*values, *more])}."
+    return f"{words.capital(who[0])} of level “{level}” {said} {each[0]}."
+
+
+def _who(finding: Finding, names: Sequence[str]) -> str:
+    """The option, or the two options, of a finding."""
+    both = (finding.other, finding.choice) if finding.other else (finding.choice,)
+    return words.listed(words.numbered_name(option, names) for option in both)
+
+
+def _value(finding: Finding) -> str:
+    if finding.kind == "redundant":
+        return number(finding.value, 3)
+    if finding.kind == "never_persisting":
+        return f"{number(finding.value)} steps, selected {number(finding.selections, 1)} times a demonstration"
+    return percent(finding.value, 1)
 
 
 # --- particulars ------------------------------------------------------------------------------------------------------
