@@ -65,6 +65,14 @@ class TrainingEnded:
 
 
 @dataclass(frozen=True)
+class OptionsCompared:
+    """``done`` of ``total`` options are compared with the others of their level."""
+
+    done: int
+    total: int
+
+
+@dataclass(frozen=True)
 class SelectionBegan:
     """A selection of ``total`` (candidate, fold) pairs begins; ``kept`` of them are scored already."""
 
@@ -128,6 +136,7 @@ Event = (
     | RestartStopped
     | RestartDiverged
     | TrainingEnded
+    | OptionsCompared
     | SelectionBegan
     | FoldScored
     | CandidateGivenUp

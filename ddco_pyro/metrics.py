@@ -177,6 +177,8 @@ class Training(Record):
     """Whether the gradient steps are EM steps over all training demonstrations."""
     by_lbfgs: bool = False
     """Whether they are steps of L-BFGS over all training demonstrations."""
+    raised_ridge: LeftOut[float | None] = None
+    """The ridge of policies, where it is larger than the spec's."""
 
 
 class Compared(Record):

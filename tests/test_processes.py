@@ -26,10 +26,10 @@ from random_demonstrations import of_states
 from ddco_pyro.data.files import only_one
 from ddco_pyro.errors import Failed
 from ddco_pyro.fitting.fit import fit
+from ddco_pyro.jobs import beside, early_process, end_pool, pool, results
 from ddco_pyro.spec import dump_spec
 from ddco_pyro.training import restarts as restarting
 from ddco_pyro.training.checkpoint import Progress, Restart
-from ddco_pyro.training.jobs import beside, early_process, end_pool, pool, results
 from ddco_pyro.training.loop import StageTraining
 from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.restarts import Trainer
@@ -293,15 +293,26 @@ def test_a_pool_that_has_nothing_to_do_is_ended() -> None:
 
 KILLED = """
 import os, signal
-from ddco_pyro.training.jobs import beside, early_process
-with early_process("json"), beside(1, [os.getpid], "dead") as results:
-    print(*results, flush=True)
-    os.kill(os.getpid(), signal.SIGKILL)
+from ddco_pyro.jobs import beside, early_process, pool, results
+{work}
+print(process, flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
 """
+WORK = {
+    "beside": """
+with early_process("json"), beside(1, [os.getpid], "dead") as found:
+    process = next(found)
+    os.kill(process, 0)
+    print(process, flush=True)
+    os.kill(os.getpid(), signal.SIGKILL)""",
+    "pool": "process = next(results(pool(2), [os.getpid] * 9, 'dead'))",
+    "episodes": "process = next(results(pool(2, ordered=True), [os.getpid] * 9, 'dead'))",
+}
 
 
-def test_a_process_ends_with_the_one_that_is_killed_while_it_waits_for_work(tmp_path) -> None:
+@pytest.mark.parametrize("work", WORK)
+def test_a_process_ends_with_the_one_that_is_killed_while_it_waits_for_work(tmp_path, work) -> None:
     with open(tmp_path / "process", "w") as file:
-        killed = subprocess.run([sys.executable, "-c", KILLED], stdout=file)
+        killed = subprocess.run([sys.executable, "-c", KILLED.format(work=WORK[work])], stdout=file)
     assert killed.returncode == -signal.SIGKILL
     assert_ends(int((tmp_path / "process").read_text()), 10)

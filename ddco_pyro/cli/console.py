@@ -25,6 +25,7 @@ from ddco_pyro.events import (
     EpochEnded,
     Event,
     FoldScored,
+    OptionsCompared,
     RestartDiverged,
     RestartStopped,
     SeedFitted,
@@ -103,6 +104,8 @@ class Progress:
                 self._say(f"restart {restart}: diverged: {why}")
             case TrainingEnded():
                 self.end()
+            case OptionsCompared(done, total):
+                self._advance("comparing options", total, done)
             case SelectionBegan(total, kept):
                 self._begin(f"cross-validation{f' ({kept} of {total} kept)' if kept else ''}", total - kept)
             case FoldScored(candidate, fold, failed):

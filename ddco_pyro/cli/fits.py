@@ -125,7 +125,7 @@ def _follow(ranks: Ranks) -> None:
 @contextmanager
 def _ready(spec: Spec, jobs: int) -> Iterator[None]:
     """Inside, another process is ready to fit baselines, if it is of use."""
-    from ddco_pyro.training.jobs import LONG, check_jobs, early_process, useful_jobs
+    from ddco_pyro.jobs import LONG, check_jobs, early_process, useful_jobs
 
     check_jobs(jobs)
     own = spec.training
@@ -214,7 +214,7 @@ def select(
     loaded = load_spec(spec, [*overrides, *number], allow_code)
     if (backend is Backend.DASK) != (scheduler is not None):
         raise SpecError("--backend dask and --scheduler tcp://HOST:PORT go together; give both or neither")
-    from ddco_pyro.training.jobs import check_jobs, importing
+    from ddco_pyro.jobs import check_jobs, importing
 
     check_jobs(jobs)
     folder = out or Path("runs") / f"{spec.stem}-select-{time.strftime('%Y%m%d-%H%M%S')}"

@@ -191,7 +191,8 @@ def cautions(
     if said:
         said.append(
             "Such a fit follows its training demonstrations too closely, and comparisons with it say nothing. Take "
-            "fewer options or observations, larger ridges (training.optimizer.ridge), or more demonstrations."
+            "fewer options or observations, smaller networks, larger ridges (training.optimizer.ridge), or more "
+            "demonstrations."
         )
     for name, (flat, difference) in flats.items():
         if _direction(difference, held_out) < 0 or difference.nats_per_step < -FAR:
@@ -434,8 +435,9 @@ def effort(training: Training) -> str:
 
 
 def _over_all(training: Training) -> str:
-    """The name of an optimiser whose steps are over all demonstrations."""
-    return "EM" if training.by_em else "L-BFGS" if training.by_lbfgs else ""
+    """The name of an optimiser whose steps are over all demonstrations, and its ridge where that was raised."""
+    ridge = "" if training.raised_ridge is None else f", ridge {training.raised_ridge:g}"
+    return f"EM{ridge}" if training.by_em else "L-BFGS" if training.by_lbfgs else ""
 
 
 def spent(training: Training) -> str:

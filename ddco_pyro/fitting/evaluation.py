@@ -18,6 +18,7 @@ from ddco_pyro.evaluation.branch_use import branch_use
 from ddco_pyro.evaluation.inferred import Inferred, infer
 from ddco_pyro.evaluation.options import divergences, option_use
 from ddco_pyro.evaluation.worth import mean_run, paired, worth
+from ddco_pyro.events import OnEvent, ignore
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.inference import Posterior
 from ddco_pyro.inference.posteriors import Decomposition
@@ -119,7 +120,13 @@ def _finite(fit: Fit, piece: Inferred) -> np.ndarray:
     return piece.log_likelihood
 
 
-def evaluate(fitted: Fit, parts: dict[str, Demonstrations], demos: Demonstrations, **about: Any) -> Metrics:
+def evaluate(
+    fitted: Fit,
+    parts: dict[str, Demonstrations],
+    demos: Demonstrations,
+    on_event: OnEvent = ignore,
+    **about: Any,
+) -> Metrics:
     """The evaluation of a model.
 
     It has the log-likelihood in nats per step of each part of the data and of each demonstration, and the paired
@@ -142,7 +149,7 @@ def evaluate(fitted: Fit, parts: dict[str, Demonstrations], demos: Demonstration
     by_dimension = {name: _by_dimension(fitted, part.each, parts[name]) for name, part in ours.items()}
     held_out = {} if valid is None else {name: each["valid"] for name, each in by_method.items()}
     lengths = np.array([] if valid is None else valid.lengths, dtype=float)
-    options, alike = _options(fitted, demos) if depth else ([], [])
+    options, alike = _options(fitted, demos, on_event) if depth else ([], [])
     labels = fitted.spec.demonstrations.labels_by_level(depth) if depth else ()
     return Metrics(
         model=fitted.name,
@@ -182,7 +189,7 @@ def _worth(fit: Fit, values: Mapping[str, np.ndarray], ours: _Part, valid: Demon
     return found.model_copy(update={"steps_in_a_row": rows})
 
 
-def _options(fit: Fit, demos: Demonstrations) -> tuple[list[list[Use]], list[list[Alike]]]:
+def _options(fit: Fit, demos: Demonstrations, on_event: OnEvent) -> tuple[list[list[Use]], list[list[Alike]]]:
     """The use and the divergences of options."""
     sums: list[Posterior] = []
 
@@ -191,7 +198,7 @@ def _options(fit: Fit, demos: Demonstrations) -> tuple[list[list[Use]], list[lis
             sums.append(Posterior(*(tuple(h.sum(1, keepdim=True) for h in kind) for kind in piece.posterior)))
             yield piece.outputs, piece.posterior
 
-    alike = divergences(pieces())
+    alike = divergences(pieces(), on_event, len(demos))
     whole = Posterior(*(tuple(map(torch.cat, zip(*kind, strict=True))) for kind in zip(*sums, strict=True)))
     return option_use(whole), alike
 

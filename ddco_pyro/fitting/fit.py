@@ -35,12 +35,12 @@ from ddco_pyro.fitting.run import (
     write_model,
 )
 from ddco_pyro.inference import compile_all
+from ddco_pyro.jobs import LONG, beside, check_jobs, useful_jobs
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec, load_spec, with_overrides
 from ddco_pyro.training.data import demonstrations as read_demonstrations
 from ddco_pyro.training.data import dimensions, known_demonstrations, parts, refuse_unfit, seen
 from ddco_pyro.training.devices import device_of, repeatable
-from ddco_pyro.training.jobs import LONG, BackendError, beside, check_jobs, useful_jobs
 from ddco_pyro.training.labels import used
 from ddco_pyro.training.networks import Dimensions, check_models, model_name, parameters
 from ddco_pyro.training.optimizers import optimizer_of
@@ -203,6 +203,7 @@ def _fit_model(
             fitted,
             split,
             demos,
+            on_event,
             engine_check=trained.check._asdict(),
             demonstrations=counts | known,
             measure=measure(hierarchy.scaling.parts),

@@ -14,9 +14,9 @@ from ddco_pyro.fitting.fit import fit as fit_again
 from ddco_pyro.fitting.fitted import Fit, load
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.fitting.run import is_finished
+from ddco_pyro.jobs import pool, results, useful_jobs
 from ddco_pyro.metrics import Metrics, Seeds, SuccessOfSeeds
 from ddco_pyro.spec import Spec, user_code, with_overrides
-from ddco_pyro.training.jobs import pool, results, useful_jobs
 
 DEAD = "a process that repeated the fit was ended from outside (too little memory?); the same command goes on"
 

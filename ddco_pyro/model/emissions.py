@@ -172,17 +172,22 @@ class Gaussian(Emission):
 
     def divergence(self, i: int) -> Tensor:
         """½ Σ (μ_i - μ_j)² / σ² where callers share σ."""
-        to, back = self.relative_entropies(i)
-        return 0.5 * (to + back)
+        square, ratio, precision = self._beside(i)
+        both = (square * (precision + precision[..., i : i + 1, :])).sum(-1)
+        return 0.25 * (both + (ratio + 1 / ratio - 2).sum(-1))
 
     def relative_entropies(self, i: int) -> tuple[Tensor, Tensor]:
         """KL(π_i ‖ π_j) and KL(π_j ‖ π_i) of caller i and each caller j, float64 [..., K] nats."""
+        square, ratio, precision = self._beside(i)
+        to = (square * precision).sum(-1) + (1 / ratio + ratio.log() - 1).sum(-1)
+        back = (square * precision[..., i : i + 1, :]).sum(-1) + (ratio - ratio.log() - 1).sum(-1)
+        return 0.5 * to, 0.5 * back
+
+    def _beside(self, i: int) -> tuple[Tensor, Tensor, Tensor]:
+        """(μ_j - μ_i)² [..., K, A], and σ_j² / σ_i² and 1 / σ_j², which steps may share."""
         mean = self.mean.double()
         variance = self.std.double().square().expand(*self.std.shape[:-2], *self.shape[-2:])
-        own = variance[..., i : i + 1, :]
-        square, ratio = (mean - mean[..., i : i + 1, :]).square(), variance / own
-        to = (square / variance + 1 / ratio + ratio.log() - 1).sum(-1)
-        return 0.5 * to, 0.5 * (square / own + ratio - ratio.log() - 1).sum(-1)
+        return (mean - mean[..., i : i + 1, :]).square(), variance / variance[..., i : i + 1, :], 1 / variance
 
 
 @dataclass(frozen=True)

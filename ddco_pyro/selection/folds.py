@@ -14,16 +14,16 @@ from pathlib import Path
 import numpy as np
 from joblib import Parallel, parallel_config
 
+from ddco_pyro import jobs
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import Damaged, json_text, write_text
 from ddco_pyro.errors import BadInput, Failed
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.inference import compile_all
 from ddco_pyro.inference.threads import one_thread
+from ddco_pyro.jobs import ALL_CORES, BackendError
 from ddco_pyro.metrics import Record, read_record
 from ddco_pyro.selection.grid import Candidate
-from ddco_pyro.training import jobs
-from ddco_pyro.training.jobs import ALL_CORES, BackendError
 from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.restarts import train_model
 

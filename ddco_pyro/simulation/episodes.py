@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -191,14 +192,20 @@ def run_episodes(
 
     :param task: the task's name for :func:`ddco_pyro.simulation.task.find_task`.
     :param observed: see :func:`run_episode`, also for ``keep``.
+    :raises Failed: a process died.
     """
-    from joblib import Parallel, delayed
+    from ddco_pyro.jobs import pool, results
 
-    calls = (
-        delayed(_run_named)(task, policy, seed, number < film, observed, keep) for number, seed in enumerate(seeds)
-    )
-    episodes: Iterable[Episode] = Parallel(n_jobs=jobs, return_as="generator")(calls)
-    return episodes
+    calls = [
+        partial(_run_named, task, policy, seed, number < film, observed, keep) for number, seed in enumerate(seeds)
+    ]
+    return results(pool(jobs, ordered=True), calls, DEAD)
+
+
+DEAD = (
+    "a process that ran episodes was ended from outside (too little memory?); what is done is kept: do the same again, "
+    "with fewer --jobs if memory was short"
+)
 
 
 def _run_named(task: str, *how: Any) -> Episode:

@@ -21,6 +21,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from ddco_pyro import jobs
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import Busy, json_text, only_one, write_text
 from ddco_pyro.data.hdf5 import natural
@@ -41,7 +42,7 @@ from ddco_pyro.simulation.episodes import run_episodes
 from ddco_pyro.spec import DemonstrationsSpec, Spec, SpecError, parse_spec, with_overrides
 from ddco_pyro.spec.yaml import read_yaml
 from ddco_pyro.study.declaration import NATS, Study
-from ddco_pyro.training import data, jobs
+from ddco_pyro.training import data
 from ddco_pyro.training.networks import Dimensions, baseline_spec, named_baselines
 
 

@@ -35,20 +35,21 @@ from ddco_pyro.events import (
 from ddco_pyro.inference.engines import STEPS, TRAJECTORIES, EngineCheck, compare_engines
 from ddco_pyro.inference.paths import segment
 from ddco_pyro.inference.threads import one_thread
+from ddco_pyro.jobs import end_with, pool, results, useful_jobs
 from ddco_pyro.model.batch import encode, refuse_unusable
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.seeding import seeded
-from ddco_pyro.spec import Spec
+from ddco_pyro.spec import Spec, with_overrides
 from ddco_pyro.training.checkpoint import Progress, Restart, TrainingData
 from ddco_pyro.training.data import tuning_split
 from ddco_pyro.training.devices import described, device_of
-from ddco_pyro.training.jobs import end_with, pool, results, useful_jobs
 from ddco_pyro.training.labels import Labels
 from ddco_pyro.training.loop import train
 from ddco_pyro.training.networks import Dimensions, build_hierarchy, model_name
 from ddco_pyro.training.objective import TrainingError
 from ddco_pyro.training.optimizers import optimizer_of
 from ddco_pyro.training.processes import Ranks
+from ddco_pyro.training.ridge import cross_validated
 from ddco_pyro.training.stages import StageEnd, plan
 
 SHORT = 10.0
@@ -132,6 +133,12 @@ class Trainer:
         encoded = varied, encode(tune, encoder, scaling)
         fitted = encoder.state_dict(), scaling.state_dict()
         self.data = TrainingData(spec, dimensions, *encoded, train.names, *fitted, Labels.of(spec, train, tune))
+        self.ridge = ridge = spec.training.optimizer.ridge.policy
+        by_em = optimizer_of(spec.training.optimizer, self.hierarchy) == "em"
+        if by_em and spec.training.optimizer.ridge.cross_validated:
+            self.ridge = cross_validated(self.hierarchy, varied, ridge, self.data.seed(0))
+            raised = with_overrides(spec, {"training.optimizer.ridge.policy": self.ridge})
+            self.data = replace(self.data, spec=raised)
         self.restarts: list[Restart] = []
         self.stopped: dict[int, int] = {}
         self.agreement: dict[int, float] = {}
@@ -237,6 +244,7 @@ class Trainer:
             "device": self.restarts[best].progress.device,
             "by_em": optimizer == "em",
             "by_lbfgs": optimizer == "lbfgs",
+            "raised_ridge": self.ridge if self.ridge != self.spec.training.optimizer.ridge.policy else None,
         }
 
     def _segments(self, number: int) -> np.ndarray:

@@ -30,6 +30,9 @@ LONG = 1000
 """Gradient steps, at least, of a training that takes longer than starting a process."""
 
 
+warnings.filterwarnings("ignore", ".*tasks (which were still|have been successfully)|A worker stopped", UserWarning)
+"""joblib says so of calls that an interruption ends, and of a process that it replaces."""
+
 _POOLED = threading.Event()  # :func:`pool` has been called
 
 
@@ -51,12 +54,16 @@ def useful_jobs(jobs: int, calls: int) -> int:
     return min(joblib.cpu_count() if jobs == ALL_CORES else jobs, calls)
 
 
-def pool(jobs: int) -> Parallel:
-    """Processes for :func:`results`, to be used in a ``with`` statement."""
+def pool(jobs: int, ordered: bool = False) -> Parallel:
+    """Processes for :func:`results`, best used in a ``with`` statement; they end soon after this one, however it ends.
+
+    :param ordered: whether results come in the order of the calls.
+    """
     if jobs != 1:
         _POOLED.set()
+    how = "generator" if ordered else "generator_unordered"
     # one call at a time: each takes long, and each result is kept at once; no read-only maps of arrays
-    return Parallel(n_jobs=jobs, return_as="generator_unordered", batch_size=1, max_nbytes=None)
+    return Parallel(jobs, return_as=how, batch_size=1, max_nbytes=None, initializer=end_with_parent)
 
 
 def end_pool() -> None:
@@ -74,8 +81,7 @@ def importing(jobs: int, module: str) -> Iterator[None]:
     try:
         yield
     except BaseException:
-        with warnings.catch_warnings(action="ignore"):  # of results that are not read
-            imported.close()
+        imported.close()
         raise
     list(imported)
 
