@@ -134,6 +134,10 @@ def test_principal_components_are_those_of_all_rows_at_once(size):
     projected, expected = ours(rows), theirs.transform(rows)
     np.testing.assert_allclose(projected * np.sign((projected * expected).sum(0)), expected, atol=1e-4)
     np.testing.assert_allclose(ours.explained, theirs.explained_variance_ratio_.sum(), rtol=1e-6)
+    spread = theirs.explained_variance_ / theirs.explained_variance_[0]
+    for least in (0.0, 0.3, 2.0):
+        without = principal_components([rows], size, least)
+        assert len(without.components) == max(1, (spread >= least).sum())
 
 
 def test_components_see_the_training_demonstrations_alone(few_dots, out):

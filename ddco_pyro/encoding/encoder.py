@@ -140,12 +140,18 @@ class Projection:
         return ((features - self.mean) @ self.components.T).astype(np.float32)
 
 
-def principal_components(blocks: Iterable[np.ndarray], size: int) -> Projection:
+NOISE = 1e-4
+"""Share of the first component's variance below which a component is noise: a hundredth of its spread. All components
+have the unit of the features; standardised one by one, noise would count as much as what moves."""
+
+
+def principal_components(blocks: Iterable[np.ndarray], size: int, least: float = 0.0) -> Projection:
     """The ``size`` principal components of rows, from one pass over blocks [M, F] of at least ``size`` rows in all.
 
     They are exactly those of all rows at once. Memory holds an F × F matrix. The entry of each component that is
     largest in magnitude is positive.
 
+    :param least: components with a smaller share of the first one's variance are left out.
     :raises DemonstrationsError: that matrix takes more memory than is allowed.
     """
     number, total, products, origin = 0, np.zeros(0), np.zeros((0, 0)), np.zeros(0)
@@ -162,9 +168,10 @@ def principal_components(blocks: Iterable[np.ndarray], size: int) -> Projection:
         products += rows.T @ rows
     offset = total / number
     values, vectors = np.linalg.eigh(products - number * np.outer(offset, offset))
+    variance = values.clip(0)
+    size = min(size, max(1, int((variance >= least * variance[-1]).sum())))
     kept = vectors[:, ::-1][:, :size].T
     largest = np.take_along_axis(kept, np.abs(kept).argmax(1)[:, None], 1)
-    variance = values.clip(0)
     explained = float(variance[::-1][:size].sum() / variance.sum()) if variance.any() else 1.0
     return Projection(origin + offset, kept * np.where(largest < 0, -1.0, 1.0), explained)
 

@@ -26,6 +26,7 @@ from ddco_pyro.data.sources import Column, Recording, refuse_foreign
 from ddco_pyro.data.sources.robomimic import Robomimic, open_robomimic, parts_of, robomimic_file, write_recording
 from ddco_pyro.encoding.autoencoder import UPDATES, Convolutions, train
 from ddco_pyro.encoding.encoder import (
+    NOISE,
     About,
     Encoder,
     Extractor,
@@ -61,8 +62,8 @@ class Encoding:
 
     :param observation: the key of the pictures, uint8 [T, H, W, C].
     :param encoder: ``random_conv``, ``autoencoder``, a user's ``module:Class``, or the folder of a fit.
-    :param size: number of principal components. By default :data:`SIZE`; fewer features, and those of a fit, are not
-        projected.
+    :param size: number of principal components. By default at most :data:`SIZE`, without those that are noise
+        (:data:`~ddco_pyro.encoding.encoder.NOISE`); fewer features, and those of a fit, are not projected.
     :param name: the new observation's key; ``<observation>_features`` by default.
     :param updates: gradient steps of the autoencoder.
     :param moved: number of further versions of each demonstration, whose pictures are all shifted alike. They become
@@ -198,8 +199,8 @@ class _Job:
             train(network, self.pictures, encoding.seed, encoding.updates, self.folder / _CHECKPOINT, self.on_event)
         self._encode_all()
         projection = self._projection()
-        explained = projection.explained if projection else 1.0
-        about = self.about.model_copy(update={"explained": explained})
+        found = {"explained": projection.explained, "size": len(projection.components)} if projection else {}
+        about = self.about.model_copy(update=found)
         return Encoder(about, self.extractor, projection)
 
     def _encode_all(self) -> None:
@@ -252,7 +253,7 @@ class _Job:
             return None
         with open_robomimic(self.folder / _UNREDUCED) as source, one_thread():
             rows = (block for name in self.pictures.training for block in self._unreduced(source, name))
-            return principal_components(rows, self.about.size)
+            return principal_components(rows, self.about.size, NOISE if self.encoding.size is None else 0.0)
 
     def _write(self, encoder: Encoder) -> None:
         attributes = {**self.source.attributes, MADE: _digest(self.identity)}
@@ -263,7 +264,7 @@ class _Job:
                 others = {key: column for key, column in recording.observations.items() if key != self.pictures.key}
                 encoded = {
                     key: Column(
-                        self._shape(recording.actions, kind, self.about.size),
+                        self._shape(recording.actions, kind, encoder.about.size),
                         np.dtype(np.float32),
                         partial(map, encoder.reduced, self._unreduced(features, name, kind)),
                     )
