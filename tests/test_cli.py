@@ -141,6 +141,34 @@ def test_help_has_an_example_that_can_be_typed(command):
     assert COMMANDS[command].make_context(command, shlex.split(example)).params
 
 
+EVERY_HELP = """
+import sys
+from ddco_pyro.cli.app import EXAMPLES, app
+for example in EXAMPLES.values():
+    app([example.split()[0], "--help"], standalone_mode=False)
+"""
+
+
+@pytest.mark.parametrize("columns", [20, 40, 59, 60, 80])
+def test_help_cuts_no_option_however_narrow_it_is(columns):
+    own = {**os.environ, "COLUMNS": str(columns)}
+    ended = subprocess.run([sys.executable, "-c", EVERY_HELP], capture_output=True, text=True, env=own)
+    names = {name for command in COMMANDS.values() for one in command.params for name in one.opts if name[:2] == "--"}
+    assert {name for name in names if name not in ended.stdout} == set()
+    assert "\\[" not in ended.stdout
+
+
+@pytest.mark.parametrize(("closed", "status"), [(">&-", 0), (">&- 2>&- <&-", 0), (">&-", 2)])
+def test_a_stream_that_is_closed_from_the_beginning_is_no_error(closed, status, tmp_path):
+    """Nor does a file that is written get its number, and what is printed."""
+    command = Path(sys.executable).with_name("ddco-pyro")
+    example = ROOT / "specs" / ("nowhere.yaml" if status else "mine.yaml")
+    line = f"exec {command} check {'' if status else '--schema'} {example} {closed}"
+    ended = subprocess.run(["sh", "-c", line], capture_output=True, text=True, cwd=tmp_path)
+    assert ended.returncode == status
+    assert "unexpected" not in ended.stderr
+
+
 def test_version_is_the_packages():
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
     ended = call("--version")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -128,6 +129,28 @@ def test_two_folds_are_not_enough_to_give_up():
 def test_a_candidate_that_has_failed_is_given_up():
     scores = [score(0, 0, 1.0), score(1, 0, 0.0, failed="it diverged")]
     assert hopeless([candidate(0), candidate(1)], scores) == {1}
+
+
+@pytest.mark.parametrize(
+    ("path", "grid", "means", "said"),
+    [
+        ("hierarchy.levels.0.count", [1, 2, 4], [0.0, 1.0, 2.0], "count = 4 is the best, and the largest of the grid"),
+        ("hierarchy.levels.0.count", [2, 3, 4], [2.0, 1.0, 0.0], "count = 2 is the best, and the smallest of the grid"),
+        ("control.std", [0.1, 0.2], [0.0, 1.0], "std = 0.2 is the best, and the largest"),
+        ("hierarchy.levels.0.count", [1, 2, 4], [0.0, 3.0, 2.0], ""),
+        ("hierarchy.levels.0.count", [1, 2], [1.0, 0.0], ""),
+        ("training.initialize", ["vq", "random"], [1.0, 0.0], ""),
+        ("observations", [["a"], ["a", "b"]], [0.0, 1.0], ""),
+    ],
+)
+def test_a_best_candidate_at_the_edge_of_the_grid_is_noted(path, grid, means, said):
+    each = [replace(candidate(c), values={path: value}) for c, value in enumerate(grid)]
+    made = choose(each, [score(c, f, mean) for c, mean in enumerate(means) for f in (0, 1)], 2)
+    noted = " ".join(made.notes)
+    assert noted.startswith(said)
+    assert bool(noted) == bool(said)
+    assert ("likelihood does not count skills" in noted) == ("count" in noted)
+    assert noted in markdown(made, as_data(made) | {"folds": 2, "demonstrations": 4, "stop_early": None})
 
 
 def test_different_fixed_errors_are_noted():

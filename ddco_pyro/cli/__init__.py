@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from shutil import get_terminal_size
 from typing import Annotated, Any
 
 import typer
+
+NARROW = get_terminal_size().columns < 60
+"""Whether tables of help would cut the names of options: help is plain text then."""
+BRACKET = "[" if NARROW else "\\["
+"""A bracket in a help text, which tables would take for markup."""
 
 
 def out_file(text: str | os.PathLike[str]) -> Path:

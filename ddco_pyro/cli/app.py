@@ -20,12 +20,13 @@ from typing import Annotated, Any
 
 import typer
 
-from ddco_pyro.cli import demos, fits, runs, starting, study
+from ddco_pyro.cli import NARROW, demos, fits, runs, starting, study
 from ddco_pyro.errors import BadInput, Failed
 
 app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None if NARROW else "rich",
     help="Discovers options in demonstrations: a hierarchy of skills, declared in YAML, fitted by exact inference.",
     epilog="--debug, anywhere on the line, shows the traceback of an error.",
 )
@@ -105,6 +106,10 @@ def _interruptible() -> Iterator[None]:
 
 def _run() -> int:
     """The exit status of the command line."""
+    for number, name in ((1, "stdout"), (2, "stderr")):
+        if getattr(sys, name) is None:  # closed, such as by >&-; the next file would get its number
+            os.dup2(os.open(os.devnull, os.O_RDWR), number)
+            setattr(sys, name, os.fdopen(number, "w", encoding="utf-8"))
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # for characters that the terminal's encoding lacks

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import typer
 
-from ddco_pyro.cli import AllowCode, AllowExternal, RunPath, out_file, out_folder, written
+from ddco_pyro.cli import BRACKET, AllowCode, AllowExternal, RunPath, out_file, out_folder, written
 from ddco_pyro.data.files import Output, check_outputs
 from ddco_pyro.errors import BadInput, command
 
@@ -239,7 +239,7 @@ def segment(
             "--baselines",
             help="Write the labels of k-means, mixtures, hidden Markov models, change points, equal lengths and "
             "gripper changes beside the options; measure the agreement of all with the file's labels "
-            "(pip install 'ddco-pyro\\[segments]').",
+            f"(pip install 'ddco-pyro{BRACKET}segments]').",
         ),
     ] = False,
     gripper: Annotated[
@@ -342,7 +342,9 @@ def export(
         Path | None,
         written(out_folder, "The folder of a LeRobot policy, for lerobot_policy_ddco.", show_default=False),
     ] = None,
-    onnx: Annotated[bool, typer.Option("--onnx", help="Write ONNX too (pip install 'ddco-pyro\\[export]').")] = False,
+    onnx: Annotated[
+        bool, typer.Option("--onnx", help=f"Write ONNX too (pip install 'ddco-pyro{BRACKET}export]').")
+    ] = False,
     allow_code: AllowCode = False,
 ) -> None:
     """Write the controller as files that do not need this library: numpy with a runner, torch.export, ONNX.

@@ -7,7 +7,7 @@ error here therefore counts a fold, not a demonstration, as one observation.
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +19,7 @@ from ddco_pyro.drawing.words import NAT, number, with_error
 from ddco_pyro.evaluation.worth import paired
 from ddco_pyro.metrics import Difference
 from ddco_pyro.selection.folds import Score
-from ddco_pyro.selection.grid import Candidate
+from ddco_pyro.selection.grid import Candidate, point_name
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -82,7 +82,29 @@ class Choice:
     def notes(self) -> list[str]:
         """Caveats about the numbers."""
         stds = [row.candidate.spec.control.std for row in self.rows]
-        return [STD_NOTE] if any(std != stds[0] for std in stds) else []
+        return [*self._rising(), *([STD_NOTE] if any(std != stds[0] for std in stds) else [])]
+
+    def _rising(self) -> Iterator[str]:
+        """Of each number in the grid whose best value is the largest or the smallest: there may be better ones beyond.
+
+        A single option has nothing below.
+        """
+        best = self.best
+        for path, own in best.candidate.values.items() if best else ():
+            values = {row.candidate.values[path] for row in self.rows if _is_number(row.candidate.values[path])}
+            count = path.endswith(".count")
+            if len(values) < 2 or own not in (min(values), max(values)) or (count and own == 1):
+                continue
+            which = "largest" if own == max(values) else "smallest"
+            skills = "; likelihood does not count skills: it also rises where options divide a skill" if count else ""
+            yield (
+                f"{point_name({path: own})} is the best, and the {which} of the grid: the likelihood is still rising "
+                f"there, so extend the grid (selection.grid.{path}){skills}"
+            )
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def choose(candidates: Sequence[Candidate], scores: Sequence[Score], folds: int) -> Choice:
