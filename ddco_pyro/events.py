@@ -15,6 +15,14 @@ class DemonstrationsDone:
 
 
 @dataclass(frozen=True)
+class BaselineSegmented:
+    """One of ``total`` baselines has segmented the demonstrations."""
+
+    baseline: str
+    total: int
+
+
+@dataclass(frozen=True)
 class TrainingBegan:
     """Training of a model begins, with a budget of epochs; None for no limit."""
 
@@ -130,6 +138,7 @@ class CellDone:
 
 Event = (
     DemonstrationsDone
+    | BaselineSegmented
     | TrainingBegan
     | EpochEnded
     | UpdatesDone

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+import yaml
+from bimanual import bimanual
 from hierarchies import SHAPES, make_batch
 from planted import LINEAR, make_trainer, small_spec
 from random_demonstrations import demonstrations
@@ -13,6 +15,9 @@ from sklearn.linear_model import LogisticRegression
 
 import ddco_pyro
 from ddco_pyro.data.controls import ControlPart
+from ddco_pyro.data.inspection import inspect
+from ddco_pyro.data.planted import pick_and_place
+from ddco_pyro.data.starting import starting_spec
 from ddco_pyro.drawing import words
 from ddco_pyro.inference import log_likelihood
 from ddco_pyro.model.batch import Batch
@@ -24,6 +29,7 @@ from ddco_pyro.training.em import Expectation, is_linear
 from ddco_pyro.training.loop import train
 from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.restarts import Trainer
+from ddco_pyro.training.ridge import cross_validated
 
 EVERYTHING = ("levels.", "meta_policy.")
 LEARNED = {"learn": True, "floor": 0.01}
@@ -393,3 +399,33 @@ def test_tuning_demonstrations_decide_nothing_before_the_last_stage():
         assert all(end["rising"] == 0 for end in restart.progress.ended[:-1])  # EM has converged
     without_tuning = [[{**row, "tune": 0} for row in history] for history in histories]
     assert without_tuning[0] == without_tuning[1] == without_tuning[2]
+
+
+def test_ridges_are_raised_where_demonstrations_are_few_for_their_observations(tmp_path):
+    """As ``init`` writes it, a fit to two arms is far better held out; where demonstrations are many, nothing changes.
+
+    By the spec's own ridge the same fit falls apart, and says so.
+    """
+
+    def fitted(demos, *overrides):
+        path = tmp_path / f"{len(demos)}.hdf5"
+        demos.write(path)
+        spec = parse_spec(yaml.safe_load(starting_spec(inspect(path), path)))
+        return ddco_pyro.fit(
+            with_overrides(spec, {"compare_with": [], "training.epochs": 16, **dict(overrides)})
+        ).metrics
+
+    fallen = fitted(bimanual(20), ("training.optimizer.ridge.cross_validated", False))
+    held, many = fitted(bimanual(20)), fitted(pick_and_place(30))
+    assert fallen.training.raised_ridge is many.training.raised_ridge is None
+    assert words.verdict(fallen).startswith("DDCO fell apart")
+    assert held.training.raised_ridge >= 30
+    assert f"ridge {held.training.raised_ridge:g}" in words.effort(held.training)
+    assert held.log_likelihood_per_step.valid > fallen.log_likelihood_per_step.valid + 50
+
+
+@pytest.mark.parametrize(("number", "parts", "ridge"), [(1, None, 2.0), (6, None, 0.0), (6, ACTIONS[:1], 2.0)])
+def test_a_ridge_stays_where_nothing_can_be_left_out(number, parts, ridge):
+    """Of a single demonstration, without a ridge, and where no control is continuous."""
+    model, batch = linear((2,), parts), batch_for(parts)
+    assert cross_validated(model, batch.select(torch.arange(number)), ridge, 0) == ridge

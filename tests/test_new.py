@@ -52,6 +52,7 @@ def test_one_command_makes_what_four_make(file: Path, tmp_path: Path) -> None:
     assert ended.status == 0, ended.err
     said = [line.split()[2] for line in ended.out.splitlines() if line.startswith("$ ddco-pyro ")]
     assert said == ["inspect", "fit", "segment"]  # the spec is there
+    assert not re.findall("fit it with|^next: ", ended.out, re.MULTILINE)  # they are done already
     quick(tmp_path / "four", file)
     run = tmp_path / "four" / "run"
     assert call("fit", tmp_path / "four" / "spec.yaml", "--out", run).status == 0

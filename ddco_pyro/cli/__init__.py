@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from shutil import get_terminal_size
 from typing import Annotated, Any
@@ -13,6 +16,24 @@ NARROW = get_terminal_size().columns < 60
 """Whether tables of help would cut the names of options: help is plain text then."""
 BRACKET = "[" if NARROW else "\\["
 """A bracket in a help text, which tables would take for markup."""
+
+
+_goes_on: ContextVar[bool] = ContextVar("goes_on", default=False)
+
+
+@contextmanager
+def going_on() -> Iterator[None]:
+    """Inside, a command that calls others goes on itself: they do not say what to do next."""
+    token = _goes_on.set(True)
+    try:
+        yield
+    finally:
+        _goes_on.reset(token)
+
+
+def hint(text: str) -> str:
+    """What to do next, in words; empty where that is done anyway (:func:`going_on`)."""
+    return "" if _goes_on.get() else text
 
 
 def out_file(text: str | os.PathLike[str]) -> Path:

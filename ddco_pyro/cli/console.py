@@ -18,6 +18,7 @@ from ddco_pyro.data.hdf5 import printable
 from ddco_pyro.drawing import words
 from ddco_pyro.drawing.page import Table
 from ddco_pyro.events import (
+    BaselineSegmented,
     CandidateGivenUp,
     CellDone,
     DemonstrationsDone,
@@ -92,6 +93,8 @@ class Progress:
         match event:
             case DemonstrationsDone(done, total):
                 self._advance(f"{self._what}", total, done)
+            case BaselineSegmented(baseline, total):
+                self._advance("segmenting by baselines", total, note=baseline)
             case TrainingBegan(model, epochs):
                 self._begin(f"training {model}", epochs)
             case EpochEnded():

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from ddco_pyro.cli import AllowCode, AllowExternal, Overrides, SpecPath, out_file, written
+from ddco_pyro.cli import AllowCode, AllowExternal, Overrides, SpecPath, hint, out_file, written
 from ddco_pyro.data.files import Output, check_outputs, write_text
 from ddco_pyro.errors import BadInput, command
 from ddco_pyro.spec import SpecError, load_spec
@@ -105,7 +105,8 @@ def init(
     refuse_foreign(file)
     text = starting_spec(look(file), file).replace("THIS_FILE", quote(str(out)))
     write_text(out, text)
-    print(f"{out}: fit it with: {command('fit', out, '--out', f'runs/{out.stem}')}")
+    fit = command("fit", out, "--out", f"runs/{out.stem}")
+    print(f"{out}{hint(f': fit it with: {fit}')}")
 
 
 def import_(

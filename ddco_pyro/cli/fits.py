@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ddco_pyro.cli import AllowCode, Overrides, RunPath, SpecPath, out_folder, written
+from ddco_pyro.cli import AllowCode, Overrides, RunPath, SpecPath, hint, out_folder, written
 from ddco_pyro.data.files import Output, check_outputs
 from ddco_pyro.errors import BadInput, Failed, command
 from ddco_pyro.events import Event
@@ -180,9 +180,10 @@ def _fit_and_report(
         every = "; ".join(", ".join(names) for names in fitted.named.values())
         print(f"names: {folder / 'names.yaml'}: {every}")
     print(f"report: {write_report(fitted, fitted.demonstrations)}")
-    if loaded.hierarchy and loaded.demonstrations.path:
-        file = loaded.demonstrations.path
-        print(f"next: {command('segment', folder, file, '--html', 'segments.html', *_allowed(loaded))}")
+    file = loaded.demonstrations.path
+    segment = command("segment", folder, file or "", "--html", "segments.html", *_allowed(loaded))
+    if loaded.hierarchy and file and (said := hint(f"next: {segment}")):
+        print(said)
 
 
 def _held_out(fitted: Fit) -> dict[str, float]:

@@ -303,7 +303,7 @@ def segment(
         segmented = segments(fit, source, progress, intervals="--html" in outputs)
         segmented = replace(segmented, frequency=fps or segmented.frequency)
         if baselines:
-            segmented = beside_baselines(segmented, fit, source, gripper)
+            segmented = beside_baselines(segmented, fit, source, gripper, progress)
             for name, found in level_agreements(segmented).items():
                 console.show(agreement_table(found.scores, f"level {name}: agreement with the label {found.labels}"))
             if missing:

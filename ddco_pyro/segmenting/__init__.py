@@ -16,7 +16,7 @@ from ddco_pyro.data.memory import Extent, refuse_too_much
 from ddco_pyro.data.sources import Recording, Source, open_source
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.inferred import Inferred, started
-from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
+from ddco_pyro.events import BaselineSegmented, DemonstrationsDone, OnEvent, ignore
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.segmenting import baselines
 from ddco_pyro.spec import LevelSpec
@@ -147,7 +147,9 @@ def segments(fit: Fit, source: Source, on_event: OnEvent = ignore, intervals: bo
     return Segmented(tuple(segmented), counts, source.frequency, truth, fit.names)
 
 
-def beside_baselines(segmented: Segmented, fit: Fit, source: Source, gripper: int = -1) -> Segmented:
+def beside_baselines(
+    segmented: Segmented, fit: Fit, source: Source, gripper: int = -1, on_event: OnEvent = ignore
+) -> Segmented:
     """The same segments with the labels of every baseline, fitted to the run's training demonstrations.
 
     :param gripper: the control dimension whose changes divide demonstrations in the baseline ``gripper``.
@@ -155,11 +157,12 @@ def beside_baselines(segmented: Segmented, fit: Fit, source: Source, gripper: in
     """
     train = parts(fit.spec, fit.demonstrations)["train"]
     demos = Demonstrations(tuple(recorded(segmented, fit, source)))
-    found = {
-        f"{level}_{name}": baselines.segment(name, train, demos, count, fit.spec.seed, fit.spec.observations, gripper)
-        for level, count in segmented.counts.items()
-        for name in baselines.BASELINES
-    }
+    found, total = {}, len(segmented.counts) * len(baselines.BASELINES)
+    for level, count in segmented.counts.items():
+        for name in baselines.BASELINES:
+            seed, observations = fit.spec.seed, fit.spec.observations
+            found[f"{level}_{name}"] = baselines.segment(name, train, demos, count, seed, observations, gripper)
+            on_event(BaselineSegmented(name, total))
     each = (
         replace(demo, baselines={name: kinds[row] + 1 for name, kinds in found.items()})
         for row, demo in enumerate(segmented.segments)
