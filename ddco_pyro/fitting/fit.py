@@ -35,7 +35,7 @@ from ddco_pyro.fitting.run import (
     write_model,
 )
 from ddco_pyro.inference import compile_all
-from ddco_pyro.jobs import LONG, beside, check_jobs, useful_jobs
+from ddco_pyro.jobs import LONG, BackendError, beside, check_jobs, useful_jobs
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec, load_spec, with_overrides
 from ddco_pyro.training.data import demonstrations as read_demonstrations
