@@ -271,7 +271,9 @@ class Use(Record):
     - ``share``: mean of u_t, the share of steps in which the choice is active;
     - ``selected``: Σ v_t, the expected number of selections;
     - ``demonstrations``: the expected number of demonstrations with a selection, Σ_n min(1, Σ_t v_t);
-    - ``duration``: expected steps from a selection to the next, Σ u_t / Σ v_t; None without a selection.
+    - ``duration``: expected steps from a selection to the next, Σ u_t / Σ v_t; None without a selection;
+    - ``segments``: how often the most likely paths go over to the choice; ``steps`` with it; ``length``: the median
+      steps of a segment, None without one.
     """
 
     choice: int
@@ -279,6 +281,9 @@ class Use(Record):
     selected: Finite
     demonstrations: Finite
     duration: Finite | None
+    segments: int
+    steps: int
+    length: Finite | None
 
 
 class Alike(Record):
@@ -387,6 +392,19 @@ class TrainedLabels(Record):
     agreement: Finite
 
 
+class NamedByLabel(Record):
+    """An option and the label that it stands for.
+
+    ``agreement`` is the intersection of their steps over the union, in training demonstrations with these labels.
+    """
+
+    level: str
+    option: AtLeastOne
+    labels: str
+    name: str
+    agreement: Finite
+
+
 class Matched(Record):
     """Measures under a matching of options with labels (:mod:`ddco_pyro.evaluation.agreement`)."""
 
@@ -456,7 +474,9 @@ class Metrics(Record, frozen=False):
     options: LeftOut[list[list[Use]]] = []
     divergences: LeftOut[list[list[Alike]]] = []
     agreement: LeftOut[Agreement | None] = None
+    control_frequency: LeftOut[Finite | None] = None
     trained_labels: LeftOut[TrainedLabels | None] = None
+    named_by_labels: LeftOut[list[NamedByLabel]] = []
     engine_check: Engines
     demonstrations: Counts
     measure: dict[str, Annotated[list[Any], Field(min_length=1)]]

@@ -17,6 +17,7 @@ from ddco_pyro.data.controls import described, notes
 from ddco_pyro.data.hdf5 import printable
 from ddco_pyro.drawing import words
 from ddco_pyro.drawing.page import Table
+from ddco_pyro.errors import command
 from ddco_pyro.events import (
     BaselineSegmented,
     CandidateGivenUp,
@@ -281,6 +282,32 @@ def warnings(fit: Fit) -> None:
         say(f"warning: {what} {advice}")
 
 
+def names(fit: Fit) -> None:
+    """The names in ``names.yaml``, with their agreement with labels, and the command that takes proposed ones."""
+    found = {(one.level, one.option): one for one in fit.metrics.named_by_labels}
+    each = {
+        level: [(name, found.get((level, option))) for option, name in enumerate(own[1:], start=1)]
+        for level, own in fit.names.items()
+    }
+    written = [
+        f"{name} {words.number(one.agreement)}" if one and one.name == name else name
+        for level in fit.named
+        for name, one in each[level]
+    ]
+    if written:
+        say(f"names: {fit.run_folder / 'names.yaml'}: {', '.join(written)}")
+    for level, pairs in each.items():
+        proposed = {name: one for name, one in pairs if one and name == words.option_name(one.option)}
+        if proposed:
+            said = [f"{name} as {one.name} {words.number(one.agreement)}" for name, one in proposed.items()]
+            taken = ",".join(proposed[name].name if name in proposed else name for name, _ in pairs)
+            again = command("name", fit.run_folder, "--level", level, taken)
+            say(f"names proposed, not written: {words.listed(said)}; to take them: {again}")
+    if found:
+        labels = words.listed(dict.fromkeys(f"labels/{one.labels}" for one in found.values()))
+        say(f"Behind a name: the steps that its option and its label in {labels} share, of the steps of either.")
+
+
 def successes(metrics: Metrics) -> None:
     """The measures of each method's rollouts, and what the hierarchy is worth by them."""
     from ddco_pyro.report.rollouts import measures_table
@@ -333,6 +360,10 @@ def _notes(field: Field) -> str:
         notes.append(f"{field.nan} NaN, {field.infinite} infinite")
     if field.huge:
         notes.append(f"{field.huge} beyond ±{LARGEST:g}")
+    if field.names:
+        notes.append(", ".join(f"{value}: {name}" for value, name in enumerate(field.names)))
+    if field.unknown:
+        notes.append(f"{field.unknown} steps unknown (-1)")
     constant, rounding = field.constant, field.rounding
     if constant + rounding and len(constant + rounding) == len(field.minimum):
         notes.append("constant up to rounding" if rounding else "constant")

@@ -176,9 +176,7 @@ def _fit_and_report(
     console.log_likelihoods(fitted)
     console.seeds(fitted.metrics)
     console.warnings(fitted)
-    if fitted.named:
-        every = "; ".join(", ".join(names) for names in fitted.named.values())
-        print(f"names: {folder / 'names.yaml'}: {every}")
+    console.names(fitted)
     print(f"report: {write_report(fitted, fitted.demonstrations)}")
     file = loaded.demonstrations.path
     segment = command("segment", folder, file or "", "--html", "segments.html", *_allowed(loaded))
@@ -276,6 +274,7 @@ def merge(
     console.log_likelihoods(fitted)
     console.merged(pair, before, fitted)
     console.warnings(fitted)
+    console.names(fitted)
     print(f"report: {write_report(fitted, fitted.demonstrations)}")
     print(f"next: {command('compare', run, folder, *_allowed(fitted.spec))}")
 

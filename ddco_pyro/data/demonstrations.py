@@ -25,7 +25,7 @@ from ddco_pyro.data.memory import PROGRAM, Extent, refuse_too_much
 from ddco_pyro.data.pictures import Observed, Pictures
 from ddco_pyro.data.sources import refuse_foreign
 from ddco_pyro.data.sources.recording import Column, Recording, of_array
-from ddco_pyro.data.sources.robomimic import Robomimic, open_robomimic, robomimic_file, write_recording
+from ddco_pyro.data.sources.robomimic import Robomimic, frequency_of, open_robomimic, robomimic_file, write_recording
 from ddco_pyro.errors import check_whole
 
 
@@ -218,6 +218,11 @@ class Demonstrations(Sequence[Demonstration]):
     def control_size(self) -> int:
         """A, the number of control dimensions."""
         return int(self.demonstrations[0].actions.shape[1])
+
+    @property
+    def frequency(self) -> float | None:
+        """Control steps per second, Hz; None if unknown."""
+        return frequency_of(self.attributes)
 
     def select(self, names: Iterable[str]) -> Demonstrations:
         """The demonstrations of these names, in this order, without masks.

@@ -45,6 +45,7 @@ from ddco_pyro.data.hdf5 import DemonstrationsError, outside_files
 from ddco_pyro.data.pictures import MOVED
 from ddco_pyro.data.sources import Column, Format, Source, open_source
 from ddco_pyro.data.sources.metadata import rate
+from ddco_pyro.data.sources.recording import UNKNOWN, label_names
 from ddco_pyro.spec import ControlSpec
 
 
@@ -63,6 +64,8 @@ class Field:
     :param still: whether the array is constant within every demonstration.
     :param demonstrations: number of demonstrations that have the array.
     :param video: whether the array is in video files, which are not decoded.
+    :param unknown: number of steps of labels without ground truth.
+    :param names: of labels 0, 1, ..., where the file names them.
     """
 
     place: str
@@ -78,6 +81,8 @@ class Field:
     still: bool = True
     demonstrations: int = 0
     video: bool = False
+    unknown: int = 0
+    names: list[str] = field(default_factory=list)
 
     @property
     def key(self) -> str:
@@ -143,6 +148,8 @@ class Field:
             self.huge += int((bad & np.isfinite(values)).sum())
             self.first = self.first or (name, step + int(bad.any(1).argmax()))
             self.affected += [name] if name not in self.affected[-1:] else []
+        if self.place.startswith("labels/"):
+            self.unknown += int((values == UNKNOWN).sum())
         self.still = self.still and bool((values == first).all())
 
     def as_json(self) -> dict[str, Any]:
@@ -366,6 +373,7 @@ class _Inspector:
             for place in (place for place in fields if place not in there):
                 self._problem("missing", f"{name}: {place} is missing", place)
         masks = {mask: tuple(name for name in members if name not in exclude) for mask, members in source.masks.items()}
+        self._name_labels()
         dimensions = self.control.dimensions()
         varying = [dimension.number for dimension in dimensions if not dimension.constant]
         found = self.problems.values()
@@ -451,6 +459,14 @@ class _Inspector:
                     f"{few(others)}: recorded at another rate than most; by {place} a step takes "
                     f"{periods[others[0]]:.4g}, and {usual:.4g} in the median demonstration: exclude or resample"
                 )
+
+    def _name_labels(self) -> None:
+        try:
+            for name, names in label_names(self.source.attributes).items():
+                if array := self.fields.get(f"labels/{name}"):
+                    array.names = names
+        except DemonstrationsError as error:
+            self._problem("names", str(error), "labels")
 
     def _read(self, name: str) -> set[str]:
         """Read a demonstration; the places of its arrays."""

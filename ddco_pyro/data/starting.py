@@ -15,6 +15,7 @@ from ddco_pyro.data.checks import LEAST, check_division
 from ddco_pyro.data.controls import all_constant
 from ddco_pyro.data.hdf5 import DemonstrationsError, natural, printable
 from ddco_pyro.data.inspection import Field, Inspection, inspect
+from ddco_pyro.data.sources.recording import BOUNDARY
 from ddco_pyro.errors import command
 from ddco_pyro.spec import parse_spec
 from ddco_pyro.spec.yaml import read_yaml
@@ -106,7 +107,7 @@ def _filled(
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    environment.filters |= {"yaml": _text, "seen": _seen}
+    environment.filters |= {"yaml": _text, "seen": _seen, "printable": printable}
     lengths, masks = list(inspection.lengths.values()), list(inspection.masks)
     vectors, images = ([field for field in used if field.image is image] for image in (False, True))
     recipe = VECTORS if vectors else PICTURES
@@ -121,7 +122,8 @@ def _filled(
         masks=[name for name in ("train", "valid") if name in masks],
         other_masks=[name for name in masks if name not in ("train", "valid")],
         valid_fraction=f"{_valid_fraction(len(lengths)):.2g}",
-        labels=[field.key for field in inspection.labels if not _unusable(inspection, field)],
+        labels=_fullest_first([field for field in inspection.labels if not _unusable(inspection, field)]),
+        steps=sum(lengths),
         unusable_labels=unusable_labels,
         vectors=vectors,
         versions=inspection.versions,
@@ -136,6 +138,13 @@ def _filled(
         few=em and len(lengths) < FEW and not {"train", "valid"} & set(masks),
         epochs=max(_epochs(np.array(lengths), batch, recipe), EXACT_EPOCHS if em else 0),
     )
+
+
+def _fullest_first(labels: Sequence[Field]) -> list[Field]:
+    """Labels with the fewest unknown steps first; last are constant ones, and those that ``segment`` wrote."""
+    keys = {field.key for field in labels}
+    written = {field.key for field in labels if field.key.removesuffix(BOUNDARY) + BOUNDARY in keys}
+    return sorted(labels, key=lambda field: (field.key in written, bool(field.constant), field.unknown))
 
 
 def _text(value: str) -> str:

@@ -19,7 +19,7 @@ from ddco_pyro.data.pictures import Observed
 from ddco_pyro.drawing.shown import frames, jpeg, projection
 
 MOST_NUMBERS = 12
-"""Observed numbers that follow the cursor."""
+"""Numbers that follow the cursor; more where the position and the controls alone are more."""
 
 MOST_BYTES = 1_000_000
 """Bytes of observed numbers on a page, about; longer demonstrations are thinned out in time."""
@@ -35,12 +35,12 @@ PICTURE_HEIGHT = 96
 class Lane:
     """A row of every demonstration: a level of options, or labels.
 
-    :param names: of each choice of a level, control first; empty for labels.
+    :param names: of each choice of a level, control first, or of each label.
     :param colours: of each choice; empty for labels.
     """
 
     name: str
-    names: Sequence[str] = ()
+    names: Sequence[str] | Mapping[int, str]
     colours: Sequence[str] = ()
 
 
@@ -160,12 +160,15 @@ def following(
 
 
 def _numbers(demo: Demonstration, position: str | None) -> dict[str, np.ndarray]:
-    """The observed numbers and controls over time by name, the position first, at most :data:`MOST_NUMBERS`."""
+    """Numbers over time by name: the position, all controls, then observations, :data:`MOST_NUMBERS` in all."""
     keys = sorted(demo.observations, key=lambda key: key != position)
     vectors = {key: np.asarray(demo.observations[key]) for key in keys if len(demo.observations[key].shape) == 2}
+    first = {key: array for key, array in vectors.items() if key == position}
+    arrays = {**first, "control": demo.actions.reshape(len(demo), -1), **vectors}
     named = {
         f"{key}[{place}]" if array.shape[1] > 1 else key: array[:, place].astype(float)
-        for key, array in {**vectors, "control": demo.actions.reshape(len(demo), -1)}.items()
+        for key, array in arrays.items()
         for place in range(array.shape[1])
     }
-    return dict(list(named.items())[:MOST_NUMBERS])
+    always = sum(array.shape[1] for array in (*first.values(), arrays["control"]))
+    return dict(list(named.items())[: max(always, MOST_NUMBERS)])

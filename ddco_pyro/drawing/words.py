@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ddco_pyro.data.sources.recording import UNKNOWN
 from ddco_pyro.metrics import (
     Against,
     Counts,
@@ -97,6 +98,19 @@ def name_in_level(option: int, level: str, names: Sequence[str] = ()) -> str:
     return f"{level} {option}" if option and name == option_name(option) else name
 
 
+def label_name(label: str, value: int, names: Sequence[str] = (), level: str = "option") -> str:
+    """``grasp`` where the file names label 2 of the labels ``phase``, else ``phase 2``; ``unknown`` for −1.
+
+    Labels that are called as a level's options are are ``label 2``.
+
+    :param names: of labels 0, 1, ...
+    """
+    if value == UNKNOWN:
+        return "unknown"
+    named = names[value].strip() if 0 <= value < len(names) else ""
+    return named or f"{'label' if label in (level, 'option') else label} {value}"
+
+
 def choice_names(count: int, named: Sequence[str] = ()) -> tuple[str, ...]:
     """The name of each choice of a level with ``count`` options, control first.
 
@@ -127,6 +141,12 @@ def percent(value: float | None, digits: int = 0) -> str:
 def interval(value: Sequence[float] | None, scale: float = 1.0, digits: int = 2) -> str:
     """``low to high``."""
     return "–" if value is None else f"{number(scale * value[0], digits)} to {number(scale * value[1], digits)}"
+
+
+def duration(frequency: float | None, *steps: float) -> str:
+    """``61 steps``, or ``8 to 29 steps``, with seconds where the frequency (Hz) is known."""
+    said = " to ".join(f"{count:g}" for count in steps) + (" step" if steps[-1] == 1 else " steps")
+    return f"{said}, {' to '.join(f'{count / frequency:.3g}' for count in steps)} s" if frequency else said
 
 
 def p_value(value: float) -> str:

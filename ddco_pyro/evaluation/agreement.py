@@ -15,10 +15,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ddco_pyro.data.sources.recording import UNKNOWN
 from ddco_pyro.metrics import Confusion, Matched, Scores
-
-UNKNOWN = -1
-"""The label of a step without ground truth."""
 
 TOLERANCES = (1, 3, 5)
 """Tolerances of boundary F1, in steps."""

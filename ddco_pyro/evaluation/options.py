@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ddco_pyro.acting.monitor import run_lengths
 from ddco_pyro.events import OnEvent, OptionsCompared, ignore
 from ddco_pyro.inference import Posterior
 from ddco_pyro.metrics import Alike, Use
@@ -17,22 +18,37 @@ from ddco_pyro.model.outputs import CallerOutputs, Outputs
 from ddco_pyro.spec import TrainingSpec
 
 
-def option_use(posterior: Posterior) -> list[list[Use]]:
-    """The use of every choice of each level, lowest first."""
+def option_use(posterior: Posterior, paths: Iterable[Sequence[np.ndarray]]) -> list[list[Use]]:
+    """The use of every choice of each level, lowest first.
+
+    :param paths: the most likely choices [T] of each demonstration, for each level.
+    """
     uses = []
-    for u, v in zip(posterior.u, posterior.v, strict=True):
+    for u, v, path in zip(posterior.u, posterior.v, paths, strict=True):
         active, selected = u.sum((0, 1)).numpy(), v.sum(1).numpy()
-        total = float(active.sum())
-        uses.append([_use(choice, float(active[choice]), selected[:, choice], total) for choice in range(len(active))])
+        total, lengths = float(active.sum()), run_lengths(path, len(active) - 1)
+        choices = range(len(active))
+        uses.append(
+            [_use(choice, float(active[choice]), selected[:, choice], total, lengths[choice]) for choice in choices]
+        )
     return uses
 
 
-def _use(choice: int, active: float, selected: np.ndarray, total: float) -> Use:
+def _use(choice: int, active: float, selected: np.ndarray, total: float, lengths: np.ndarray) -> Use:
     """The use of a choice that is ``active`` in so many of ``total`` steps; ``selected`` is by demonstration."""
     often = float(selected.sum())
     duration = active / often if often > 1e-6 else None
     within = float(selected.clip(max=1.0).sum())
-    return Use(choice=choice, share=active / total, selected=often, demonstrations=within, duration=duration)
+    return Use(
+        choice=choice,
+        share=active / total,
+        selected=often,
+        demonstrations=within,
+        duration=duration,
+        segments=len(lengths),
+        steps=int(lengths.sum()),
+        length=float(np.median(lengths)) if len(lengths) else None,
+    )
 
 
 MANY = 20

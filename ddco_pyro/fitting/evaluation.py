@@ -174,6 +174,7 @@ def evaluate(
         options=options,
         divergences=alike,
         agreement=_agreement(labels, ours, parts) if labels else None,
+        control_frequency=demos.frequency,
         trained_labels=_trained_labels(fitted, demos),
         **about,
     )
@@ -192,15 +193,18 @@ def _worth(fit: Fit, values: Mapping[str, np.ndarray], ours: _Part, valid: Demon
 def _options(fit: Fit, demos: Demonstrations, on_event: OnEvent) -> tuple[list[list[Use]], list[list[Alike]]]:
     """The use and the divergences of options."""
     sums: list[Posterior] = []
+    paths: list[list[np.ndarray]] = [[] for _ in fit.names]
 
     def pieces() -> Iterator[tuple[Outputs, Posterior]]:
         for piece in infer(fit.hierarchy, demos):
+            for path, level in zip(paths, piece.path.choices, strict=True):
+                path += list(level.numpy())
             sums.append(Posterior(*(tuple(h.sum(1, keepdim=True) for h in kind) for kind in piece.posterior)))
             yield piece.outputs, piece.posterior
 
     alike = divergences(pieces(), on_event, len(demos))
     whole = Posterior(*(tuple(map(torch.cat, zip(*kind, strict=True))) for kind in zip(*sums, strict=True)))
-    return option_use(whole), alike
+    return option_use(whole, paths), alike
 
 
 def _worst_first(

@@ -19,11 +19,12 @@ from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import leftovers
 from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.memory import allowed
+from ddco_pyro.data.sources.recording import label_names
 from ddco_pyro.events import Event, OnEvent, TrainingBegan, ignore
 from ddco_pyro.fitting.digest import record, recorded
 from ddco_pyro.fitting.evaluation import evaluate
 from ddco_pyro.fitting.fitted import Fit, left_out, load
-from ddco_pyro.fitting.names import label_names, proposed, read_names, write_names
+from ddco_pyro.fitting.names import accepted, matched, read_names, write_names
 from ddco_pyro.fitting.run import (
     Clock,
     claim,
@@ -114,7 +115,7 @@ def fit(
         if demos is not None:
             refuse_unfit(spec, demos)
             used(spec, demos)
-            label_names(demos)
+            label_names(demos.attributes)
     with ExitStack() as stack:  # all checks are done: from here on files are written
         if folder is not None:
             stack.enter_context(claimed(folder, spec, resume))
@@ -214,10 +215,13 @@ def _fit_model(
             versions=_versions(),
         )
         named = read_names(folder, spec) if folder else None
-        if named is None and spec.hierarchy and name is None:
-            named = proposed(spec, split["train"], fitted.segment(split["train"]), metrics.trained_labels)
-            if folder and named:
-                write_names(folder, named)
+        if spec.hierarchy and name is None:
+            segments = fitted.segment(split["train"])
+            metrics.named_by_labels = matched(spec, split["train"], segments, metrics.trained_labels)
+            if named is None:
+                named = accepted(spec, metrics.named_by_labels)
+                if folder and named:
+                    write_names(folder, named)
     metrics.seconds = clock.end()
     if folder:
         metrics.write(folder)

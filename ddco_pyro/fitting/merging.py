@@ -11,13 +11,12 @@ from typing import Any
 import numpy as np
 
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.data.sources.recording import LABEL_NAMES
+from ddco_pyro.data.sources.recording import LABEL_NAMES, label_names
 from ddco_pyro.data.tensors import digest_of
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import OnEvent, ignore
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.fitted import Fit
-from ddco_pyro.fitting.names import label_names
 from ddco_pyro.spec import Spec, with_overrides
 from ddco_pyro.spec.base import nearest
 from ddco_pyro.training.checkpoint import copy_of
@@ -60,7 +59,7 @@ def merge(run: Fit, pair: Pair, out: str | Path | None = None, on_event: OnEvent
     if out is not None:
         _check_same(Path(out), json.loads(json.dumps(origin)))
     demos = merged_labels(run, pair)
-    names = label_names(demos) | {LABELS: _merged_names(run, pair)}
+    names = label_names(demos.attributes) | {LABELS: _merged_names(run, pair)}
     about = {LABELS: json.dumps(origin), LABEL_NAMES: json.dumps(names)}
     demos = replace(demos, attributes={**demos.attributes, **about})
     return fit(changed, demos, out=out, on_event=on_event, jobs=jobs)

@@ -1,4 +1,4 @@
-"""Names of options: ``names.yaml`` in a run folder, and the names that labels propose."""
+"""Names of options: ``names.yaml`` in a run folder, and the names of the labels that options stand for."""
 
 from __future__ import annotations
 
@@ -7,20 +7,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import TypeAdapter, ValidationError
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
-from ddco_pyro.data.hdf5 import DemonstrationsError
-from ddco_pyro.data.sources.recording import LABEL_NAMES
-from ddco_pyro.drawing.words import choice_names
+from ddco_pyro.data.sources.recording import label_names
+from ddco_pyro.drawing.words import choice_names, label_name, option_name
 from ddco_pyro.errors import BadInput, nearest
 from ddco_pyro.evaluation.agreement import confusion
-from ddco_pyro.metrics import TrainedLabels
+from ddco_pyro.metrics import Confusion, NamedByLabel, TrainedLabels
 from ddco_pyro.spec import Spec
 from ddco_pyro.spec.yaml import dump_yaml, read_yaml
 
 FILE = "names.yaml"
+
+AGREED = 0.6
+"""The agreement with a label from which on its option has its name; below, the name is proposed."""
 
 Named = dict[str, tuple[str, ...]]
 """The names of options 1 to k, by level."""
@@ -76,66 +77,55 @@ def write_names(folder: Path, named: Named) -> None:
     write_text(folder / FILE, text + dump_yaml({level: list(names) for level, names in named.items()}))
 
 
-def label_names(demos: Demonstrations) -> dict[str, list[str]]:
-    """The names of labels 0, 1, ... that a file of demonstrations gives (:data:`LABEL_NAMES`), by name of labels.
-
-    :raises DemonstrationsError: the attribute is something else.
-    """
-    try:
-        return TypeAdapter(dict[str, list[str]]).validate_json(str(demos.attributes.get(LABEL_NAMES, "{}")))
-    except ValidationError:
-        raise DemonstrationsError(
-            f'attribute {LABEL_NAMES!r}: is no JSON such as {{"phase": ["reach", "grasp"]}}; correct or remove it'
-        ) from None
-
-
-def proposed(
+def matched(
     spec: Spec, train: Demonstrations, segments: Sequence[Sequence[np.ndarray]], trained: TrainedLabels | None = None
-) -> Named:
-    """Names of options from the labels of the demonstrations that they were trained with.
+) -> list[NamedByLabel]:
+    """The options that stand for labels of the demonstrations that they were trained with.
 
-    An option that stands for a label of ``training.labels`` has that label's name. Elsewhere options are matched with
-    labels so that as many steps as possible agree (Hungarian assignment). An option gets the name of its label where
-    more than half of its labelled steps have that label, and more than half of the label's steps are in the option.
-    Other options stay without a name, and so does a level without any match.
+    An option of a level with ``training.labels`` stands for its own label. Elsewhere options are matched with labels
+    so that as many steps as possible agree (Hungarian assignment). An option then stands for its label where more than
+    half of its labelled steps have that label, and more than half of the label's steps are in the option.
 
     :param segments: the most likely choices of each level, of each demonstration [T].
     """
     assert spec.hierarchy is not None  # or there are no segments
-    levels, known = spec.hierarchy.levels, label_names(train)
+    levels, known = spec.hierarchy.levels, label_names(train.attributes)
     labels = dict(zip((level.name for level in levels), spec.demonstrations.labels_by_level(len(levels)), strict=False))
-    named: Named = {}
+    found: list[NamedByLabel] = []
     for level, choices in zip(levels, segments, strict=True):
-        if trained and trained.level == level.name:
-            label, matched = trained.labels, list(enumerate(trained.values, start=1))
-        elif (label := labels.get(level.name, "")) and all(label in demo.labels for demo in train):
-            matched = _clear_matches(choices, train, label)
-        else:
+        own = trained if trained and trained.level == level.name else None
+        label = own.labels if own else labels.get(level.name, "")
+        labelled = [row for row, demo in enumerate(train) if label in demo.labels]
+        if not labelled or not (own or len(labelled) == len(train)):
             continue
-        names = list(choice_names(level.count))
-        for option, value in matched:
-            name = _label_name(label, value, known.get(label), level.name).strip()
-            if name and name not in names:
-                names[option] = name
-        if tuple(names) != choice_names(level.count):
-            named[level.name] = tuple(names[1:])
-    return named
-
-
-def _clear_matches(choices: Sequence[np.ndarray], train: Demonstrations, label: str) -> list[tuple[int, int]]:
-    """Options with their labels, where each is in most of the other's steps."""
-    table = confusion(choices, [demo.labels[label] for demo in train])
-    steps, found = np.array(table.steps), []
-    for place, (option, value) in enumerate(zip(table.options, table.matched, strict=True)):
-        if option and value is not None:
-            row = table.labels.index(value)
-            if 2 * steps[row, place] > max(steps[row].sum(), steps[:, place].sum()):
-                found.append((option, value))
+        table = confusion([choices[row] for row in labelled], [train[row].labels[label] for row in labelled])
+        pairs = zip(table.options, table.matched, strict=True)
+        for option, value in enumerate(own.values, start=1) if own else pairs:
+            if not option or value is None:
+                continue
+            name = label_name(label, value, known.get(label, ()), level.name)
+            both, apart = _shared(table, option, value)
+            alone = name in (option_name(0), *(one.name for one in found if one.level == level.name))
+            if not alone and (own or both > max(apart)):
+                share = both / (both + sum(apart)) if both else 0.0
+                found.append(NamedByLabel(level=level.name, option=option, labels=label, name=name, agreement=share))
     return found
 
 
-def _label_name(label: str, value: int, known: list[str] | None, level: str) -> str:
-    """``grasp`` where the file names the label, else ``phase 2``; empty where it names others only."""
-    if known is not None:
-        return known[value] if 0 <= value < len(known) else ""
-    return f"{'label' if label in (level, 'option') else label} {value}"
+def _shared(table: Confusion, option: int, value: int) -> tuple[int, tuple[int, int]]:
+    """The steps with both an option and a label, and the further ones of the option and of the label."""
+    steps = np.array(table.steps)
+    of_option = steps[:, [one == option for one in table.options]]
+    of_label = steps[[one == value for one in table.labels]]
+    both = int(of_label[:, [one == option for one in table.options]].sum())
+    return both, (int(of_option.sum()) - both, int(of_label.sum()) - both)
+
+
+def accepted(spec: Spec, found: Sequence[NamedByLabel]) -> Named:
+    """The names with an agreement of :data:`AGREED` or more; levels without any are left out."""
+    named: Named = {}
+    for level in spec.hierarchy.levels if spec.hierarchy else ():
+        own = {one.option: one.name for one in found if one.level == level.name and one.agreement >= AGREED}
+        if own:
+            named[level.name] = tuple(own.get(option, option_name(option)) for option in range(1, 1 + level.count))
+    return named

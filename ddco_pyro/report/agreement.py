@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from ddco_pyro.drawing.page import Block, Section, Table, Text, note
-from ddco_pyro.drawing.words import option_name, percent
+from ddco_pyro.drawing.words import label_name, option_name, percent
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Confusion
 from ddco_pyro.report.options import quoted
 from ddco_pyro.segmenting.agreement import EXPLAINED, agreement_table
 
 
-def section(fit: Fit) -> Section | None:
-    """The measures of each level, and where the steps of each label lie; None where the spec names no labels."""
+def section(fit: Fit, known: Mapping[str, Sequence[str]]) -> Section | None:
+    """The measures of each level, and where the steps of each label lie; None where the spec names no labels.
+
+    :param known: the names of labels 0, 1, ... by name of labels.
+    """
     record = fit.metrics.agreement
     if not record or fit.spec.hierarchy is None:
         return None
@@ -28,8 +31,9 @@ def section(fit: Fit) -> Section | None:
     labels = quoted(list(dict.fromkeys(record.labels)))
     blocks: list[Block] = [Text(f"Options and the ground-truth {labels}."), agreement_table(scores), note(EXPLAINED)]
     for level, label, own in zip(names, record.labels, record.confusion, strict=True):
+        names_of_labels = [label_name(label, value, known.get(label, ()), level) for value in own.labels]
         title = f"Where each label’s steps lie: level “{level}”, label “{label}”"
-        blocks += [Text(title, "heading"), confusion_table(own, fit.names[level])]
+        blocks += [Text(title, "heading"), confusion_table(own, fit.names[level], names_of_labels)]
     part = "training" if record.valid is None else "held-out"
     blocks.append(
         note(
@@ -41,15 +45,16 @@ def section(fit: Fit) -> Section | None:
     return Section("agreement", "Agreement with ground truth", blocks)
 
 
-def confusion_table(record: Confusion, names: Sequence[str] = ()) -> Table:
+def confusion_table(record: Confusion, names: Sequence[str], labels: Sequence[str]) -> Table:
     """Share of each label's steps in each option, and the label of each option.
 
     :param names: of each choice, control first.
+    :param labels: the names of the table's labels.
     """
     rows = [
-        [str(label), str(sum(steps)), *(percent(count / sum(steps)) if count else "" for count in steps)]
-        for label, steps in zip(record.labels, record.steps, strict=True)
+        [label, str(sum(steps)), *(percent(count / sum(steps)) if count else "" for count in steps)]
+        for label, steps in zip(labels, record.steps, strict=True)
     ]
-    matched = ["–" if label is None else str(label) for label in record.matched]
+    matched = ["–" if value is None else labels[record.labels.index(value)] for value in record.matched]
     options = [option_name(option, names) for option in record.options]
     return Table(["Label", "Steps", *options], [*rows, ["stands for", "", *matched]])

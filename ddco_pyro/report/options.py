@@ -14,12 +14,14 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import MaxNLocator
 
 from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.sources.recording import label_names
 from ddco_pyro.drawing.colours import add_legend, option_colour
 from ddco_pyro.drawing.figures import FAINT, GRID, blank, hide_frame, save
 from ddco_pyro.drawing.page import Block, Cell, Picture, Section, Table, Text, note
 from ddco_pyro.drawing.timeline import Timelines
-from ddco_pyro.drawing.words import number, numbered_name, percent
+from ddco_pyro.drawing.words import duration, label_name, number, numbered_name, percent
 from ddco_pyro.fitting.fitted import Fit
+from ddco_pyro.metrics import NamedByLabel
 from ddco_pyro.report import trajectories
 from ddco_pyro.report.activity import Activity, Bins, LevelActivity, bins
 from ddco_pyro.segmenting import LevelLabels, Segmented, Segments
@@ -36,6 +38,9 @@ LEAST_SHARE = 0.01
 
 MOST_STEPS = 1_000_000
 """Steps of all levels in time lines, about; ``ddco-pyro segment --html`` makes a page of more."""
+
+CHARACTER = 0.016
+"""The share of a posterior's width that a character of a label takes, about."""
 
 LABEL_SHADES = ("#ffffff", "#d4d4d4")
 """Shades of ground-truth segments, in turn: colours belong to options."""
@@ -54,38 +59,41 @@ def section(fit: Fit, demos: Demonstrations, activity: Activity) -> Section:
         trajectories.picture(fit, demos, activity),
         _timing_picture(fit, activity),
     )
-    used = note(
-        "Over all demonstrations. Expected steps: from one selection of the option to the next selection of any option."
-    )
+    used = note("On the most likely path of all demonstrations. The same option chosen anew stays one segment.")
     blocks: list[Block] = [picture for picture in pictures if picture is not None]
     if len(fit.names) > 1:
         named = " Legends give the names of the highest level first." if fit.named else ""
         apart = f"Each level numbers its own options: equal colours in two levels mean nothing.{named}"
         blocks.insert(0, Text(apart))
     blocks.append(Text("Use of the options", "heading"))
-    blocks.append(use_table(fit))
+    blocks.append(use_table(fit, demos.frequency))
     link = Markup('<a href="#segments">segments of every demonstration</a>')
     blocks += [used, Text(Markup("Step by step: {}.").format(link))]
     return Section("options", "Which option is active when", blocks)
 
 
-def use_table(fit: Fit, levels: Sequence[str] | None = None) -> Table:
+def use_table(fit: Fit, frequency: float | None, levels: Sequence[str] | None = None) -> Table:
     """The use of each choice of each level, the highest level first; control only where it is chosen.
 
+    :param frequency: steps per second (Hz); None where unknown.
     :param levels: the levels to show; None for all.
     """
-    counts = fit.metrics.demonstrations
-    demonstrations = counts.train + counts.tune + (0 if counts.left_out else counts.valid)
-    rows = []
+    rows, stands_for = [], {(one.level, one.option): agreeing(one) for one in fit.metrics.named_by_labels}
     for (level, names), use in reversed(list(zip(fit.names.items(), fit.metrics.options, strict=True))):
+        total = sum(row.steps for row in use)
         for row in use if levels is None or level in levels else ():
-            if row.choice or row.share > 0:
-                named = numbered_name(row.choice, names)
-                each = number(row.selected / demonstrations)
-                numbers = [percent(row.share, 1), number(row.selected, 1), each, number(row.duration, 1)]
-                rows.append([level, Cell(named, colour=option_colour(row.choice)), *numbers])
-    head = ["Level", "Choice", "Share of steps", "Selections", "Selections per demonstration", "Expected steps"]
-    return Table(head, rows, {0, 1})
+            if row.choice or row.segments:
+                named = Cell(numbered_name(row.choice, names), colour=option_colour(row.choice))
+                length = "–" if row.length is None else duration(frequency, row.length)
+                label = [stands_for.get((level, row.choice), "–")] if stands_for else []
+                rows.append([level, named, percent(row.steps / total, 1), str(row.segments), length, *label])
+    head = ["Level", "Option", "Share of steps", "Segments", "Median length", *["Label, agreement"][: len(stands_for)]]
+    return Table(head, rows, {0, 1, len(head) - bool(stands_for)})
+
+
+def agreeing(one: NamedByLabel) -> str:
+    """The label that an option stands for, with their agreement: ``reach 0.71``."""
+    return f"{one.name} {number(one.agreement)}"
 
 
 def quoted(names: Mapping[str, Any] | Sequence[str]) -> str:
@@ -108,30 +116,40 @@ def _posterior_picture(
     )
     if known := labels[examples[names[0]]]:
         caption += f" Boxes: ground-truth {quoted(known)}."
-    figure = draw_posteriors(activity, examples, labels)
+    figure = draw_posteriors(activity, examples, labels, label_names(demos.attributes))
     alt = f"Stacked probabilities of the options over time in {', '.join(names)}"
     return save(figure, fit.run_folder / "figures" / "posterior.png", alt, caption)
 
 
 def draw_posteriors(
-    activity: Activity, examples: Mapping[str, int], labels: Sequence[Mapping[str, np.ndarray]]
+    activity: Activity,
+    examples: Mapping[str, int],
+    labels: Sequence[Mapping[str, np.ndarray]],
+    known: Mapping[str, Sequence[str]],
 ) -> Figure:
     """Two demonstrations side by side: for each level u_t, stacked, over the most likely path.
 
     :param examples: name and row of each demonstration.
     :param labels: of every demonstration, name to [T].
+    :param known: the names of labels 0, 1, ... by name of labels.
     """
     rows = -(-len(examples) // 2)
-    known = len(labels[next(iter(examples.values()))])
-    figure = blank(0.35 + rows * (0.55 + 1.25 * len(activity.levels) + 0.2 * known))
+    strips = len(labels[next(iter(examples.values()))])
+    figure = blank(0.35 + rows * (0.55 + 1.25 * len(activity.levels) + 0.2 * strips))
     for part, (name, row) in zip(figure.subfigures(rows, 2, squeeze=False).flat, examples.items(), strict=False):
-        _example(part, activity, row, labels[row])
+        _example(part, activity, row, labels[row], known)
         part.axes[0].set_title(name)
     add_legend(figure, activity.choices, activity.names)
     return figure
 
 
-def _example(figure: SubFigure, activity: Activity, row: int, labels: Mapping[str, np.ndarray]) -> None:
+def _example(
+    figure: SubFigure,
+    activity: Activity,
+    row: int,
+    labels: Mapping[str, np.ndarray],
+    known: Mapping[str, Sequence[str]],
+) -> None:
     length = int(activity.lengths[row])
     heights = [*([5, 0.8] * len(activity.levels)), *([0.9] * len(labels))]
     panels = iter(figure.subplots(len(heights), 1, height_ratios=heights, gridspec_kw={"hspace": 0.02}))
@@ -149,7 +167,7 @@ def _example(figure: SubFigure, activity: Activity, row: int, labels: Mapping[st
         hide_frame(strip)
         strip.set_ylabel("path", **beside)
     for strip, (name, values) in zip(panels, labels.items(), strict=True):
-        _labels(strip, values)
+        _labels(strip, values, [label_name(name, value, known.get(name, ())) for value in values.tolist()])
         strip.set_ylabel("label" if len(labels) == 1 else name, **beside)
     last = figure.axes[-1]
     last.set_xlim(-0.5, length - 0.5)
@@ -166,13 +184,13 @@ def _stack(axes: Axes, shares: np.ndarray, edges: np.ndarray) -> None:
     axes.set(xlim=(edges[0], edges[-1]), ylim=(0, 1))
 
 
-def _labels(axes: Axes, labels: np.ndarray) -> None:
-    """One demonstration's labels [T] as boxes, with their text where there is room."""
+def _labels(axes: Axes, labels: np.ndarray, names: Sequence[str]) -> None:
+    """One demonstration's labels [T] as boxes, with their names where there is room."""
     edges = np.concatenate([[0], np.flatnonzero(np.diff(labels)) + 1, [len(labels)]])
     for place, (start, end) in enumerate(pairwise(edges.tolist())):
         axes.axvspan(start - 0.5, end - 0.5, facecolor=LABEL_SHADES[place % 2], edgecolor=FAINT, linewidth=0.5)
-        if end - start > 0.03 * len(labels):
-            axes.text((start + end - 1) / 2, 0.45, str(labels[start]), ha="center", va="center", fontsize=7.5)
+        if end - start > CHARACTER * len(names[start]) * len(labels):
+            axes.text((start + end - 1) / 2, 0.45, names[start], ha="center", va="center", fontsize=7.5)
     axes.set_xlim(-0.5, len(labels) - 0.5)
     hide_frame(axes)
 
@@ -316,7 +334,8 @@ def segmented(fit: Fit, demos: Demonstrations, activity: Activity) -> Segmented:
             value = entry.log_likelihood_per_step[fit.name]
             segments.append(Segments(name, levels, value, entry.part == "valid", labels))
     counts = {level.name: level.active.shape[2] - 1 for level in activity.levels}
-    return Segmented(tuple(segments), counts, None, names=fit.names)
+    known = label_names(demos.attributes)
+    return Segmented(tuple(segments), counts, demos.frequency, names=fit.names, label_names=known)
 
 
 def segments(drawn: Timelines, demonstrations: int) -> Section:

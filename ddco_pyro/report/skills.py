@@ -15,11 +15,12 @@ from ddco_pyro.drawing.diagrams import curves, dendrogram, path_film, transition
 from ddco_pyro.drawing.figures import data_uri
 from ddco_pyro.drawing.page import Block, Card, Cell, Code, Drawing, Facts, Film, Films, Picture, Section, Text, note
 from ddco_pyro.drawing.shown import frames, jpeg, position_key, projection
-from ddco_pyro.drawing.words import number, numbered_name, percent
+from ddco_pyro.drawing.words import duration, number, numbered_name, percent
 from ddco_pyro.errors import command
 from ddco_pyro.evaluation.options import SMALLEST_DIVERGENCE
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.report.inputs import deciding
+from ddco_pyro.report.options import agreeing
 from ddco_pyro.segmenting import Segmented
 from ddco_pyro.simulation.film import encoded
 
@@ -131,7 +132,9 @@ def section(fit: Fit, demos: Demonstrations, pictures: Sequence[Observed], segme
         every = {choice: instances(segmented, level, choice) for choice in range(len(names))}
         present = [choice for choice, found in every.items() if found]
         for choice in present:
-            facts = _facts(steps[choice] / steps.sum(), every[choice], counts, choice, names)
+            facts = _facts(steps[choice] / steps.sum(), every[choice], counts, choice, names, segmented.frequency)
+            labels = [one for one in fit.metrics.named_by_labels if (one.level, one.option) == (level, choice)]
+            facts |= {f"Label {one.labels}, agreement": agreeing(one) for one in labels}
             facts |= {what: values[choice] for what, values in reads.get(level, {}).items() if choice in values}
             facts = {what: said.replace(" %", "\N{NO-BREAK SPACE}%") for what, said in facts.items()}
             title = Cell(numbered_name(choice, names), colour=option_colour(choice))
@@ -155,13 +158,19 @@ def section(fit: Fit, demos: Demonstrations, pictures: Sequence[Observed], segme
 
 
 def _facts(
-    share: float, found: Sequence[Instance], counts: np.ndarray, choice: int, names: Sequence[str]
+    share: float,
+    found: Sequence[Instance],
+    counts: np.ndarray,
+    choice: int,
+    names: Sequence[str],
+    frequency: float | None,
 ) -> dict[str, str]:
     low, median, high = np.percentile([len(one) for one in found], [25, 50, 75])
     return {
         "Share of steps": percent(share, 1),
         "Segments": str(len(found)),
-        "Duration, steps": f"{median:g} (quartiles {low:g} to {high:g})",
+        "Median length": duration(frequency, median),
+        "Quartiles of length": duration(frequency, low, high),
         "Comes after": _frequent(counts[:, choice], [*names, "start"]),
         "Comes before": _frequent(counts[choice], [*names, "end"]),
     }

@@ -14,6 +14,7 @@ from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.hdf5 import DemonstrationsError
 from ddco_pyro.data.memory import Extent, refuse_too_much
 from ddco_pyro.data.sources import Recording, Source, open_source
+from ddco_pyro.data.sources.recording import label_names
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.inferred import Inferred, started
 from ddco_pyro.events import BaselineSegmented, DemonstrationsDone, OnEvent, ignore
@@ -98,6 +99,7 @@ class Segmented:
     :param frequency: steps per second (Hz); None where unknown.
     :param truth: for each level, the name of the labels that the run's spec compares with it.
     :param names: for each level, the name of each choice, control first.
+    :param label_names: for labels in the file, the names of labels 0, 1, ...
     """
 
     segments: tuple[Segments, ...]
@@ -105,6 +107,7 @@ class Segmented:
     frequency: float | None
     truth: Mapping[str, str] = field(default_factory=dict)
     names: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    label_names: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.segments)
@@ -136,7 +139,7 @@ def segments(fit: Fit, source: Source, on_event: OnEvent = ignore, intervals: bo
     if hierarchy is None:
         raise BadInput(f"{fit.place}: is a {fit.name} policy without options; name a run with a hierarchy")
     counts = {level.name: level.count for level in hierarchy.levels}
-    chosen = chosen_names(source, fit)
+    chosen, known = chosen_names(source, fit), label_names(source.attributes)
     labels: dict[str, dict[str, np.ndarray]] = {}
     segmented: list[Segments] = []
     for piece in fit.infer(_demonstrations(source, chosen, fit, labels)):
@@ -144,7 +147,7 @@ def segments(fit: Fit, source: Source, on_event: OnEvent = ignore, intervals: bo
         on_event(DemonstrationsDone(len(segmented), len(chosen)))
     names = fit.spec.demonstrations.labels_by_level(len(counts))
     truth = dict(zip(counts, names, strict=bool(names)))
-    return Segmented(tuple(segmented), counts, source.frequency, truth, fit.names)
+    return Segmented(tuple(segmented), counts, source.frequency, truth, fit.names, known)
 
 
 def beside_baselines(

@@ -14,11 +14,12 @@ import numpy as np
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import write_text
 from ddco_pyro.data.pictures import Observed
+from ddco_pyro.data.sources.recording import BOUNDARY
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.drawing.page import Block, Cell, Page, Section, Table, Text, note
 from ddco_pyro.drawing.shown import position_key
 from ddco_pyro.drawing.timeline import Lane, Runs, Timelines, Track, following
-from ddco_pyro.drawing.words import NAT, number, numbered_name, option_name
+from ddco_pyro.drawing.words import NAT, duration, label_name, number, numbered_name, option_name, percent
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.segmenting import Segmented, Segments
 from ddco_pyro.segmenting.agreement import EXPLAINED, LevelAgreement, agreement_table
@@ -65,11 +66,11 @@ def _level(name: str, segmented: Segmented, agreement: LevelAgreement | None) ->
         lengths = [end - start for choice, start, end in runs if choice == option]
         if option or lengths:
             named = Cell(numbered_name(option, segmented.names.get(name, ())), colour=option_colour(option))
-            median = duration(float(np.median(lengths)), segmented.frequency) if lengths else "–"
+            median = duration(segmented.frequency, float(np.median(lengths))) if lengths else "–"
             there = sum(any(choice == option for choice, _, _ in each) for each in per_demo)
-            used = [f"{sum(lengths) / total:.1%}", str(len(lengths)), median]
+            used = [percent(sum(lengths) / total, 1), str(len(lengths)), median]
             rows.append([named, *used, f"{there} of {len(segmented)}"])
-    head = ["option", "of all steps", "segments", "median length", "in demonstrations"]
+    head = ["Option", "Share of steps", "Segments", "Median length", "Demonstrations with it"]
     blocks: list[Block] = [Table(head, rows)]
     if agreement:
         blocks.append(Text(f"Agreement with the label “{agreement.labels}”", "heading"))
@@ -82,11 +83,6 @@ def anchor(name: str) -> str:
     return "segments-" + quote(name, safe="").replace("%", ".")
 
 
-def duration(steps: float, frequency: float | None) -> str:
-    """``61 steps``, with seconds where the frequency (Hz) is known."""
-    return f"{steps:g} steps" + (f", {steps / frequency:.3g} s" if frequency else "")
-
-
 def timelines(
     segmented: Segmented, follows: Iterable[Mapping[str, Any]] = (), most_steps: float = math.inf
 ) -> Timelines:
@@ -95,17 +91,14 @@ def timelines(
     :param follows: what follows the cursor, of :func:`~ddco_pyro.drawing.timeline.following`.
     """
     lanes = {name: _level_lane(name, segmented) for name in reversed(segmented.counts)}
-    for demo in segmented.segments:
-        for name in (*demo.labels, *demo.baselines):
-            if name not in segmented.counts and not name.endswith("_boundary"):
-                lanes.setdefault(name, Lane(name))
+    lanes |= {name: Lane(name, names) for name, names in _values(segmented).items()}
     before = accumulate((len(demo) * len(segmented.counts) for demo in segmented.segments), initial=0)
     shown = [demo for demo, steps in zip(segmented.segments, before, strict=False) if steps < most_steps]
     tracks = [
         Track(
             demo.name,
             anchor(demo.name),
-            f"{duration(len(demo), segmented.frequency)}, {number(demo.log_likelihood)} nats/step",
+            f"{duration(segmented.frequency, len(demo))}, {number(demo.log_likelihood)} nats/step",
             demo.held_out,
             len(demo),
             [_runs(demo, name) for name in lanes],
@@ -139,6 +132,19 @@ def _level_lane(name: str, segmented: Segmented) -> Lane:
     choices = range(segmented.counts[name] + 1)
     names = segmented.names.get(name, ())
     return Lane(name, [option_name(choice, names) for choice in choices], [option_colour(choice) for choice in choices])
+
+
+def _values(segmented: Segmented) -> dict[str, dict[int, str]]:
+    """The labels and the baselines of demonstrations, and the name of each of their values."""
+    found: dict[str, dict[int, str]] = {}
+    for demo in segmented.segments:
+        for name, values in (*demo.labels.items(), *demo.baselines.items()):
+            if name not in segmented.counts and not name.endswith(BOUNDARY):
+                known, label = segmented.label_names.get(name, ()), "kind" if name in demo.baselines else name
+                found.setdefault(name, {}).update(
+                    (value, label_name(label, value, known)) for value in np.unique(values).tolist()
+                )
+    return found
 
 
 def _runs(demo: Segments, name: str) -> Runs | None:

@@ -12,6 +12,7 @@ from typing import Literal
 import h5py
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import TypeAdapter, ValidationError
 
 from ddco_pyro.data.hdf5 import DAMAGE, Attribute, DemonstrationsError
 from ddco_pyro.data.memory import refuse_too_much
@@ -30,6 +31,12 @@ LABEL_NAMES = "label_names"
 
 NUMBERS = "fiub"
 """Kinds of numpy types that are real numbers."""
+
+UNKNOWN = -1
+"""The label of a step without ground truth."""
+
+BOUNDARY = "_boundary"
+"""End of the name of labels that are 1 where a segment begins, beside the labels of a level."""
 
 Format = Literal["robomimic", "minari", "lerobot", "maniskill", "act", "d4rl", "ogbench", "jigsaws"]
 
@@ -105,6 +112,19 @@ class Recording:
         yield "actions", self.actions
         yield from ((f"obs/{key}", column) for key, column in self.observations.items())
         yield from ((f"labels/{key}", column) for key, column in self.labels.items())
+
+
+def label_names(attributes: Mapping[str, Attribute]) -> dict[str, list[str]]:
+    """The names of labels 0, 1, ... in the attributes of a file (:data:`LABEL_NAMES`), by name of labels.
+
+    :raises DemonstrationsError: the attribute is something else.
+    """
+    try:
+        return TypeAdapter(dict[str, list[str]]).validate_json(str(attributes.get(LABEL_NAMES, "{}")))
+    except ValidationError:
+        raise DemonstrationsError(
+            f'attribute {LABEL_NAMES!r}: is no JSON such as {{"phase": ["reach", "grasp"]}}; correct or remove it'
+        ) from None
 
 
 def is_image(shape: tuple[int, ...], dtype: np.dtype) -> bool:

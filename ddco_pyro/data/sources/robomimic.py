@@ -56,15 +56,7 @@ class Robomimic:
         self.masks: Mapping[str, tuple[str, ...]] = {name: self._mask(masks, name) for name in masks}
         known = attributes_of(self._data) | attributes_of(file)
         self.attributes: Mapping[str, Attribute] = {name: known[name] for name in known if name != ALL_STEPS}
-        self.frequency = rate(self.attributes) or rate(self._environment()) or rate(self._first())
-
-    def _environment(self) -> dict[str, object]:
-        """What robomimic's description of the environment says, its arguments too."""
-        try:
-            said = json.loads(str(self.attributes.get(ENVIRONMENT, "{}")))
-            return {**said, **(said.get("env_kwargs") or {})}
-        except (ValueError, TypeError, AttributeError, RecursionError):
-            return {}
+        self.frequency = frequency_of(self.attributes) or rate(self._first())
 
     def _first(self) -> Mapping[str, Attribute]:
         """The attributes of the first demonstration; none where it cannot be read."""
@@ -131,6 +123,15 @@ def open_robomimic(path: Path, external: bool = False) -> Iterator[Robomimic]:
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------
+
+
+def frequency_of(attributes: Mapping[str, Attribute]) -> float | None:
+    """Control steps per second, Hz, by the file's attributes or robomimic's description of the environment in them."""
+    try:
+        said = json.loads(str(attributes.get(ENVIRONMENT, "{}")))
+        return rate(attributes) or rate({**said, **(said.get("env_kwargs") or {})})
+    except (ValueError, TypeError, AttributeError, RecursionError):
+        return rate(attributes)
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import shutil
 from collections.abc import Iterable
@@ -11,12 +12,13 @@ from pathlib import Path
 import numpy as np
 
 from ddco_pyro.data.files import whole_file
-from ddco_pyro.data.hdf5 import DemonstrationsError, opened, written
+from ddco_pyro.data.hdf5 import DemonstrationsError, attributes_of, opened, written
+from ddco_pyro.data.sources.recording import BOUNDARY, LABEL_NAMES, label_names
+from ddco_pyro.drawing.words import choice_names
 from ddco_pyro.errors import BadInput
 from ddco_pyro.segmenting import Segmented, Segments, chosen_names
 from ddco_pyro.segmenting.formats import Writer
 
-BOUNDARY = "_boundary"
 OURS = "segmented_by"
 """Attribute of labels written by this library; other labels are never replaced."""
 
@@ -91,8 +93,8 @@ def check_copy(path: Path, out: Path) -> None:
 def write_labels(path: Path, out: Path, segmented: Segmented) -> None:
     """Write the labels into ``out``, which is ``path`` itself or becomes a copy of it, whole or not at all.
 
-    Labels of the same name are replaced. A file that has these very labels is not written again. For a copy, ``path``
-    must also be unchanged since it was copied.
+    Labels of the same name are replaced. The names of options become names of their labels. A file that has these very
+    labels and names is not written again. For a copy, ``path`` must also be unchanged since it was copied.
     """
     in_place = _same(out, path)
     if (in_place or _copied_from(out) == _version(path)) and _has(out, segmented):
@@ -106,8 +108,18 @@ def write_labels(path: Path, out: Path, segmented: Segmented) -> None:
                     if name in group:
                         del group[name]
                     group.create_dataset(name, data=values).attrs[OURS] = SIGNATURE
+            if (names := _names(segmented)) != segmented.label_names:
+                holder = file if LABEL_NAMES in file.attrs else file["data"]
+                holder.attrs[LABEL_NAMES] = json.dumps(names)
             if not in_place:
                 file.attrs[COPIED] = _version(path)
+
+
+def _names(segmented: Segmented) -> dict[str, list[str]]:
+    """The names of the labels in the file, where labels of a level with named options have the names of its choices."""
+    known = {name: list(names) for name, names in segmented.label_names.items() if name not in segmented.counts}
+    levels = segmented.names.items()
+    return known | {level: list(names) for level, names in levels if tuple(names) != choice_names(len(names) - 1)}
 
 
 def _same(out: Path, path: Path) -> bool:
@@ -132,6 +144,8 @@ def _copied_from(copy: Path) -> list[str]:
 
 def _has(path: Path, segmented: Segmented) -> bool:
     with opened(path) as file:
+        if label_names(attributes_of(file["data"]) | attributes_of(file)) != _names(segmented):
+            return False
         for demo in segmented.segments:
             group = file["data"].get(f"{demo.name}/labels", {}) if demo.name in file["data"] else {}
             for name, values in labels_of(demo).items():
