@@ -245,7 +245,8 @@ def log_likelihoods(fit: Fit) -> None:
     if caution := words.caution(metrics):
         say(caution)
     if metrics.worth:
-        said = words.worth(metrics.worth, words.method(metrics.model), len(metrics.valid), words.sound(metrics))
+        ours, rate = words.method(metrics.model), metrics.control_frequency
+        said = words.worth(metrics.worth, ours, len(metrics.valid), words.sound(metrics), rate)
         say(said if metrics.seeds else f"{said} {ONE_FIT}")
     if differ := stds(fit):
         say(differ)

@@ -270,7 +270,7 @@ def segment(
     from ddco_pyro.data.sources import open_source
     from ddco_pyro.fitting.fitted import load
     from ddco_pyro.segmenting import beside_baselines, segments
-    from ddco_pyro.segmenting.agreement import agreement_table, level_agreements
+    from ddco_pyro.segmenting.agreement import agreement_table, level_agreements, tolerances
     from ddco_pyro.segmenting.baselines import BASELINES, check_installed
     from ddco_pyro.segmenting.formats import Asked
 
@@ -306,6 +306,8 @@ def segment(
             segmented = beside_baselines(segmented, fit, source, gripper, progress)
             for name, found in level_agreements(segmented).items():
                 console.show(agreement_table(found.scores, f"level {name}: agreement with the label {found.labels}"))
+                if said := tolerances(segmented.frequency):
+                    console.say(said)
             if missing:
                 print(f"--baselines: {missing}; no agreement is measured")
         for writer in writers:

@@ -145,7 +145,7 @@ def interval(value: Sequence[float] | None, scale: float = 1.0, digits: int = 2)
 
 def duration(frequency: float | None, *steps: float) -> str:
     """``61 steps``, or ``8 to 29 steps``, with seconds where the frequency (Hz) is known."""
-    said = " to ".join(f"{count:g}" for count in steps) + (" step" if steps[-1] == 1 else " steps")
+    said = " to ".join(f"{round(count, 2):g}" for count in steps) + (" step" if steps[-1] == 1 else " steps")
     return f"{said}, {' to '.join(f'{count / frequency:.3g}' for count in steps)} s" if frequency else said
 
 
@@ -266,7 +266,7 @@ def _explained(metrics: Metrics) -> str:
     if metrics.demonstrations.left_out:
         said.append("Every demonstration trains the model; each is held out from a fit without it.")
     if metrics.worth:
-        said.append(worth(metrics.worth, ours, held_out, sound(metrics)))
+        said.append(worth(metrics.worth, ours, held_out, sound(metrics), metrics.control_frequency))
     if metrics.seeds:
         said.append(over_seeds(metrics.seeds, ours, held_out, sound(metrics)))
     return " ".join(said)
@@ -286,7 +286,7 @@ def explains(name: str, differences: Mapping[str, Difference], held_out: int) ->
     return f"{text} (± is one standard error over {held_out} held-out demonstrations, for one fit of each model)."
 
 
-def worth(found: Worth, ours: str, held_out: int, sound: bool = True) -> str:
+def worth(found: Worth, ours: str, held_out: int, sound: bool = True, frequency: float | None = None) -> str:
     """The worth of several experts and of options that last, in one fit of each model.
 
     :param ours: what the hierarchy is called.
@@ -303,8 +303,8 @@ def worth(found: Worth, ours: str, held_out: int, sound: bool = True) -> str:
     }[_direction(found.memory, held_out)]
     rows = found.steps_in_a_row
     if rows and all(row.options <= row.mixture for row in rows):
-        own, mixture = number(rows[0].options, 1), number(rows[0].mixture, 1)
-        decided += f" Options stay active no longer ({own} steps) than the mixture keeps to one expert ({mixture})."
+        own, mixture = (duration(frequency, steps) for steps in (rows[0].options, rows[0].mixture))
+        decided += f" Options stay active no longer ({own}) than the mixture keeps to one policy ({mixture})."
     return f"{parts} {decided}"
 
 

@@ -10,7 +10,6 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
 from ddco_pyro.data.pictures import Observed
 from ddco_pyro.data.sources import open_source
-from ddco_pyro.data.sources.recording import label_names
 from ddco_pyro.drawing import words
 from ddco_pyro.drawing.figures import style
 from ddco_pyro.drawing.page import Block, Facts, Page, Text, note
@@ -50,7 +49,7 @@ def write_report(fit: Fit, demos: Demonstrations) -> Path:
             rollouts.success(fit),
             learning,
             options.section(fit, demos, active) if active else None,
-            agreement.section(fit, label_names(demos.attributes)),
+            agreement.section(fit, demos),
             inputs.saliency(fit, demos),
             inputs.branches(fit),
             training.warnings(fit),

@@ -2,34 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.sources.recording import label_names
 from ddco_pyro.drawing.page import Block, Section, Table, Text, note
 from ddco_pyro.drawing.words import label_name, option_name, percent
 from ddco_pyro.fitting.fitted import Fit
-from ddco_pyro.metrics import Confusion
+from ddco_pyro.metrics import Confusion, Scores
 from ddco_pyro.report.options import quoted
-from ddco_pyro.segmenting.agreement import EXPLAINED, agreement_table
+from ddco_pyro.segmenting.agreement import EXPLAINED, agreement_table, of_equal_lengths, tolerances
+from ddco_pyro.segmenting.baselines import BASELINES, EQUAL
+from ddco_pyro.training.data import parts
 
 
-def section(fit: Fit, known: Mapping[str, Sequence[str]]) -> Section | None:
-    """The measures of each level, and where the steps of each label lie; None where the spec names no labels.
-
-    :param known: the names of labels 0, 1, ... by name of labels.
-    """
+def section(fit: Fit, demos: Demonstrations) -> Section | None:
+    """The measures of each level, and where the steps of each label lie; None where the spec names no labels."""
     record = fit.metrics.agreement
     if not record or fit.spec.hierarchy is None:
         return None
     names = [level.name for level in fit.spec.hierarchy.levels]
-    parts = {"held out": record.valid, "training": record.train}
-    scores = {
-        f"{level}, {words}" if len(names) > 1 else words: found[place]
-        for place, level in enumerate(names)
-        for words, found in parts.items()
-        if found is not None
-    }
-    labels = quoted(list(dict.fromkeys(record.labels)))
-    blocks: list[Block] = [Text(f"Options and the ground-truth {labels}."), agreement_table(scores), note(EXPLAINED)]
+    divided, scores = parts(fit.spec, demos), dict[str, Scores | None]()
+    for place, (level, label) in enumerate(zip(names, record.labels, strict=True)):
+        before, count = f"{level}: " if len(names) > 1 else "", len(fit.names[level]) - 1
+        for words, part, found in (("held out", "valid", record.valid), ("training", "train", record.train)):
+            if found is not None:
+                scores[f"{before}options, {words}"] = found[place]
+                labels = [demo.labels[label] for demo in divided[part]]
+                scores[f"{before}{BASELINES[EQUAL]}, {words}"] = of_equal_lengths(labels, count)
+    known = label_names(demos.attributes)
+    compared = quoted(list(dict.fromkeys(record.labels)))
+    blocks: list[Block] = [Text(f"Options and the ground-truth {compared}."), agreement_table(scores)]
+    blocks.append(note(f"{EXPLAINED} {tolerances(demos.frequency)}"))
     for level, label, own in zip(names, record.labels, record.confusion, strict=True):
         names_of_labels = [label_name(label, value, known.get(label, ()), level) for value in own.labels]
         title = f"Where each label’s steps lie: level “{level}”, label “{label}”"

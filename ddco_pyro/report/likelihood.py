@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from ddco_pyro.data.controls import ControlDimension
 from ddco_pyro.drawing.figures import Interval, Panel, interval_plot, save
 from ddco_pyro.drawing.page import Block, Cell, Section, Table, Text, note
-from ddco_pyro.drawing.words import about, capital, effort, listed, method, number, with_error
+from ddco_pyro.drawing.words import about, capital, duration, effort, listed, method, number, with_error
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Compared, Metrics
 from ddco_pyro.segmenting.page import anchor
@@ -103,12 +103,13 @@ def demonstrations(metrics: Metrics, anchors: Collection[str]) -> Section:
         place, held_out = anchor(entry.name), entry.part == "valid"
         name = Cell(entry.name, link=f"#{place}" if place in anchors else "")
         mark = Cell("held out" if held_out else "", mark=held_out)
-        rows.append([name, mark, str(entry.steps), *(number(entry.log_likelihood_per_step[m]) for m in methods)])
+        length = duration(metrics.control_frequency, entry.steps)
+        rows.append([name, mark, length, *(number(entry.log_likelihood_per_step[m]) for m in methods)])
     text = (
         f"Log-likelihood of each demonstration, nats per step. The least likely under {method(metrics.model)} comes "
         "first: it is unlike the others, or the model fits it poorly."
     )
-    found = Table(["Demonstration", "", "Steps", *map(method, methods)], rows, {0, 1})
+    found = Table(["Demonstration", "", "Length", *map(method, methods)], rows, {0, 1})
     links = " A name leads to the demonstration’s segments." if anchors else ""
     return Section(
         "demonstrations", "Every demonstration", [Text(text + links), *found.folded(SHOWN, "demonstrations")]

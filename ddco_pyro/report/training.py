@@ -158,7 +158,7 @@ def degeneracies(fit: Fit) -> list[tuple[str, str]]:
         if finding.kind != "never_persisting" or levels[finding.level - 1].lasts:
             groups.setdefault((finding.level, finding.kind), []).append(finding)
     return [
-        (_sign(found, levels[level - 1].name, fit.names), found[0].advice(fit.spec.training))
+        (_sign(found, levels[level - 1].name, fit), found[0].advice(fit.spec.training))
         for (level, _), found in groups.items()
     ]
 
@@ -167,7 +167,7 @@ LISTED = 10
 """Options, or pairs of options, that a sign lists, the clearest first."""
 
 
-def _sign(found: Sequence[Finding], level: str, names: Mapping[str, Sequence[str]]) -> str:
+def _sign(found: Sequence[Finding], level: str, fit: Fit) -> str:
     """The findings of one kind in a level as one sign of a degenerate solution, in words."""
     if found[0].kind == "high_fitting":
         share = percent(found[0].value, 1)
@@ -180,8 +180,8 @@ def _sign(found: Sequence[Finding], level: str, names: Mapping[str, Sequence[str
         "never_persisting": "never persist; on average they last" if many else "never persists; on average it lasts",
     }[found[0].kind]
     ordered = sorted(found, key=lambda finding: finding.value)
-    each = [_value(finding) for finding in ordered[:LISTED]]
-    who = [_who(finding, names[level]) for finding in ordered[:LISTED]]
+    each = [_value(finding, fit.metrics.control_frequency) for finding in ordered[:LISTED]]
+    who = [_who(finding, fit.names[level]) for finding in ordered[:LISTED]]
     left = len(found) - LISTED
     if many:
         values = [f"{value} ({name})" for value, name in zip(each, who, strict=True)]
@@ -197,11 +197,11 @@ def _who(finding: Finding, names: Sequence[str]) -> str:
     return words.listed(words.numbered_name(option, names) for option in both)
 
 
-def _value(finding: Finding) -> str:
+def _value(finding: Finding, frequency: float | None) -> str:
     if finding.kind == "redundant":
         return number(finding.value, 3)
     if finding.kind == "never_persisting":
-        return f"{number(finding.value)} steps, selected {number(finding.selections, 1)} times a demonstration"
+        return f"{words.duration(frequency, finding.value)}, selected {number(finding.selections, 1)} times a demonstration"
     return percent(finding.value, 1)
 
 

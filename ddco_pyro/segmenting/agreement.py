@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from ddco_pyro.drawing.page import Table
-from ddco_pyro.drawing.words import number
-from ddco_pyro.evaluation.agreement import MATCHED, UNMATCHED, agreement
+from ddco_pyro.drawing.words import duration, number
+from ddco_pyro.evaluation.agreement import MATCHED, TOLERANCES, UNMATCHED, agreement
 from ddco_pyro.metrics import Scores
 from ddco_pyro.segmenting import Segmented, Segments
-from ddco_pyro.segmenting.baselines import BASELINES
+from ddco_pyro.segmenting.baselines import BASELINES, EQUAL, equal_lengths
 
 MATCHINGS = {"matched_globally": "one for all", "matched_per_demonstration": "each its own"}
 
@@ -20,7 +22,8 @@ EXPLAINED = (
     "begin, within so many steps. The other measures match options with labels so that most steps agree. The match is "
     "the same in all demonstrations (one for all) or separate in each (each its own). Accuracy: share of steps that "
     "agree. IoU: intersection over union, mean over labels. F1@P: a segment is right where it overlaps one of its "
-    "label by P % or more. Edit: 1 − edit distance of the sequences of segments."
+    "label by P % or more. Edit: 1 − edit distance of the sequences of segments. Equal lengths: what cutting each "
+    "demonstration into equal parts, as many as options, reaches without looking at it."
 )
 
 
@@ -40,6 +43,12 @@ def measure_names(keys: Iterable[str]) -> list[str]:
             names.append({"nmi": "NMI", "ari": "ARI", "iou": "IoU"}.get(key, key))
         before = base
     return names
+
+
+def tolerances(frequency: float | None) -> str:
+    """A sentence on the seconds of the tolerances of boundary F1; empty where the frequency (Hz) is not known."""
+    each = "; ".join(f"±{duration(frequency, steps)}" for steps in TOLERANCES)
+    return f"Tolerances of boundary F1: {each}." if frequency else ""
 
 
 def agreement_table(scores: Mapping[str, Scores | None], title: str | None = None) -> Table:
@@ -68,7 +77,8 @@ class LevelAgreement:
 def level_agreements(segmented: Segmented) -> dict[str, LevelAgreement]:
     """Agreement of each level that has labels, by the level's name.
 
-    Baselines are compared on the held-out demonstrations, or on all where none is held out.
+    Parts of equal length stand beside the options. Other baselines are compared on the held-out demonstrations, or on
+    all where none is held out.
     """
     agreements = {}
     for level, truth in segmented.truth.items():
@@ -77,14 +87,21 @@ def level_agreements(segmented: Segmented) -> dict[str, LevelAgreement]:
             continue
         scores: dict[str, Scores | None] = {}
         for part, group in groups.items():
-            options = [demo.levels[level].options for demo in group]
-            scores[f"options, {part}"] = agreement(options, [demo.labels[truth] for demo in group])
+            options, labels = [demo.levels[level].options for demo in group], [demo.labels[truth] for demo in group]
+            scores[f"options, {part}"] = agreement(options, labels)
+            scores[f"{BASELINES[EQUAL]}, {part}"] = of_equal_lengths(labels, segmented.counts[level])
         part, group = next(iter(groups.items()))
-        for name, words in BASELINES.items() if group[0].baselines else ():
-            found = [demo.baselines[f"{level}_{name}"] for demo in group]
-            scores[f"{words}, {part}"] = agreement(found, [demo.labels[truth] for demo in group])
+        for name, words in BASELINES.items():
+            if group[0].baselines and name != EQUAL:
+                found = [demo.baselines[f"{level}_{name}"] for demo in group]
+                scores[f"{words}, {part}"] = agreement(found, [demo.labels[truth] for demo in group])
         agreements[level] = LevelAgreement(truth, scores)
     return agreements
+
+
+def of_equal_lengths(labels: Sequence[np.ndarray], count: int) -> Scores | None:
+    """The agreement with labels [T] of demonstrations that are cut into ``count`` equal parts."""
+    return agreement([equal_lengths(len(own), count) for own in labels], labels)
 
 
 def _groups(segmented: Segmented, truth: str) -> dict[str, Sequence[Segments]]:

@@ -20,6 +20,9 @@ from ddco_pyro.model.encoder import ObservationEncoder
 from ddco_pyro.spec import ObservationSpec
 from ddco_pyro.training.initialization import block_means, distinct, joined
 
+EQUAL = "equal"
+"""The baseline of parts of equal length."""
+
 PIECES = 2
 """Pieces of a demonstration between change points, for each kind of segment asked for."""
 
@@ -52,12 +55,17 @@ def segment(
     if name not in BASELINES:
         raise BadInput(f"there is no baseline {name!r}{nearest(name, BASELINES)}; there is: {', '.join(BASELINES)}")
     check_installed([name])
-    if name == "equal":
-        return [np.arange(len(demo)) * count // len(demo) for demo in valid]
+    if name == EQUAL:
+        return [equal_lengths(len(demo), count) for demo in valid]
     if name == "gripper":
         return _gripper(train, valid, gripper)
     rows = _rows_of(train, observations)
     return METHODS[name]([rows(demo) for demo in train], [rows(demo) for demo in valid], count, seed)
+
+
+def equal_lengths(steps: int, count: int) -> np.ndarray:
+    """The number of the part, from 0 on, of each step [T] of a demonstration that is cut into equal parts."""
+    return np.arange(steps) * count // steps
 
 
 def _rows_of(
@@ -183,7 +191,7 @@ BASELINES = {
     "gmm": "Gaussian mixture",
     "hmm": "Gaussian HMM",
     "change_points": "change points, clustered",
-    "equal": "equal lengths",
+    EQUAL: "equal lengths",
     "gripper": "gripper changes",
 }
 """The baselines and their names in tables."""

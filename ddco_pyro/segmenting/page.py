@@ -22,7 +22,7 @@ from ddco_pyro.drawing.timeline import Lane, Runs, Timelines, Track, following
 from ddco_pyro.drawing.words import NAT, duration, label_name, number, numbered_name, option_name, percent
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.segmenting import Segmented, Segments
-from ddco_pyro.segmenting.agreement import EXPLAINED, LevelAgreement, agreement_table
+from ddco_pyro.segmenting.agreement import EXPLAINED, LevelAgreement, agreement_table, tolerances
 
 FIRST = 10
 """Demonstrations among which an observation that moves like a position is sought."""
@@ -74,7 +74,7 @@ def _level(name: str, segmented: Segmented, agreement: LevelAgreement | None) ->
     blocks: list[Block] = [Table(head, rows)]
     if agreement:
         blocks.append(Text(f"Agreement with the label “{agreement.labels}”", "heading"))
-        blocks += [agreement_table(agreement.scores), note(EXPLAINED)]
+        blocks += [agreement_table(agreement.scores), note(f"{EXPLAINED} {tolerances(segmented.frequency)}")]
     return Section(f"level-{quote(name, safe='')}", f"Level “{name}”", blocks)
 
 
