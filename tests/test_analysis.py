@@ -29,7 +29,8 @@ def test_use_of_options_by_sums_over_every_path():
     tables = random_tables((2,), (True,), trajectories=2, steps=4, seed=1)
     lengths = [4, 3]
     truths = [brute_force(tables, n, length) for n, length in enumerate(lengths)]
-    (found,) = option_use(posterior(tables, torch.tensor(lengths)))
+    paths = [[np.array([1, 1, 2, 1]), np.array([2, 0, 0, -1])]]
+    (found,) = option_use(posterior(tables, torch.tensor(lengths)), paths)
     u = sum(truth.u[0].sum(0) for truth in truths)
     v = sum(truth.v[0].sum(0) for truth in truths)
     for choice, one in enumerate(found):
@@ -39,6 +40,7 @@ def test_use_of_options_by_sums_over_every_path():
         assert one.demonstrations == pytest.approx(sum(min(1.0, truth.v[0].sum(0)[choice]) for truth in truths))
         assert one.duration == pytest.approx(u[choice] / v[choice])
     assert found[0].duration == pytest.approx(1)  # control lasts one step
+    assert [(one.segments, one.steps, one.length) for one in found] == [(1, 2, 2), (2, 3, 1.5), (2, 2, 1)]
 
 
 def test_an_option_that_is_never_selected_has_no_duration():
@@ -46,12 +48,14 @@ def test_an_option_that_is_never_selected_has_no_duration():
     active = torch.tensor([[[0, 1, 0, 0]] * 2 + [[0, 0, 1, 0]] * 3 + [[0, 0, 0, 0]]], dtype=torch.float64)
     chosen = active.clone()
     chosen[0, [1, 3, 4]] = 0
-    (found,) = option_use(Posterior((active,), (chosen,), (active,)))
+    (found,) = option_use(Posterior((active,), (chosen,), (active,)), [[np.array([1, 1, 2, 2, 2, -1])]])
+    never = {"share": 0.0, "selected": 0.0, "demonstrations": 0.0, "duration": None, "segments": 0, "steps": 0}
+    once = {"selected": 1.0, "demonstrations": 1.0, "segments": 1}
     assert [dict(one) for one in found] == [
-        {"choice": 0, "share": 0.0, "selected": 0.0, "demonstrations": 0.0, "duration": None},
-        {"choice": 1, "share": 0.4, "selected": 1.0, "demonstrations": 1.0, "duration": 2.0},
-        {"choice": 2, "share": 0.6, "selected": 1.0, "demonstrations": 1.0, "duration": 3.0},
-        {"choice": 3, "share": 0.0, "selected": 0.0, "demonstrations": 0.0, "duration": None},
+        {"choice": 0, **never, "length": None},
+        {"choice": 1, "share": 0.4, **once, "duration": 2.0, "steps": 2, "length": 2.0},
+        {"choice": 2, "share": 0.6, **once, "duration": 3.0, "steps": 3, "length": 3.0},
+        {"choice": 3, **never, "length": None},
     ]
 
 
@@ -228,7 +232,7 @@ def level(*shares, durations=None):
     """Options that are selected ten times in each of two demonstrations."""
     durations = durations or [5.0] * len(shares)
     return [
-        Use(choice=choice, share=share, selected=20.0, demonstrations=2.0, duration=duration)
+        Use.model_construct(choice=choice, share=share, selected=20.0, demonstrations=2.0, duration=duration)
         for choice, (share, duration) in enumerate(zip(shares, durations, strict=True))
     ]
 
@@ -244,7 +248,8 @@ def use(*demonstrations):
             active[row, start : start + length, option] = 1
             selected[row, start, option] = 1
             start += length
-    return option_use(Posterior((active,), (selected,), (active,)))
+    paths = [[np.concatenate([np.full(length, option) for option, length in segments]) for segments in demonstrations]]
+    return option_use(Posterior((active,), (selected,), (active,)), paths)
 
 
 def short(option, selections, duration=1.0):

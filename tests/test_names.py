@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import csv
 import json
+import re
+import shlex
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -12,10 +15,14 @@ from command_line import call
 from time_lines import embedded
 
 import ddco_pyro
+from ddco_pyro.cli import console
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.inspection import inspect
+from ddco_pyro.drawing.words import label_name
 from ddco_pyro.errors import BadInput
 from ddco_pyro.exporting import write_numpy
-from ddco_pyro.fitting.names import proposed
+from ddco_pyro.fitting.names import accepted, matched
+from ddco_pyro.metrics import NamedByLabel
 from ddco_pyro.spec import parse_spec
 
 SPEC = {
@@ -40,8 +47,12 @@ def labelled(phases=PHASES, number=4, names=None):
     return Demonstrations(demos, attributes={} if names is None else {"label_names": json.dumps({"phase": names})})
 
 
+def stands_for(choices, demos):
+    return matched(parse_spec(SPEC), demos, (np.tile(choices, (len(demos), 1)),))
+
+
 def propose(choices, demos):
-    return proposed(parse_spec(SPEC), demos, (np.tile(choices, (len(demos), 1)),))
+    return accepted(parse_spec(SPEC), stands_for(choices, demos))
 
 
 @pytest.mark.parametrize("order", [(1, 2, 3), (3, 1, 2)])
@@ -65,8 +76,30 @@ def test_only_a_clear_match_gives_a_name():
     twice = labelled(names=["reach", "grasp", "reach"])
     assert propose(np.array([1, 2, 3])[PHASES], twice) == {"skill": ("reach", "grasp", "option 3")}
     assert propose(np.array([1, 2, 3])[PHASES], labelled(names=["control", "", "lift"])) == {
-        "skill": ("option 1", "option 2", "lift")
+        "skill": ("option 1", "phase 1", "lift")
     }
+
+
+def test_below_an_agreement_of_three_fifths_a_name_is_proposed_and_not_given():
+    demos, choices = labelled(np.repeat([0, 1, 2], [7, 5, 3]), names=["reach", "grasp", "lift"]), 1 + PHASES
+    found = {one.name: one.agreement for one in stands_for(choices, demos)}
+    assert found == pytest.approx({"reach": 6 / 7, "grasp": 3 / 6, "lift": 3 / 5})
+    assert propose(choices, demos) == {"skill": ("reach", "option 2", "lift")}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name"),
+    [
+        (("phase", 1, ["reach", " grasp "]), "grasp"),
+        (("phase", 1, ["reach", " "]), "phase 1"),
+        (("phase", 5, ["reach"]), "phase 5"),
+        (("phase", -1, ["reach"]), "unknown"),
+        (("option", 5), "label 5"),
+        (("skill", 5, (), "skill"), "label 5"),
+    ],
+)
+def test_a_label_is_never_a_number_alone(arguments, name):
+    assert label_name(*arguments) == name
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +109,7 @@ def files(tmp_path_factory):
     labelled(number=8, names=["reach", "grasp", "lift"]).write(folder / "demos.hdf5")
     (folder / "mine.yaml").write_text(
         f"""
-demonstrations: {{path: {folder / "demos.hdf5"}}}
+demonstrations: {{path: {folder / "demos.hdf5"}, labels: phase}}
 observations: [place]
 control: {{std: 0.3}}
 hierarchy:
@@ -87,13 +120,14 @@ training: {{epochs: 60, optimizer: {{lr: 0.1}}, labels: {{level: skill, from: ph
 """
     )
     ended = call("fit", folder / "mine.yaml", "--out", folder / "run", "--jobs", 1)
-    assert f"names: {folder / 'run' / 'names.yaml'}: reach, grasp, lift\n" in ended.out
+    assert f"names: {folder / 'run' / 'names.yaml'}: reach 1.00, grasp 1.00, lift 1.00\n" in ended.out
     return folder
 
 
 def test_a_fit_proposes_the_names_of_its_labels(files):
     fit = ddco_pyro.load(files / "run")
     assert fit.names == {"skill": ("control", "reach", "grasp", "lift")}
+    assert [one.agreement for one in fit.metrics.named_by_labels] == [1, 1, 1]
     assert fit.baselines["mixture"].named == {}
     own = ddco_pyro.fit(fit.spec, labelled(number=8))
     assert own.names == {"skill": ("control", "phase 0", "phase 1", "phase 2")}
@@ -109,16 +143,22 @@ def test_names_are_shown_wherever_options_are(files):
     for page in (run / "report.html", outputs["--html"]):
         text = page.read_text()
         assert "&lt;go&gt; (option 1)" in text
-        assert embedded(text)["lanes"][0]["names"] == ["control", "<go>", "pick & place", "on"]
+        skills, phases = embedded(text)["lanes"]
+        assert skills["names"] == ["control", "<go>", "pick & place", "on"]
+        assert (phases["name"], phases["names"]) == ("phase", {"0": "reach", "1": "grasp", "2": "lift"})
         assert "<go>" not in text
+    assert re.search(r"stands for.*?>reach<.*?>grasp<.*?>lift<", (run / "report.html").read_text(), re.DOTALL)
     fit = ddco_pyro.load(run)
     truth = [fit.names["skill"][option] for row in fit.segment(fit.demonstrations)[0] for option in row]
     rows = list(csv.DictReader(outputs["--csv"].open()))
     assert [row["skill_name"] for row in rows] == truth
     assert all(fit.names["skill"][int(row["skill"])] == row["skill_name"] for row in rows)
     shown = call("name", run).out
-    assert "pick & place (option 2)" in shown
-    assert f"{100 * fit.metrics.options[0][2].share:.1f} %" in shown
+    (row,) = re.findall(r"pick & place \(option 2\).*", shown)
+    (instances,) = re.findall(
+        r"pick &amp; place \(option 2\).*?Segments</dt><dd>(\d+)", (run / "report.html").read_text(), re.DOTALL
+    )
+    assert [cell.strip() for cell in row.split("│")][2:] == [instances, "4 steps", "grasp 1.00"]
     with h5py.File(demos) as file:
         place = file["data/demo_0/obs/place"][0]
     controller, monitor = fit.controller(), fit.monitor()
@@ -129,6 +169,31 @@ def test_names_are_shown_wherever_options_are(files):
     write_numpy(fit, files)
     about = json.loads((files / "controller.json").read_text())
     assert about["names"] == {"skill": ["control", "<go>", "pick & place", "on"]}
+
+
+def test_a_file_with_labels_keeps_the_names_of_options_and_of_labels(files, tmp_path):
+    run, out, phases = files / "run", tmp_path / "labelled.hdf5", ["reach", "grasp", "lift"]
+    for names in (["go", "hold", "up"], ["go", "hold", "raise"], ["option 1", "option 2", "option 3"]):
+        ddco_pyro.load(run).name_options("skill", names)
+        assert call("segment", run, files / "demos.hdf5", "--out", out).status == 0
+        named = [] if names[0] == "option 1" else ["control", *names]
+        facts = {field.key: field.names for field in inspect(out).labels}
+        assert facts == {"phase": phases, "skill": named, "skill_boundary": []}
+    assert "0: reach, 1: grasp, 2: lift" in call("inspect", out).out
+    assert call("init", out, "--out", tmp_path / "again.yaml").status == 0
+    assert "labels: phase " in (text := (tmp_path / "again.yaml").read_text())
+    assert "# labels 0, 1, ...: reach, grasp, lift\n" in text
+
+
+def test_a_proposed_name_comes_with_the_command_that_takes_it(files, capsys):
+    fit = ddco_pyro.load(files / "run")
+    half = [NamedByLabel(level="skill", option=2, labels="phase", name="hold", agreement=0.5)]
+    console.names(replace(fit, named={}, metrics=fit.metrics.model_copy(update={"named_by_labels": half})))
+    said = capsys.readouterr().out
+    assert "names proposed, not written: option 2 as hold 0.50" in said
+    again = said.partition("to take them: ddco-pyro ")[2].splitlines()[0]
+    assert call(*shlex.split(again)).status == 0
+    assert ddco_pyro.load(files / "run").names["skill"] == ("control", "option 1", "hold", "option 3")
 
 
 def test_the_command_writes_names_that_are_read_again(files):
@@ -173,3 +238,5 @@ def test_label_names_that_are_none_are_refused_before_anything_is_written(tmp_pa
     with pytest.raises(BadInput, match="attribute 'label_names': is no JSON"):
         ddco_pyro.fit(parse_spec(SPEC), wrong, out=tmp_path / "run")
     assert not (tmp_path / "run").exists()
+    wrong.write(tmp_path / "wrong.hdf5")
+    assert "problem: attribute 'label_names': is no JSON" in call("inspect", tmp_path / "wrong.hdf5").out
