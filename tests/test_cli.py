@@ -426,8 +426,8 @@ def test_a_fit_that_stops_early_says_so(clock, capsys, epochs, shown):
             progress(EpochEnded(0, "level-1", 1, 1.25, -0.5))
         progress(TrainingEnded("ddco"))
     assert capsys.readouterr().err.splitlines() == [
-        f"training ddco: {shown}  level-1: training 1.250, tuning -0.500 nats/step",
-        "training ddco: done after 3, 12 s",
+        f"training options: {shown}  level-1: training 1.250, tuning -0.500 nats/step",
+        "training options: done after 3, 12 s",
     ]
 
 
@@ -439,5 +439,5 @@ def test_the_first_of_many_says_nothing_of_the_time_left(clock, capsys):
             clock[0] = now
             progress(EpochEnded(0, "joint", 1, 1.0, 0.5))
     first, second = capsys.readouterr().err.splitlines()
-    assert first == "training ddco: 1/1000  joint: training 1.000, tuning 0.500 nats/step"
-    assert second.startswith("training ddco: 12/1000, 988 s left")
+    assert first == "training options: 1/1000  joint: training 1.000, tuning 0.500 nats/step"
+    assert second.startswith("training options: 12/1000, 988 s left")

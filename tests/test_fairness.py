@@ -133,7 +133,7 @@ def test_stages_that_needed_more_are_named_on_the_console(fitted):
             rise = f"{stage.rising:.2f} nats per step over the last {stage.epochs})"
             assert f"stage {stage.stage} after {stage.epochs} epochs (tuning log-likelihood up by {rise}" in said
     assert said.count("warning: ") >= 4
-    assert "warning: DDCO has not converged: the budget ended stage vq-1 after 2 epochs" in said
+    assert "warning: Options have not converged: the budget ended stage vq-1 after 2 epochs" in said
     assert "warning: Flat of equal size has not converged: the budget ended stage policy after 9 epochs" in said
 
 

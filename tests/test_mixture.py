@@ -245,7 +245,7 @@ def test_the_verdict_is_about_options_that_last(memory, error, said):
     text = words.worth(Worth(**found, flat="flat", steps_in_a_row=[{"options": 3.0, "mixture": 4.0}]), "DDCO", 10)
     assert text.startswith(f"Of {words.signed(2.0 + memory)} nats per step over flat, +2.00 ± {words.number(error)} ")
     assert said in text
-    assert text.endswith("Options stay active no longer (3.0 steps) than the mixture keeps to one expert (4.0).")
+    assert text.endswith("Options stay active no longer (3 steps) than the mixture keeps to one policy (4 steps).")
 
 
 def test_how_long_a_choice_is_kept():

@@ -100,7 +100,7 @@ def over_three(memory, errors):
     [
         ([0.3, 0.4, 0.35], "So options that last are worth it on these demonstrations."),
         ([0.3, 0.4, -0.35], "It is inconclusive whether options that last are worth anything here."),
-        ([-0.3, -0.4, -0.35], "So options that last explain these demonstrations worse than the same experts"),
+        ([-0.3, -0.4, -0.35], "So options that last explain these demonstrations worse than the same policies"),
         ([0.001, 0.0011, 0.0012], "So options that last make no difference here: less than 0.01 nats per step."),
     ],
 )

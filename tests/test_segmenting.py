@@ -359,7 +359,7 @@ def test_other_demonstrations_are_refused(toy_run, file, key, other, width, mess
 
 
 def test_a_policy_without_options_is_refused(toy_run, file):
-    message = "is a flat policy without options; name a run with a hierarchy"
+    message = "is a flat policy without options; name a run that has options"
     refused(message, toy_run.folder / "baselines" / "flat", file, "--in-place")
 
 

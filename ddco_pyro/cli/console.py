@@ -97,7 +97,8 @@ class Progress:
             case BaselineSegmented(baseline, total):
                 self._advance("segmenting by baselines", total, note=baseline)
             case TrainingBegan(model, epochs):
-                self._begin(f"training {model}", epochs)
+                name, _, further = model.partition(" ")
+                self._begin(f"training {words.method(name)} {further}".rstrip(), epochs)
             case EpochEnded():
                 self._advance(note=f"{event.stage}: training {event.train:.3f}, tuning {event.tune:.3f} nats/step")
             case UpdatesDone(done, loss):

@@ -140,7 +140,7 @@ def _caution(compared: Comparison) -> str:
 
 
 def _worth(compared: Comparison) -> str:
-    """The worth of several experts and of options that last, where there is one run of each model."""
+    """The worth of several policies and of options that last, where there is one run of each model."""
     models = [row.model for row in compared.rows]
     alone = {row.model: np.array(row.each) for row in compared.rows if models.count(row.model) == 1}
     found = worth(HIERARCHY, alone, compared.steps)

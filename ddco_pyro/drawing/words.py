@@ -43,7 +43,7 @@ FLAT = ("flat", "flat_equal")
 """Flat baselines; a hierarchy is compared with the first one that a fit has."""
 
 METHODS = {
-    "ddco": "DDCO",
+    "ddco": "options",
     "flat": "flat",
     "flat_equal": "flat of equal size",
     "per_timestep": "per-timestep",
@@ -52,10 +52,10 @@ METHODS = {
 }
 
 ABOUT = {
-    "ddco": "the hierarchy of options",
+    "ddco": "policies that stay active until they end",
     "flat": "one policy without options",
     "per_timestep": "a policy for each time step",
-    "mixture": "the hierarchy’s policies with a new choice at every step (no memory)",
+    "mixture": "the options’ policies with a new choice at every step (no memory)",
 }
 
 
@@ -76,6 +76,11 @@ def stage(name: str) -> str:
 def method(name: str) -> str:
     """A method in words: ``flat_equal`` is ``flat of equal size``."""
     return METHODS.get(name, name.replace("_", " "))
+
+
+def verb(name: str, many: str, one: str) -> str:
+    """The form of a verb after the name of a method."""
+    return many if name.lower() == METHODS["ddco"] else one
 
 
 def option_name(option: int, names: Sequence[str] = ()) -> str:
@@ -256,11 +261,11 @@ def _explained(metrics: Metrics) -> str:
     ours, held_out, per_step = method(metrics.model), len(metrics.valid), metrics.log_likelihood_per_step
     name = capital(ours)
     if not held_out:
-        value = number(per_step.train)
-        return f"{name} was fitted to all demonstrations ({value} nats per step); none was held out to evaluate it."
+        fitted, value = verb(name, "were", "was"), number(per_step.train)
+        return f"{name} {fitted} fitted to all demonstrations ({value} nats per step); none was held out."
     if not metrics.comparison:
-        value = number(per_step.valid)
-        return f"{name} gives held-out demonstrations {value} nats per step; no baseline was trained to compare with."
+        give, value = verb(name, "give", "gives"), number(per_step.valid)
+        return f"{name} {give} held-out demonstrations {value} nats per step; no baseline was trained to compare with."
     differences = {method(other): compared.difference for other, compared in metrics.comparison.items()}
     said = [explains(name, differences, held_out)]
     if metrics.demonstrations.left_out:
@@ -280,14 +285,14 @@ def explains(name: str, differences: Mapping[str, Difference], held_out: int) ->
     :param differences: the paired difference by the other model's name.
     """
     clauses = [_clause(other, difference, held_out) for other, difference in differences.items()]
-    text = f"{name} explains held-out demonstrations {listed(clauses)}"
+    text = f"{name} {verb(name, 'explain', 'explains')} held-out demonstrations {listed(clauses)}"
     if held_out == 1:
         return f"{text} (1 held-out demonstration, one fit of each model)."
     return f"{text} (± is one standard error over {held_out} held-out demonstrations, for one fit of each model)."
 
 
 def worth(found: Worth, ours: str, held_out: int, sound: bool = True, frequency: float | None = None) -> str:
-    """The worth of several experts and of options that last, in one fit of each model.
+    """The worth of several policies and of options that last, in one fit of each model.
 
     :param ours: what the hierarchy is called.
     :param sound: whether neither model fell apart; otherwise nothing is concluded.
@@ -299,7 +304,7 @@ def worth(found: Worth, ours: str, held_out: int, sound: bool = True, frequency:
     decided = {
         1: "In this fit options that last explain held-out controls better; one fit of each model is no verdict.",
         0: "This fit does not show that options that last are worth anything.",
-        -1: "In this fit options that last explain held-out controls worse than the same experts without memory.",
+        -1: "In this fit options that last explain held-out controls worse than the same policies without memory.",
     }[_direction(found.memory, held_out)]
     rows = found.steps_in_a_row
     if rows and all(row.options <= row.mixture for row in rows):
@@ -338,7 +343,7 @@ def _divided(found: Worth | SuccessWorth, ours: str, total: str, memory_alone: s
     if found.flat is None:
         return f"{memory_alone}: {lasting}."
     flat = method(found.flat)
-    experts = f"{said(found.experts)} come from several experts (mixture − {flat})"
+    experts = f"{said(found.experts)} come from several policies (mixture − {flat})"
     return f"Of {total} over {flat}, {experts} and {lasting}."
 
 
@@ -410,7 +415,7 @@ def _verdict(low: float, high: float) -> str:
     if low > 0:
         return "So options that last are worth it on these demonstrations."
     if high < 0:
-        return "So options that last explain these demonstrations worse than the same experts without memory."
+        return "So options that last explain these demonstrations worse than the same policies without memory."
     return "It is inconclusive whether options that last are worth anything here."
 
 
@@ -502,7 +507,9 @@ def unconverged(metrics: Metrics) -> list[tuple[str, str]]:
         stages = [_too_short(stage) for stage in training.stages if not stage.converged]
         if stages:
             who = method(name)
-            verdict = f"Earlier stages of {who} had" if training.converged else f"{capital(who)} has"
+            verdict = (
+                f"Earlier stages of {who} had" if training.converged else f"{capital(who)} {verb(who, 'have', 'has')}"
+            )
             verdicts.append((f"{verdict} not converged: the budget ended {listed(stages)}.", RAISE))
     return verdicts
 
@@ -536,7 +543,7 @@ def success(metrics: Metrics) -> str:
     if metrics.rollouts is None or metrics.model not in rates:
         return ""
     ours = method(metrics.model)
-    text = f"In rollouts {ours} succeeds in {rate(rates.pop(metrics.model), 'episodes')}"
+    text = f"In rollouts {ours} {verb(ours, 'succeed', 'succeeds')} in {rate(rates.pop(metrics.model), 'episodes')}"
     others = [f"{method(name)} in {rate(summary)}" for name, summary in rates.items()]
     said = f"{text}{'; ' if others else ''}{listed(others) if others else ''}."
     return f"{said} {success_worth(metrics.rollouts, ours)}".rstrip()

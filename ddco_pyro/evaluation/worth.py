@@ -1,4 +1,4 @@
-"""The advantage of a hierarchy over a flat policy in two parts: several experts, and options that last."""
+"""The advantage of a hierarchy over a flat policy in two parts: several policies, and options that last."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def paired(ours: np.ndarray, theirs: np.ndarray, lengths: np.ndarray) -> Differe
 def worth(ours: str, values: Mapping[str, np.ndarray], lengths: Sequence[int]) -> Worth | None:
     """The parts of a hierarchy's advantage in held-out log-likelihood per step, as paired differences.
 
-    ``memory`` is hierarchy − mixture: both have the same experts and gate, and in the hierarchy alone options last.
+    ``memory`` is hierarchy − mixture: both have the same policies and gate, and in the hierarchy alone options last.
     ``experts`` is mixture − flat and ``total`` is hierarchy − flat, where there is a flat baseline, named in ``flat``.
 
     :param ours: the hierarchy's name.

@@ -239,7 +239,7 @@ class Fit:
         :raises BadInput: the model has no options.
         """
         if not self.names:
-            raise BadInput(f"{self.place}: is a {self.name} policy without options; name a run with a hierarchy")
+            raise BadInput(f"{self.place}: is a {self.name} policy without options; name a run that has options")
         fits = (self, *self.repetitions)
         seeds = [fit.spec.seed if (own := fit.spec.training.seed) is None else own for fit in fits]
         return draw([fit.infer(demos) for fit in fits], self.names, seeds, draws, seed)

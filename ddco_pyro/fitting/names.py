@@ -35,7 +35,7 @@ def checked(spec: Spec, given: Any) -> Named:
     """
     counts = {level.name: level.count for level in spec.hierarchy.levels} if spec.hierarchy else {}
     if not counts:
-        raise BadInput("there are no options to name; name a run with a hierarchy")
+        raise BadInput("there are no options to name; name a run that has options")
     if not isinstance(given, Mapping):
         raise BadInput("is no mapping; write a line for each level, such as: option: [reach, grasp]")
     named = {}

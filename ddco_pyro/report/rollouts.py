@@ -74,7 +74,7 @@ def paired_table(methods: Mapping[str, Method], ours: str) -> Table | None:
         for name, results in methods.items()
         if (pair := results.against)
     ]
-    head = [f"{method(ours)} against", f"Only {method(ours)} succeeds", "Only the other succeeds", "Episodes", "p"]
+    head = [f"{method(ours)} against", f"Only {method(ours)}: success", "Only the other: success", "Episodes", "p"]
     return Table(head, rows) if rows else None
 
 

@@ -1,4 +1,4 @@
-"""The worth of the hierarchy in the report, in two parts: several experts, and options that last."""
+"""The worth of options in the report, in two parts: several policies, and options that last."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from ddco_pyro.drawing.page import Section, Table, note
 from ddco_pyro.metrics import Metrics
 
 EXPLAINED = (
-    "A mixture has the hierarchy’s experts and the gate that chooses among them, and chooses anew at every step. "
-    "Its lead over one flat policy is the worth of several experts and of their parameters. The hierarchy’s lead "
-    "over it is the worth of options that last. This fit: ± one standard error over held-out demonstrations, p by "
-    "McNemar’s exact test. Training seeds: mean with its 95 % interval."
+    "A mixture has the options’ policies and the gate that chooses among them, and chooses anew at every step. The "
+    "mixture’s lead over one flat policy is the worth of several policies and of their parameters. The options’ lead "
+    "over the mixture is the worth of options that last. This fit: ± one standard error over held-out demonstrations, p "
+    "by McNemar’s exact test. Training seeds: mean with its 95 % interval."
 )
 
 
@@ -21,7 +21,7 @@ def section(metrics: Metrics) -> Section | None:
         return None
     ours, flat = words.method(metrics.model), words.method(found.flat or "flat")
     parts = {
-        "experts": f"Several experts: mixture − {flat}",
+        "experts": f"Several policies: mixture − {flat}",
         "memory": f"Options that last: {ours} − mixture",
         "total": f"Together: {ours} − {flat}",
     }
@@ -40,4 +40,4 @@ def section(metrics: Metrics) -> Section | None:
         for part, name in parts.items()
         if getattr(found, part)
     ]
-    return Section("worth", "What the hierarchy is worth", [Table(["Part", *columns], rows), note(EXPLAINED)])
+    return Section("worth", "What options are worth", [Table(["Part", *columns], rows), note(EXPLAINED)])

@@ -137,7 +137,7 @@ def segments(fit: Fit, source: Source, on_event: OnEvent = ignore, intervals: bo
     """
     hierarchy = fit.spec.hierarchy
     if hierarchy is None:
-        raise BadInput(f"{fit.place}: is a {fit.name} policy without options; name a run with a hierarchy")
+        raise BadInput(f"{fit.place}: is a {fit.name} policy without options; name a run that has options")
     counts = {level.name: level.count for level in hierarchy.levels}
     chosen, known = chosen_names(source, fit), label_names(source.attributes)
     labels: dict[str, dict[str, np.ndarray]] = {}
