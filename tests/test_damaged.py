@@ -127,9 +127,9 @@ def read_all(fit: Fit, metrics: Metrics) -> None:
     words.verdict(metrics), words.success(metrics)
     again = replace(fit, metrics=metrics)
     training.degeneracies(again), header(fit, metrics), training.particulars(again)
-    agreement.section(again)
+    agreement.section(again, fit.demonstrations)
     likelihood.table(metrics)
-    options.use_table(again)
+    options.use_table(again, None)
     found = metrics.rollouts
     if found:
         rollouts.measures_table(found.methods), rollouts.paired_table(found.methods, metrics.model)

@@ -38,7 +38,7 @@ def made(number=8, size=3):
         phase = (np.arange(steps) >= steps // 2).astype(int)
         actions = np.where(phase[:, None], 1.0, -1.0) * place[:, :2] + 0.1 * rng.normal(size=(steps, 2))
         rows.append(({"place": place}, actions, {"phase": phase}))
-    return numbered(rows)
+    return replace(numbered(rows), attributes={"control_frequency": 20.0})
 
 
 def run(folder, demos, name="run", labels="phase", **changes):
@@ -138,9 +138,27 @@ def test_demonstrations_are_listed_worst_first_with_links_to_their_segments(labe
     assert [name for name, *_ in listed] == sorted(demos.names, key=per_step.__getitem__)
     for name, link, held_out, numbers in listed:
         assert held_out == (name in valid)
-        assert numbers[:2] == [str(len(demos[demos.names.index(name)])), words.number(per_step[name])]
+        assert numbers[:2] == [words.duration(20, len(demos[demos.names.index(name)])), words.number(per_step[name])]
         assert page.count(f'id="{link}"') == 1
         assert tracks(page)[name][:2] == (link, held_out)
+
+
+def test_agreement_and_lengths_are_shown_beside_a_yardstick(labelled):
+    """Agreement beside that of equal lengths, here the labels themselves or one step off; steps beside seconds."""
+    found, page, _ = labelled
+    (section,) = re.findall(r'<section id="agreement">(.*?)</section>', page, re.DOTALL)
+    rows = dict(re.findall(r"<tr><td>([a-z][^<]*)</td><td>([^<]*)</td>", section))
+    assert list(rows)[:4] == [
+        "options, held out",
+        "equal lengths, held out",
+        "options, training",
+        "equal lengths, training",
+    ]
+    assert rows["options, held out"] == words.number(found.metrics.agreement.valid[0].nmi)
+    assert float(rows["equal lengths, training"]) > 0.7
+    for use in found.metrics.options[0][1:]:
+        assert f"<td>{use.segments}</td><td>{words.duration(20, use.length)}</td>" in page
+        assert f"<dd>{use.segments}</dd>\n<dt>Median length</dt><dd>{words.duration(20, use.length)}</dd>" in page
 
 
 def test_the_segments_are_those_of_the_most_likely_path(labelled):

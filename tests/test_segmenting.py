@@ -25,10 +25,11 @@ from sklearn.metrics import normalized_mutual_info_score
 from time_lines import embedded, tracks, unpacked
 
 import ddco_pyro
-from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.importing import import_demonstrations
 from ddco_pyro.data.sources import open_source
 from ddco_pyro.drawing.colours import option_colour
+from ddco_pyro.drawing.timeline import following
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.agreement import agreement
 from ddco_pyro.fitting.fit import fit
@@ -222,6 +223,14 @@ def test_numbers_follow_the_cursor(toy_run, written):
             np.testing.assert_allclose(row, expected, atol=span / 255 + 1e-5)
 
 
+def test_every_control_follows_the_cursor():
+    arm = {"arm": np.zeros((4, 20)), "hand": np.arange(12.0).reshape(4, 3)}
+    (numbers,) = (found["n"]["names"] for found in following([Demonstration("a", arm, np.eye(4, 14))], [], 4, "hand"))
+    assert numbers == [f"hand[{n}]" for n in range(3)] + [f"control[{n}]" for n in range(14)]
+    (numbers,) = (found["n"]["names"] for found in following([Demonstration("a", arm, np.eye(4, 2))], [], 4, None))
+    assert numbers == ["control[0]", "control[1]", *(f"arm[{n}]" for n in range(10))]
+
+
 def test_intervals_are_those_of_the_posterior_draws(toy_run, file):
     """The very draws of ``Inferred.draws`` for a demonstration, and one interval for each segment."""
     with open_source(file) as source:
@@ -268,6 +277,12 @@ def test_the_page_marks_what_was_held_out_and_says_how_labels_agree(toy_run, toy
     assert "Agreement with the label “phase”" in text
     assert f"<td>options, 3 held out</td><td>{scores['valid']:.2f}</td>" in text
     assert f"<td>options, 9 others</td><td>{scores['train']:.2f}</td>" in text
+    truth = [demo.labels["phase"] for demo in split["valid"]]
+    halves = normalized_mutual_info_score(
+        np.concatenate(truth), np.concatenate([np.arange(len(own)) * 2 // len(own) for own in truth])
+    )
+    assert f"<td>equal lengths, 3 held out</td><td>{halves:.2f}</td>" in text
+    assert "Tolerances of boundary F1: ±1 step, 0.05 s; ±3 steps, 0.15 s; ±5 steps, 0.25 s." in text
     assert "3 of 12 demonstrations were held out when the run was fitted" in text
 
 
@@ -292,6 +307,8 @@ def test_baselines_stand_beside_the_options_and_are_written_as_they_are(toy_run,
         for demo, kinds in zip(again, expected, strict=True):
             np.testing.assert_array_equal(demo.labels[f"option_{name}"], kinds + 1)
             np.testing.assert_array_equal(demo.labels[f"option_{name}_boundary"], np.diff(kinds, prepend=-1) != 0)
+        lanes = {lane["name"]: lane["names"] for lane in embedded(page.read_text())["lanes"]}
+        assert set(lanes[f"option_{name}"].values()) <= {"kind 1", "kind 2", "kind 3"}
         assert [int(row[f"option_{name}"]) for row in rows] == [kind + 1 for kinds in expected for kind in kinds]
         for row, (_, _, lanes) in enumerate(tracks(page.read_text()).values()):
             steps = [value for value, start, end in lanes[f"option_{name}"] for _ in range(start, end)]

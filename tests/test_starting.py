@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -121,6 +122,33 @@ def broken(path: Path, number: int, names: list[str], key: str = "obs/pose", **m
         for name in names:
             file[f"data/{name}/{key}"][1, 1] = np.nan
     return starting_spec(inspect(path), path)
+
+
+def test_options_are_compared_with_the_labels_that_know_most(path: Path) -> None:
+    """Neither with constant labels, nor with those that ``segment`` wrote."""
+    with h5py.File(path, "r+") as file:
+        file["data"].attrs["label_names"] = json.dumps({"whole": ["go", "take\nit"]})
+        for number, group in enumerate(file["data"].values()):
+            halves = np.arange(len(group["actions"])) * 2 // len(group["actions"])
+            group["labels/phase"][:] = np.where(number < 2, halves, -1)
+            for name, values in {
+                "all": 0 * halves,
+                "option": halves,
+                "option_boundary": halves,
+                "whole": halves,
+            }.items():
+                group[f"labels/{name}"] = values
+    facts = inspect(path)
+    text, steps = starting_spec(facts, path), sum(facts.lengths.values())
+    assert "  labels: whole                  # compared" in text
+    assert (
+        f"  # the fullest of the labels: known in {steps} of {steps} steps\n  # labels 0, 1, ...: go, take\\nit\n"
+        in text
+    )
+    few = sum(list(facts.lengths.values())[:2])
+    assert re.findall(r"# labels: (\w+)   # known in (\d+) of", text) == [
+        ("phase", str(few)), ("all", str(steps)), ("option", str(steps)), ("option_boundary", str(steps))
+    ]  # fmt: skip
 
 
 def test_a_few_broken_demonstrations_are_left_out(path: Path, tmp_path: Path) -> None:

@@ -122,10 +122,14 @@ def _shared(table: Confusion, option: int, value: int) -> tuple[int, tuple[int, 
 
 
 def accepted(spec: Spec, found: Sequence[NamedByLabel]) -> Named:
-    """The names with an agreement of :data:`AGREED` or more; levels without any are left out."""
+    """The names with an agreement of :data:`AGREED` or more, and those that ``training.labels`` gives by itself.
+
+    Levels without any are left out.
+    """
     named: Named = {}
     for level in spec.hierarchy.levels if spec.hierarchy else ():
-        own = {one.option: one.name for one in found if one.level == level.name and one.agreement >= AGREED}
+        given = spec.training.labels is not None and spec.training.labels.level == level.name
+        own = {one.option: one.name for one in found if one.level == level.name and (given or one.agreement >= AGREED)}
         if own:
             named[level.name] = tuple(own.get(option, option_name(option)) for option in range(1, 1 + level.count))
     return named

@@ -19,11 +19,11 @@ from ddco_pyro.training.data import parts
 def section(fit: Fit, demos: Demonstrations) -> Section | None:
     """The measures of each level, and where the steps of each label lie; None where the spec names no labels."""
     record = fit.metrics.agreement
-    if not record or fit.spec.hierarchy is None:
+    names, truth = list(fit.names), fit.spec.demonstrations.labels_by_level(len(fit.names))
+    if not record or not truth:
         return None
-    names = [level.name for level in fit.spec.hierarchy.levels]
     divided, scores = parts(fit.spec, demos), dict[str, Scores | None]()
-    for place, (level, label) in enumerate(zip(names, record.labels, strict=True)):
+    for place, (level, label) in enumerate(zip(names, truth, strict=True)):
         before, count = f"{level}: " if len(names) > 1 else "", len(fit.names[level]) - 1
         for words, part, found in (("held out", "valid", record.valid), ("training", "train", record.train)):
             if found is not None:
@@ -31,10 +31,10 @@ def section(fit: Fit, demos: Demonstrations) -> Section | None:
                 labels = [demo.labels[label] for demo in divided[part]]
                 scores[f"{before}{BASELINES[EQUAL]}, {words}"] = of_equal_lengths(labels, count)
     known = label_names(demos.attributes)
-    compared = quoted(list(dict.fromkeys(record.labels)))
+    compared = quoted(fit.spec.demonstrations.label_names)
     blocks: list[Block] = [Text(f"Options and the ground-truth {compared}."), agreement_table(scores)]
     blocks.append(note(f"{EXPLAINED} {tolerances(demos.frequency)}"))
-    for level, label, own in zip(names, record.labels, record.confusion, strict=True):
+    for level, label, own in zip(names, truth, record.confusion, strict=True):
         names_of_labels = [label_name(label, value, known.get(label, ()), level) for value in own.labels]
         title = f"Where each label’s steps lie: level “{level}”, label “{label}”"
         blocks += [Text(title, "heading"), confusion_table(own, fit.names[level], names_of_labels)]

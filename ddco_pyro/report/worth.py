@@ -9,8 +9,8 @@ from ddco_pyro.metrics import Metrics
 EXPLAINED = (
     "A mixture has the options’ policies and the gate that chooses among them, and chooses anew at every step. The "
     "mixture’s lead over one flat policy is the worth of several policies and of their parameters. The options’ lead "
-    "over the mixture is the worth of options that last. This fit: ± one standard error over held-out demonstrations, p "
-    "by McNemar’s exact test. Training seeds: mean with its 95 % interval."
+    "over the mixture is the worth of options that last. This fit: ± one standard error over held-out demonstrations, "
+    "p by McNemar’s exact test. Training seeds: mean with its 95 % interval."
 )
 
 
