@@ -437,9 +437,10 @@ class Confusion(Record):
     matched: list[int | None]
 
     @model_validator(mode="after")
-    def _of_one_size(self) -> Confusion:
+    def _whole(self) -> Confusion:
         sizes = [len(self.labels), *(len(row) for row in self.steps), len(self.matched)]
-        if sizes != [len(self.steps), *[len(self.options)] * (len(self.steps) + 1)]:
+        whole = sizes == [len(self.steps), *[len(self.options)] * (len(self.steps) + 1)]
+        if not whole or set(self.matched) - {None, *self.labels}:
             raise invalid(("", "is no table of labels by options"))
         return self
 

@@ -147,7 +147,7 @@ def test_options_are_compared_with_the_labels_that_know_most(path: Path) -> None
     )
     few = sum(list(facts.lengths.values())[:2])
     assert re.findall(r"# labels: (\w+)   # known in (\d+) of", text) == [
-        ("phase", str(few)), ("all", str(steps)), ("option", str(steps)), ("option_boundary", str(steps))
+        ("other", str(steps)), ("phase", str(few)), ("all", str(steps)), ("option", str(steps)), ("option_boundary", str(steps))
     ]  # fmt: skip
 
 

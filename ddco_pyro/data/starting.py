@@ -141,10 +141,14 @@ def _filled(
 
 
 def _fullest_first(labels: Sequence[Field]) -> list[Field]:
-    """Labels with the fewest unknown steps first; last are constant ones, and those that ``segment`` wrote."""
+    """Labels with the fewest unknown steps first, named ones of equals; constant ones, and ``segment``'s, are last."""
     keys = {field.key for field in labels}
-    written = {field.key for field in labels if field.key.removesuffix(BOUNDARY) + BOUNDARY in keys}
-    return sorted(labels, key=lambda field: (field.key in written, bool(field.constant), field.unknown))
+
+    def rank(field: Field) -> tuple[bool, bool, int, bool]:
+        written = field.key.removesuffix(BOUNDARY) + BOUNDARY in keys
+        return written, bool(field.constant), field.unknown, not field.names
+
+    return sorted(labels, key=rank)
 
 
 def _text(value: str) -> str:
