@@ -131,24 +131,17 @@ def test_options_are_compared_with_the_labels_that_know_most(path: Path) -> None
         for number, group in enumerate(file["data"].values()):
             halves = np.arange(len(group["actions"])) * 2 // len(group["actions"])
             group["labels/phase"][:] = np.where(number < 2, halves, -1)
-            for name, values in {
-                "all": 0 * halves,
-                "option": halves,
-                "option_boundary": halves,
-                "whole": halves,
-            }.items():
+            full = dict.fromkeys(["option", "option_boundary", "other", "whole"], halves)
+            for name, values in {"all": 0 * halves, **full}.items():
                 group[f"labels/{name}"] = values
     facts = inspect(path)
     text, steps = starting_spec(facts, path), sum(facts.lengths.values())
     assert "  labels: whole                  # compared" in text
-    assert (
-        f"  # the fullest of the labels: known in {steps} of {steps} steps\n  # labels 0, 1, ...: go, take\\nit\n"
-        in text
-    )
+    assert f"  # the fullest of the labels: known in {steps} of {steps} steps\n" in text
+    assert "  # labels 0, 1, ...: go, take\\nit\n" in text
     few = sum(list(facts.lengths.values())[:2])
-    assert re.findall(r"# labels: (\w+)   # known in (\d+) of", text) == [
-        ("other", str(steps)), ("phase", str(few)), ("all", str(steps)), ("option", str(steps)), ("option_boundary", str(steps))
-    ]  # fmt: skip
+    known = dict(other=steps, phase=few, all=steps, option=steps, option_boundary=steps)
+    assert re.findall(r"# labels: (\w+)   # known in (\d+) of", text) == [(key, str(known[key])) for key in known]
 
 
 def test_a_few_broken_demonstrations_are_left_out(path: Path, tmp_path: Path) -> None:
