@@ -273,7 +273,7 @@ training: {{epochs: 3, labels: {{level: skill, from: phase, count: 2}}, duration
 
 def test_a_run_says_for_which_labels_its_options_stand(files):
     output = call("check", files / "mine.yaml").out
-    assert "labels/phase, level 'skill': 0 is option 1, 2 is option 2; used of 2 demonstrations" in output
+    assert "labels/phase, level 'skill': phase 0 is option 1, phase 2 is option 2; used of 2 demonstrations" in output
     call("fit", files / "mine.yaml", "--out", files / "run")
     said = json.loads((files / "run" / "metrics.json").read_text())["trained_labels"]
     assert (said["level"], said["labels"], said["values"]) == ("skill", "phase", [0, 2])

@@ -140,7 +140,7 @@ def test_options_are_compared_with_the_labels_that_know_most(path: Path) -> None
     assert f"  # the fullest of the labels: known in {steps} of {steps} steps\n" in text
     assert "  # labels 0, 1, ...: go, take\\nit\n" in text
     few = sum(list(facts.lengths.values())[:2])
-    known = dict(other=steps, phase=few, all=steps, option=steps, option_boundary=steps)
+    known = {"other": steps, "phase": few, "all": steps, "option": steps, "option_boundary": steps}
     assert re.findall(r"# labels: (\w+)   # known in (\d+) of", text) == [(key, str(known[key])) for key in known]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
@@ -218,14 +218,16 @@ def device(spec: Spec) -> None:
         say(f"networks: on {described(device_of(spec.training))}, {spec.training.precision} in gradient steps")
 
 
-def labels(spec: Spec, used: Labels | None) -> None:
-    """The label of each option, where training uses labels."""
+def labels(spec: Spec, used: Labels | None, known: Mapping[str, Sequence[str]]) -> None:
+    """The label of each option, where training uses labels.
+
+    :param known: the names of labels 0, 1, ... by name of labels.
+    """
     own = spec.training.labels
     if used is not None and own is not None:
-        names = ", ".join(
-            f"{value} is {words.option_name(option)}" for option, value in enumerate(used.values, start=1)
-        )
-        say(f"labels/{own.source}, level {own.level!r}: {names}; used of {len(used.demonstrations)} demonstrations")
+        names = (words.label_name(own.source, value, known.get(own.source, ()), own.level) for value in used.values)
+        each = ", ".join(f"{name} is {words.option_name(option)}" for option, name in enumerate(names, start=1))
+        say(f"labels/{own.source}, level {own.level!r}: {each}; used of {len(used.demonstrations)} demonstrations")
 
 
 # --- fit, select, merge, rollout --------------------------------------------------------------------------------------

@@ -46,6 +46,7 @@ def check(
         raise SpecError("name a spec, such as: ddco-pyro check specs/needle.yaml")
     loaded = load_spec(spec, overrides, allow_code)
     from ddco_pyro.cli import console
+    from ddco_pyro.data.sources.recording import label_names
     from ddco_pyro.training.data import dimensions, in_file, outline, refuse_unfit
     from ddco_pyro.training.labels import used
     from ddco_pyro.training.networks import check_models
@@ -55,12 +56,12 @@ def check(
     (_, hierarchy), *baselines = check_models(loaded, size).values()
     if demos is not None:
         refuse_unfit(loaded, demos)
-    labels = used(loaded, demos) if demos else None
+    labels, known = (used(loaded, demos), label_names(demos.attributes)) if demos else (None, {})
     print(dump_spec(loaded), end="")
     console.dimensions(loaded, size, hierarchy, baselines)
     console.control(size, hierarchy)
     console.device(loaded)
-    console.labels(loaded, labels)
+    console.labels(loaded, labels, known)
 
 
 def fit(
