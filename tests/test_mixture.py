@@ -260,7 +260,7 @@ def test_a_run_says_what_lasting_is_worth(run):
     assert found.memory.nats_per_step == pytest.approx((ours - mixture) / sum(held_out.lengths))
     (path,) = run.segment(held_out)
     assert found.steps_in_a_row[0].options == pytest.approx(mean_run(path))
-    assert words.worth(found, "DDCO", len(held_out)) in words.verdict(run.metrics)
+    assert words.worth(found, "options", len(held_out)) in words.verdict(run.metrics)
 
 
 def test_its_segments_are_runs_of_one_expert():

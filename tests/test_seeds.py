@@ -141,7 +141,7 @@ def test_rollouts_have_the_same_two_parts_and_the_same_seeds(written, tmp_path):
     assert found["seeds"]["worth"]["experts"] == pytest.approx(experts)
     own = found["worth"]
     assert (own["memory"]["only_ours"] - own["memory"]["only_theirs"]) / 6 == pytest.approx(memory[0])
-    assert words.success_worth(Rollouts.model_validate(found), "DDCO") in ended.out
+    assert words.success_worth(Rollouts.model_validate(found), "options") in ended.out
     page = (run / "report.html").read_text()
     assert 'id="worth"' in page
     assert "Points of success, 3 training seeds" in page

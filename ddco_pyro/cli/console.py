@@ -123,7 +123,7 @@ class Progress:
             case SeedFitted(total):
                 self._advance("fitting with other training seeds", total)
             case EpisodeEnded(method, total):
-                self._advance("rolling out", total, note=method)
+                self._advance("rolling out", total, note=words.method(method))
             case StudyBegan(total, kept):
                 self._begin(f"study{f' ({kept} of {total} kept)' if kept else ''}", total - kept)
             case CellDone(cell, failed):

@@ -92,7 +92,7 @@ def fit(
     ] = False,
     allow_code: AllowCode = False,
 ) -> None:
-    """Fit the spec's hierarchy and its baselines; write the run folder with its report.
+    """Fit the spec's options and its baselines; write the run folder with its report.
 
     An unfinished run of the same spec in --out is continued, with any number of processes. Under torchrun processes
     share each gradient step, at most training.shards of them.

@@ -73,7 +73,7 @@ def run_table(compared: Comparison) -> Table:
         numbers = [words.number(value, 1) for value in (row.total, row.se, row.difference, row.dse)]
         if row.rank == 0:
             numbers[2:] = ["0", "0"]
-        first = [str(row.rank), row.name, row.model, str(row.parameters)]
+        first = [str(row.rank), row.name, words.method(row.model), str(row.parameters)]
         rows.append([*first, *numbers, words.number(row.per_step, 3), words.effort(row.training)])
     return Table(head, rows, {0, 1, 2})
 
