@@ -129,7 +129,7 @@ def read_all(fit: Fit, metrics: Metrics) -> None:
     training.degeneracies(again), header(fit, metrics), training.particulars(again)
     agreement.section(again, fit.demonstrations)
     likelihood.table(metrics)
-    options.use_table(again, None)
+    options.use_table(again)
     found = metrics.rollouts
     if found:
         rollouts.measures_table(found.methods), rollouts.paired_table(found.methods, metrics.model)

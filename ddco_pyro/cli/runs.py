@@ -114,7 +114,7 @@ def name(
         fitted.name_options(level or next(iter(fitted.names), ""), names.split(","))
     elif not fitted.names or (level and level not in fitted.names):
         raise BadInput(f"{run}: has no {f'level {level!r}' if fitted.names else 'options'}; name another")
-    console.show(use_table(fitted, fitted.metrics.control_frequency, [level] if level else None))
+    console.show(use_table(fitted, [level] if level else None))
     if names is not None:
         allowed = ["--allow-code"] if allow_code else []
         print(f"{run / 'names.yaml'}: show them with: {command('report', run, *allowed)}")

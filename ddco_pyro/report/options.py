@@ -66,16 +66,15 @@ def section(fit: Fit, demos: Demonstrations, activity: Activity) -> Section:
         apart = f"Each level numbers its own options: equal colours in two levels mean nothing.{named}"
         blocks.insert(0, Text(apart))
     blocks.append(Text("Use of the options", "heading"))
-    blocks.append(use_table(fit, demos.frequency))
+    blocks.append(use_table(fit))
     link = Markup('<a href="#segments">segments of every demonstration</a>')
     blocks += [used, Text(Markup("Step by step: {}.").format(link))]
     return Section("options", "Which option is active when", blocks)
 
 
-def use_table(fit: Fit, frequency: float | None, levels: Sequence[str] | None = None) -> Table:
+def use_table(fit: Fit, levels: Sequence[str] | None = None) -> Table:
     """The use of each choice of each level, the highest level first; control only where it is chosen.
 
-    :param frequency: steps per second (Hz); None where unknown.
     :param levels: the levels to show; None for all.
     """
     rows, stands_for = [], {(one.level, one.option): agreeing(one) for one in fit.metrics.named_by_labels}
@@ -84,11 +83,18 @@ def use_table(fit: Fit, frequency: float | None, levels: Sequence[str] | None = 
         for row in use if levels is None or level in levels else ():
             if row.choice or row.segments:
                 named = Cell(numbered_name(row.choice, names), colour=option_colour(row.choice))
-                length = "–" if row.length is None else duration(frequency, row.length)
+                length = "–" if row.length is None else duration(fit.metrics.control_frequency, row.length)
                 label = [stands_for.get((level, row.choice), "–")] if stands_for else []
                 rows.append([level, named, percent(row.steps / total, 1), str(row.segments), length, *label])
-    head = ["Level", "Option", "Share of steps", "Segments", "Median length", *["Label, agreement"][: len(stands_for)]]
-    return Table(head, rows, {0, 1, len(head) - bool(stands_for)})
+    head = [
+        "Level",
+        "Option",
+        "Share of steps",
+        "Segments",
+        "Median length",
+        *(["Label, agreement"] if stands_for else []),
+    ]
+    return Table(head, rows, {0, 1, 5})
 
 
 def agreeing(one: NamedByLabel) -> str:
