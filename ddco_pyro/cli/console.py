@@ -309,7 +309,7 @@ def names(fit: Fit) -> None:
             say(f"names proposed, not written: {words.listed(said)}; to take them: {again}")
     if found:
         labels = words.listed(dict.fromkeys(f"labels/{one.labels}" for one in found.values()))
-        say(f"Behind a name: the steps that its option and its label in {labels} share, of the steps of either.")
+        say(f"Agreement with {labels}: the steps with both an option and its label, divided by the steps with either.")
 
 
 def successes(metrics: Metrics) -> None:
