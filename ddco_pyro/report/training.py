@@ -201,7 +201,8 @@ def _value(finding: Finding, frequency: float | None) -> str:
     if finding.kind == "redundant":
         return number(finding.value, 3)
     if finding.kind == "never_persisting":
-        return f"{words.duration(frequency, finding.value)}, selected {number(finding.selections, 1)} times a demonstration"
+        lasts = words.duration(frequency, finding.value)
+        return f"{lasts}, selected {number(finding.selections, 1)} times a demonstration"
     return percent(finding.value, 1)
 
 
