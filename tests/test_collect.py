@@ -222,7 +222,22 @@ CONV = {"network": "conv"}
     [
         ({"observations": ["offsets", "pose", "jaw"]}, r"^observations: there is no pose, jaw \(there are: camera, of"),
         ({"control": {"scale": [1.0]}}, r"^control\.scale: has 1 numbers, but the control has 2 dimensions$"),
-        ({"observations": ["visited"], "report": {"trajectory": "visited"}}, r"^report\.trajectory: 'visited' has"),
+        (
+            {"observations": ["visited"], "report": {"trajectory": "visited"}},
+            r"^report\.trajectory: 'visited' is 1 num",
+        ),
+        (
+            {"report": {"trajectory": ["offsets", "3:9"]}},
+            r"^report\.trajectory: 'offsets\[3:9\]' is 1 numbers, of shape",
+        ),
+        (
+            {"report": {"trajectory": ["offsets", "0:4"]}},
+            r"^report\.trajectory: 'offsets\[0:4\]' is 4 numbers, of shape",
+        ),
+        (
+            {"report": {"trajectory": [["offsets", "0:3"], ["offsets", "2:4"]]}},
+            r"^report\.trajectory: offsets\[2:4\] is in the plane, offsets\[0:3\] in space; name as many",
+        ),
         ({"observations": ["camera"]}, r"^baseline\.policy: reads vectors, but camera are images"),
         (
             {"baseline": None, "hierarchy": {"levels": [LEVEL, LEVEL | {"name": "task", "termination": CONV}]}},

@@ -68,6 +68,30 @@ def test_one_command_makes_what_four_make(file: Path, tmp_path: Path) -> None:
     assert (tmp_path / "one" / "run" / "model.safetensors").stat().st_mtime_ns == before
 
 
+def test_another_setting_of_the_report_draws_again_and_fits_nothing(file: Path, tmp_path: Path) -> None:
+    quick(out := tmp_path / "out", file)
+    spec, run = out / "spec.yaml", out / "run"
+    assert call("new", file, "--out", out).status == 0
+    before, text = (run / "model.safetensors").stat().st_mtime_ns, spec.read_text()
+    spec.write_text(text + "report: {trajectory: goal}\n")
+    assert call("new", file, "--out", out).status == 0
+    assert "Drawings: observation “goal”." in (run / "report.html").read_text()
+    assert call("report", run, "--set", "report.trajectory=[object, 0:2]").status == 0
+    assert "Drawings: observation “object[0:2]”." in (run / "report.html").read_text()
+    assert (run / "model.safetensors").stat().st_mtime_ns == before
+    for change, message in {
+        "report.trajectory=objekt": "there is no observation 'objekt' (did you mean 'object'?)",
+        "report.trajectory=[object, 0:1]": "'object[0:1]' is 1 numbers",
+        "seed=3": "is fitted; only settings of the report can change",
+    }.items():
+        ended = call("report", run, "--set", change)
+        assert (ended.status, ended.err.count("\n")) == (2, 1)
+        assert message in ended.err
+    assert [str(path) for path in ddco_pyro.load(run).spec.report.trajectory or ()] == ["object[0:2]"]
+    spec.write_text(text + "seed: 3\n")
+    assert "holds a run of another spec" in call("new", file, "--out", out).err
+
+
 def test_a_folder_of_another_file_is_refused(file: Path, tmp_path: Path) -> None:
     quick(tmp_path / "out", file)
     other = tmp_path / "other.hdf5"

@@ -9,7 +9,7 @@ import pytest
 import toy_task
 from made_metrics import compared, made_metrics
 from random_demonstrations import numbered
-from time_lines import tracks
+from time_lines import embedded, tracks
 
 from ddco_pyro.cli import console
 from ddco_pyro.data.demonstrations import Demonstrations
@@ -19,7 +19,7 @@ from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.fitted import load
 from ddco_pyro.metrics import Metrics
 from ddco_pyro.report import rollouts as rolling
-from ddco_pyro.report import training, write_report
+from ddco_pyro.report import training, trajectories, write_report
 from ddco_pyro.report.activity import Activity, LevelActivity, activity, bins
 from ddco_pyro.report.options import row_order, shares, terminations
 from ddco_pyro.simulation.episodes import Episode, paired_difference, summarize
@@ -298,6 +298,49 @@ def test_the_hand_is_drawn_where_something_else_moves_further(other, absolute):
 
 def test_nothing_is_drawn_where_nothing_moves():
     assert position_key(observing([{"goal": np.full((5, 3), 0.1)}, {"goal": np.full((1, 3), 0.7)}])) is None
+
+
+@pytest.mark.parametrize(("space", "drawn"), [({}, "hand"), ({"arm": 3}, "arm")])
+def test_a_plane_is_drawn_where_nothing_moves_in_space(space, drawn):
+    """A sine and a cosine are no place, and two fingers of a gripper none beside an arm."""
+    rng, demos = np.random.default_rng(0), []
+    for _ in range(4):
+        turn = np.cumsum(0.1 * rng.random(30))[:, None]
+        moved = {key: np.cumsum(rng.normal(size=(30, size)), 0) for key, size in {"hand": 2, **space}.items()}
+        demos.append({"angle": np.hstack([np.sin(turn), np.cos(turn)]), "goal": np.ones((30, 3)), **moved})
+    assert position_key(observing(demos)) == drawn
+
+
+@pytest.mark.parametrize(
+    ("size", "drawn", "numbers", "said"),
+    [
+        (2, None, [[0, 1]], "observation “place”"),
+        (4, None, [[0, 1, 2]], "observation “place” (the first three of its 4 numbers)"),
+        (4, ["place", "2:4"], [[2, 3]], "observation “place[2:4]”"),
+        (
+            6,
+            [["place", "0:3"], ["place", "3:6"]],
+            [[0, 1, 2], [3, 4, 5]],
+            "observations “place[0:3]” (solid), “place[3:6]” (dashed)",
+        ),
+    ],
+)
+def test_what_is_drawn_is_what_the_spec_names(tmp_path, size, drawn, numbers, said, monkeypatch):
+    figures, save = {}, trajectories.save
+    monkeypatch.setattr(
+        trajectories, "save", lambda one, path, *text: figures.update({path.stem: one}) or save(one, path, *text)
+    )
+    found, demos = run(tmp_path, made(5, size), training={"epochs": 1}, compare_with=[], report={"trajectory": drawn})
+    page = html.unescape(write_report(found, demos).read_text())
+    axes = figures["trajectories"].axes[0]
+    plane = len(numbers[0]) == 2
+    assert (axes.name, axes.get_aspect()) == (("rectilinear", 1.0) if plane else ("3d", "auto"))
+    assert len({str(dash) for dash in axes.collections[0].get_linestyles()}) == len(numbers)
+    assert f"Drawings: {said}." in page
+    assert f"by the most likely option: {said}, in its own units." in page
+    shown = embedded(page)["tracks"][0]
+    names = [[shown["n"]["names"][place] for place in path] for path in shown["paths"]]
+    assert names == [[f"place[{number}]" for number in path] for path in numbers]
 
 
 def test_movement_by_hand():

@@ -15,7 +15,7 @@ from scipy.cluster.hierarchy import linkage
 
 from ddco_pyro.data.demonstrations import Demonstration
 from ddco_pyro.drawing.colours import CONTROL, OPTIONS, option_rgb
-from ddco_pyro.drawing.diagrams import dendrogram, transition_graph
+from ddco_pyro.drawing.diagrams import dendrogram, path_film, transition_graph, typical_paths
 from ddco_pyro.drawing.shown import frames, projection
 from ddco_pyro.report.inputs import _shares
 from ddco_pyro.report.skills import Instance, aligned, film_of, instances, sheet_of, transitions
@@ -106,6 +106,21 @@ def test_a_projection_keeps_distances_in_the_plane_that_it_looks_at():
     points = np.random.default_rng(0).normal(size=(50, 3))
     turn = projection(points) * np.ptp(points, axis=0).max()
     np.testing.assert_allclose(turn @ turn.T, np.eye(2), atol=1e-12)
+
+
+def test_a_plane_is_drawn_as_it_is_with_one_scale():
+    points = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 1.0]])
+    np.testing.assert_allclose(points @ projection(points).T, [[0, 0], [1, 0], [1, -0.25]])
+
+
+def test_each_path_of_two_arms_has_a_line_of_its_own():
+    """Two demonstrations of two arms; a film of one of them has a point on each arm."""
+    still, moving = np.zeros((6, 2)), np.arange(12.0).reshape(6, 2)
+    both = [np.stack([still, moving]), np.stack([moving, still])]
+    drawn = typical_paths(both, [(0, 2, 5)], "#123456")
+    assert re.findall(r'<polyline[^>]*stroke-dasharray="([^"]*)"', drawn) == ["none", "5 2.5"]
+    assert drawn.count('class="faint"') == 4
+    assert len(re.findall("<circle", path_film(both[:1], np.array([[0], [3], [5]]), 1.0, "#123456"))) == 2
 
 
 def test_a_dendrogram_joins_the_alike_first():

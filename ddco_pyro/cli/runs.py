@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import typer
 
-from ddco_pyro.cli import BRACKET, AllowCode, AllowExternal, RunPath, out_file, out_folder, written
+from ddco_pyro.cli import BRACKET, AllowCode, AllowExternal, Overrides, RunPath, out_file, out_folder, written
 from ddco_pyro.data.files import Output, check_outputs
 from ddco_pyro.errors import BadInput, command
 
@@ -84,13 +84,15 @@ def rollout(
     print(f"report: {write_report(fitted, demos)}")
 
 
-def report(run: RunPath, allow_code: AllowCode = False) -> None:
-    """Write the report of a run again."""
+def report(run: RunPath, overrides: Overrides = [], allow_code: AllowCode = False) -> None:  # noqa: B006
+    """Write the report of a run again. RUN/spec.yaml keeps what --set changes, such as report.trajectory=KEY."""
     from ddco_pyro.fitting.fitted import load
+    from ddco_pyro.fitting.run import claim
     from ddco_pyro.report import write_report
 
-    fitted = load(run, allow_code)
-    _check_run(run)
+    fitted = load(run, allow_code, overrides)
+    _check_run(run, "spec.yaml")
+    claim(run, fitted.spec)
     print(f"report: {write_report(fitted, fitted.demonstrations)}")
 
 

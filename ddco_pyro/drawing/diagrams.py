@@ -9,6 +9,7 @@ import numpy as np
 from markupsafe import Markup
 
 from ddco_pyro.drawing.colours import option_colour
+from ddco_pyro.drawing.shown import LINES
 
 WIDTH = 900
 """Units across a drawing as wide as the page."""
@@ -150,10 +151,12 @@ CELL = 110.0
 
 MARGIN = 8.0
 
+DASHES = {"solid": "none", "dashed": "5 2.5", "dotted": "1.2 2"}
+
 
 def fitted(paths: Sequence[np.ndarray], width: float, height: float) -> list[np.ndarray]:
-    """Paths in the plane [T, 2], moved and scaled together into a box."""
-    every = np.concatenate(paths)
+    """Paths in the plane [P, T, 2], moved and scaled together into a box."""
+    every = np.concatenate([path.reshape(-1, 2) for path in paths])
     low, span = every.min(0), np.ptp(every, axis=0)
     room = np.array([width, height]) - 2 * MARGIN
     scale = min(room / np.where(span > 0, span, 1e-9))
@@ -167,29 +170,36 @@ def line(points: np.ndarray, **looks: Any) -> Markup:
     return Markup('<polyline points="{}" fill="none"{}/>').format(drawn, _attributes(looks))
 
 
+def paths_of_one(points: np.ndarray, **looks: Any) -> Markup:
+    """A line for each path [P, T, 2] of a demonstration: solid, dashed or dotted."""
+    dashes = (DASHES[LINES[place % len(LINES)]] for place in range(len(points)))
+    return Markup("").join(line(path, stroke_dasharray=next(dashes), **looks) for path in points)
+
+
 def typical_paths(paths: Sequence[np.ndarray], segments: Sequence[tuple[int, int, int]], colour: str) -> Markup:
     """Segments in colour over whole demonstrations; circle, square and triangle: first, middle and last step.
 
-    :param paths: of demonstrations in the plane [T, 2].
+    :param paths: of demonstrations in the plane [P, T, 2].
     :param segments: (demonstration, first step, step after the last).
     """
     width, height = 2.4 * CELL, 2 * CELL
     placed = fitted(paths, width, height)
-    parts: list[str] = [line(path, class_="faint") for path in placed]
+    parts: list[str] = [line(path, class_="faint") for each in placed for path in each]
+    mark = f'fill="{colour}" stroke="var(--paper)" stroke-width="1"'
     for row, start, end in segments:
-        parts.append(line(placed[row][start:end], stroke=colour, stroke_width=2))
-        (x, y), (x1, y1), (x2, y2) = (placed[row][step] for step in (start, (start + end - 1) // 2, end - 1))
-        mark = f'fill="{colour}" stroke="var(--paper)" stroke-width="1"'
-        parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4.5" {mark}/>')
-        parts.append(f'<rect x="{x1 - 3.5:.1f}" y="{y1 - 3.5:.1f}" width="7" height="7" {mark}/>')
-        parts.append(f'<path d="M{x2:.1f},{y2 - 5:.1f} l5,9 l-10,0 z" {mark}/>')
+        parts.append(paths_of_one(placed[row][:, start:end], stroke=colour, stroke_width=2))
+        for path in placed[row]:
+            (x, y), (x1, y1), (x2, y2) = (path[step] for step in (start, (start + end - 1) // 2, end - 1))
+            parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4.5" {mark}/>')
+            parts.append(f'<rect x="{x1 - 3.5:.1f}" y="{y1 - 3.5:.1f}" width="7" height="7" {mark}/>')
+            parts.append(f'<path d="M{x2:.1f},{y2 - 5:.1f} l5,9 l-10,0 z" {mark}/>')
     return svg(width, height, "Trajectories of typical segments", parts)
 
 
 def path_film(paths: Sequence[np.ndarray], steps: np.ndarray, seconds: float, colour: str) -> Markup:
     """A grid of cells in each of which a point moves along one instance; all begin at their onset together.
 
-    :param paths: the demonstration of each instance in the plane [T, 2].
+    :param paths: the demonstration of each instance in the plane [P, T, 2]; a point moves along each path.
     :param steps: the step of each frame in each instance, [F, instances].
     :param seconds: of the whole film.
     """
@@ -197,19 +207,20 @@ def path_film(paths: Sequence[np.ndarray], steps: np.ndarray, seconds: float, co
     placed = fitted(paths, CELL, CELL)
     parts: list[str] = []
     for cell, path in enumerate(placed):
-        shown = path[steps[:, cell]]
+        shown = path[:, steps[:, cell]]
         parts.append(f'<g transform="translate({CELL * (cell % columns):.0f},{CELL * (cell // columns):.0f})">')
         parts.append(f'<rect x="1" y="1" width="{CELL - 2:.0f}" height="{CELL - 2:.0f}" class="faint"/>')
-        parts += [line(path, class_="faint"), line(shown, stroke=colour, stroke_width=1.5)]
-        parts.append(
-            f'<circle r="4.5" cx="{shown[0, 0]:.1f}" cy="{shown[0, 1]:.1f}" fill="{colour}" stroke="var(--ink)">'
-        )
-        for axis, name in enumerate(("cx", "cy")):
-            values = ";".join(f"{value:.1f}" for value in shown[:, axis])
-            parts.append(
-                f'<animate attributeName="{name}" values="{values}" dur="{seconds:.2f}s" repeatCount="indefinite"/>'
-            )
-        parts.append("</circle></g>")
+        parts += [line(one, class_="faint") for one in path]
+        parts.append(paths_of_one(shown, stroke=colour, stroke_width=1.5))
+        for (x, y), one in zip(shown[:, 0], shown, strict=True):
+            parts.append(f'<circle r="4.5" cx="{x:.1f}" cy="{y:.1f}" fill="{colour}" stroke="var(--ink)">')
+            for axis, name in enumerate(("cx", "cy")):
+                values = ";".join(f"{value:.1f}" for value in one[:, axis])
+                parts.append(
+                    f'<animate attributeName="{name}" values="{values}" dur="{seconds:.2f}s" repeatCount="indefinite"/>'
+                )
+            parts.append("</circle>")
+        parts.append("</g>")
     rows = -(-len(placed) // columns)
     return svg(columns * CELL, rows * CELL, "Instances from their onset on", parts, class_="film", tabindex="0")
 

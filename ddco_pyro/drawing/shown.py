@@ -1,4 +1,4 @@
-"""What is shown of a demonstration: its trajectory in space, its pictures, and its numbers over time."""
+"""What is shown of a demonstration: its paths in space, its pictures, and its numbers over time."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.pictures import PICTURE_DIMENSIONS, Observed
 from ddco_pyro.data.sources import Source
+from ddco_pyro.spec import PathSpec
 
 LEAST_OBLIQUE = 15.0
 """Degrees between the view and an axis, at least; a view along an axis hides the axis' scale."""
@@ -29,22 +30,54 @@ MOST_SKIPPED = 4
 """Steps of a stretch that is read whole, for each of its pictures that is shown."""
 
 
-# --- trajectories in space --------------------------------------------------------------------------------------------
+# --- paths in space ---------------------------------------------------------------------------------------------------
+
+
+def paths_of(named: Sequence[PathSpec] | None, demos: Demonstrations) -> tuple[PathSpec, ...]:
+    """The paths that are drawn of each demonstration: the named ones, else that of :func:`position_key`."""
+    key = None if named else position_key(demos)
+    return tuple(named or ()) if key is None else (PathSpec(key=key),)
+
+
+def positions(demo: Demonstration, paths: Sequence[PathSpec]) -> np.ndarray:
+    """The positions of P paths in space or in the plane, [P, T, 3] or [P, T, 2]."""
+    arrays = [np.asarray(demo.observations[path.key], float) for path in paths]
+    return np.stack([array[:, path.among(array.shape[1])] for path, array in zip(paths, arrays, strict=True)])
+
+
+def told(paths: Sequence[PathSpec], demos: Demonstrations) -> str:
+    """The paths in words: which numbers of which observations, and how the lines of several differ."""
+    each = []
+    for place, path in enumerate(paths):
+        size = demos.observation_shapes[path.key][0]
+        more = [LINES[place % len(LINES)]] if len(paths) > 1 else []
+        more += [f"the first three of its {size} numbers"] if path.numbers is None and size > 3 else []
+        each.append(f"“{path}”" + (f" ({'; '.join(more)})" if more else ""))
+    return f"observation{'s' * (len(each) > 1)} {', '.join(each)}"
+
+
+LINES = ("solid", "dashed", "dotted")
+"""Of several paths, in turn."""
 
 
 def position_key(demos: Demonstrations) -> str | None:
-    """The vector of three numbers or more with the most :func:`movement` that controls explain; None where none moves.
+    """The vector that controls :func:`move <movement>` most: of three numbers or more, or else of two; None without one.
 
     An object that the hand moves later may move more than the hand, but controls say less of where the object goes.
     """
-    keys = [key for key, shape in demos.observation_shapes.items() if len(shape) == 1 and shape[0] >= 3]
-    controls = [demo.actions.astype(float) for demo in demos]
-    moves = {}
-    for key in keys:
-        values = [np.asarray(demo.observations[key]) for demo in demos]
-        if moved := movement(values):
-            moves[key] = moved * (UNEXPLAINED + (1 - UNEXPLAINED) * _explained(values, controls))
-    return max(moves, key=moves.__getitem__, default=None)
+    shapes, controls = demos.observation_shapes, [demo.actions.astype(float) for demo in demos]
+    for keys in (
+        [key for key, shape in shapes.items() if len(shape) == 1 and shape[0] >= 3],
+        [key for key, shape in shapes.items() if shape == (2,)],
+    ):
+        moves = {}
+        for key in keys:
+            values = [np.asarray(demo.observations[key]) for demo in demos]
+            if moved := movement(values):
+                moves[key] = moved * (UNEXPLAINED + (1 - UNEXPLAINED) * _explained(values, controls))
+        if moves:
+            return max(moves, key=moves.__getitem__)
+    return None
 
 
 def movement(values: Sequence[np.ndarray]) -> float:
@@ -53,9 +86,14 @@ def movement(values: Sequence[np.ndarray]) -> float:
     - Standard deviation within demonstrations over the total one: 0 for a goal that is constant in a demonstration.
     - Diagonal of the box around a demonstration over the length of T steps of its root mean square step: 1 along a
       straight line at one speed, near 0 for a velocity or noise.
-    - The share of the numbers that is drawn, 3 / n.
+    - The share of the numbers that is drawn, 3 / n, or 1 of two.
     - The share of the steps that move by at least a tenth of the root mean square step: low for what moves late.
+
+    It is 0 for numbers of constant norm, such as a sine and a cosine, or a quaternion.
     """
+    norms = np.concatenate([np.linalg.norm(array.astype(float), axis=1) for array in values])
+    if np.ptp(norms) <= 1e-3 * norms.max():
+        return 0.0
     points = [array[:, :3].astype(float) for array in values]
     reach = float(np.mean([_reach(path) for path in points]))
     if reach == 0:
@@ -64,7 +102,7 @@ def movement(values: Sequence[np.ndarray]) -> float:
     between = np.array([path.mean(0) for path in points]).var(0).sum()
     steps = [np.square(np.diff(path, axis=0)).sum(1) for path in points]
     moves = float(np.mean([np.mean(each > SLOW**2 * each.mean()) if len(each) else 0.0 for each in steps]))
-    return float(np.sqrt(within / (within + between))) * reach * moves * 3 / values[0].shape[1]
+    return float(np.sqrt(within / (within + between))) * reach * moves * points[0].shape[1] / values[0].shape[1]
 
 
 def _explained(values: Sequence[np.ndarray], controls: Sequence[np.ndarray]) -> float:
@@ -105,14 +143,19 @@ def view(points: np.ndarray, span: np.ndarray) -> tuple[float, float]:
 
 
 def spans(points: np.ndarray) -> np.ndarray:
-    """The range of each coordinate of positions [M, 3]; 1 where all are equal."""
+    """The range of each coordinate of positions [M, D]; 1 where all are equal."""
     span: np.ndarray = np.ptp(points, axis=0)
     return np.where(span > 0, span, 1.0)
 
 
 def projection(points: np.ndarray) -> np.ndarray:
-    """The map [2, 3] from positions [M, 3] to a plane, right and down, as :func:`view` sees them."""
+    """The map [2, D] from positions [M, D] to a plane, right and down.
+
+    Space is seen as :func:`view` says; the second axis of a plane points up, and both have one scale.
+    """
     span = spans(points)
+    if len(span) == 2:
+        return np.array([[1.0, 0.0], [0.0, -1.0]]) / span.max()
     scale = span if span.max() > MOST_STRETCHED * span.min() else np.full(3, span.max())
     up, turned = np.radians(view(points, scale / scale.max()))
     right = [-np.sin(turned), np.cos(turned), 0.0]

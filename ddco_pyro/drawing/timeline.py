@@ -9,17 +9,18 @@ import base64
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import zip_longest
+from itertools import chain, islice, zip_longest
 from typing import Any
 
 import numpy as np
 
 from ddco_pyro.data.demonstrations import Demonstration
 from ddco_pyro.data.pictures import Observed
-from ddco_pyro.drawing.shown import frames, jpeg, projection
+from ddco_pyro.drawing.shown import frames, jpeg, positions, projection
+from ddco_pyro.spec import PathSpec
 
 MOST_NUMBERS = 12
-"""Numbers that follow the cursor; more where the position and the controls alone are more."""
+"""Numbers that follow the cursor; more where the paths and the controls alone are more."""
 
 MOST_BYTES = 1_000_000
 """Bytes of observed numbers on a page, about; longer demonstrations are thinned out in time."""
@@ -126,17 +127,17 @@ def text(values: np.ndarray) -> str:
 
 
 def following(
-    demos: Iterable[Demonstration], pictures: Sequence[Observed], steps: int, position: str | None
+    demos: Iterable[Demonstration], pictures: Sequence[Observed], steps: int, paths: Sequence[PathSpec]
 ) -> Iterator[dict[str, Any]]:
-    """What follows the cursor along each demonstration: numbers, a trajectory, pictures.
+    """What follows the cursor along each demonstration: numbers, paths in space, pictures.
 
     :param pictures: of each demonstration; empty for none.
     :param steps: of all demonstrations together.
-    :param position: the observation whose first three numbers are a trajectory.
+    :param paths: that are drawn.
     """
     left, view = MOST_PICTURES, None
     for demo, observed in zip_longest(demos, pictures):
-        values = _numbers(demo, position)
+        values, drawn = _numbers(demo, paths)
         every = -(-len(values) * steps // MOST_BYTES) or 1
         low = np.array([array.min() for array in values.values()])
         span = np.array([np.ptp(array) for array in values.values()])
@@ -146,9 +147,9 @@ def following(
             coded = text(np.rint([array[::every] for array in scaled]))
             ranges = {"low": np.round(low, 6).tolist(), "span": np.round(span, 6).tolist()}
             found["n"] = {"names": list(values), "every": every, "bytes": coded, **ranges}
-        if position is not None:
-            view = projection(demo.observations[position][:, :3]) if view is None else view
-            found["view"] = np.round(view, 5).tolist()
+        if paths:
+            view = projection(np.concatenate(positions(demo, paths))) if view is None else view
+            found |= {"view": np.round(view, 5).tolist(), "paths": drawn}
         if observed is not None and left >= FEWEST_PICTURES:
             count = min(len(demo), max(FEWEST_PICTURES, MOST_PICTURES * len(demo) // steps), left)
             chosen = np.unique(np.linspace(0, len(demo) - 1, count).round().astype(int))
@@ -159,16 +160,18 @@ def following(
         yield found
 
 
-def _numbers(demo: Demonstration, position: str | None) -> dict[str, np.ndarray]:
-    """Numbers over time by name: the position, all controls, then observations, :data:`MOST_NUMBERS` in all."""
-    keys = sorted(demo.observations, key=lambda key: key != position)
-    vectors = {key: np.asarray(demo.observations[key]) for key in keys if len(demo.observations[key].shape) == 2}
-    first = {key: array for key, array in vectors.items() if key == position}
-    arrays = {**first, "control": demo.actions.reshape(len(demo), -1), **vectors}
-    named = {
-        f"{key}[{place}]" if array.shape[1] > 1 else key: array[:, place].astype(float)
-        for key, array in arrays.items()
-        for place in range(array.shape[1])
+def _numbers(demo: Demonstration, paths: Sequence[PathSpec]) -> tuple[dict[str, np.ndarray], list[list[int]]]:
+    """Numbers over time by name: those of paths, all controls, then observations; and the places of each path's.
+
+    There are :data:`MOST_NUMBERS` in all, or more where paths and controls alone are more.
+    """
+    vectors = {key: np.asarray(array) for key, array in demo.observations.items() if len(array.shape) == 2}
+    arrays = {"control": demo.actions.reshape(len(demo), -1), **vectors}
+    drawn = [[(path.key, place) for place in path.among(vectors[path.key].shape[1])] for path in paths]
+    first = list(dict.fromkeys(chain.from_iterable(drawn)))
+    every = dict.fromkeys([*first, *((key, place) for key, array in arrays.items() for place in range(array.shape[1]))])
+    values = {
+        f"{key}[{place}]" if arrays[key].shape[1] > 1 else key: arrays[key][:, place].astype(float)
+        for key, place in islice(every, max(MOST_NUMBERS, len(first) + arrays["control"].shape[1]))
     }
-    always = sum(array.shape[1] for array in (*first.values(), arrays["control"]))
-    return dict(list(named.items())[: max(always, MOST_NUMBERS)])
+    return values, [[first.index(number) for number in path] for path in drawn]

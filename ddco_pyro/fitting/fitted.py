@@ -26,7 +26,7 @@ from ddco_pyro.fitting.run import RunError, is_finished, read_model
 from ddco_pyro.inference import Posterior
 from ddco_pyro.metrics import Metrics
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.spec import Spec, load_spec, user_code
+from ddco_pyro.spec import Spec, SpecError, load_spec, user_code
 from ddco_pyro.training.data import demonstrations as read_demonstrations
 from ddco_pyro.training.networks import model_name, named_baselines
 
@@ -269,7 +269,7 @@ def left_out(folder: Path, demos: Demonstrations) -> dict[str, Path]:
     return {name: folder / "left_out" / str(number) for number, name in enumerate(demos.names)}
 
 
-def load(folder: str | Path, allow_code: bool = False) -> Fit:
+def load(folder: str | Path, allow_code: bool = False, overrides: Iterable[str] = ()) -> Fit:
     """The fit in a run folder.
 
     >>> again = ddco_pyro.load("runs/mine")
@@ -278,11 +278,12 @@ def load(folder: str | Path, allow_code: bool = False) -> Fit:
 
     :param allow_code: import the user code (``module:name``) that its spec names; nothing else in a run is ever
         executed.
+    :param overrides: other settings of the report, such as ``"report.trajectory=pose"``.
     :raises RunError: the folder has no finished fit, or its model is of another spec.
     :raises OtherVersion: the folder was written in another format.
     :raises Damaged: the model or ``metrics.json`` is damaged.
     :raises BadInput: ``names.yaml`` does not fit the spec.
-    :raises SpecError: its spec names user code, and that is not allowed.
+    :raises SpecError: its spec names user code, and that is not allowed; or an override is no setting of the report.
     """
     folder = Path(folder)
     missing = [name for name in ("spec.yaml", "model.safetensors", "metrics.json") if not (folder / name).exists()]
@@ -291,7 +292,9 @@ def load(folder: str | Path, allow_code: bool = False) -> Fit:
         if (folder / "folds.json").exists():
             what = f"a selection; the fit of what it chose is in {folder / 'fit'} once it is done"
         raise RunError(f"{folder}: {what} (it has no {missing[0]})")
-    spec = load_spec(folder / "spec.yaml", allow_code=allow_code)
+    fitted, spec = (load_spec(folder / "spec.yaml", those, allow_code) for those in ((), overrides))
+    if spec.model_copy(update={"report": fitted.report}) != fitted:
+        raise SpecError(f"{folder}: is fitted; only settings of the report can change, such as report.trajectory=KEY")
     recorded(folder)  # or the format is another
     hierarchy = read_model(folder, spec)
     counts = [level.count for level in spec.hierarchy.levels] if spec.hierarchy else []

@@ -19,7 +19,7 @@ from ddco_pyro.errors import BadInput
 from ddco_pyro.events import EpochEnded, Event, OnEvent
 from ddco_pyro.metrics import read_record, refit, write_table
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.spec import Spec, dump_spec
+from ddco_pyro.spec import Spec, SpecError, dump_spec, load_spec
 from ddco_pyro.training.checkpoint import copy_of
 from ddco_pyro.training.loop import SAVE_EVERY
 from ddco_pyro.training.networks import Dimensions, build_hierarchy
@@ -46,21 +46,34 @@ def claimed(folder: Path, spec: Spec, resume: bool = True) -> Iterator[None]:
 def claim(folder: Path, spec: Spec, resume: bool = True) -> None:
     """Make a folder the run of a spec, by writing ``spec.yaml``. An unfinished run of the same spec is continued.
 
+    A spec that differs in its ``report`` alone is the same, and replaces the one in the folder.
+
     :param resume: whether the folder may hold the finished run.
     :raises RunError: the folder holds something else, or the finished run although it may not.
     """
     text, path = dump_spec(spec), folder / "spec.yaml"
     if path.exists():
-        if path.read_bytes() != text.encode():
+        same = path.read_bytes() == text.encode()
+        if not same and not _differs_in_report(spec, path):
             raise RunError(f"{folder}: holds a run of another spec; choose another --out or remove it")
         if not resume and is_finished(folder) and (folder / "report.html").exists():  # what `fit` writes last
             raise RunError(
                 f"{folder}: holds a run of this spec already; show it with --resume, or choose another --out"
             )
-        return
-    if folder.exists() and set(folder.iterdir()) - set(leftovers(folder)):
+        if same:
+            return
+    elif folder.exists() and set(folder.iterdir()) - set(leftovers(folder)):
         raise RunError(f"{folder}: is not empty and not a run; choose another --out")
     write_text(path, text)
+
+
+def _differs_in_report(spec: Spec, path: Path) -> bool:
+    """Whether a spec differs from that in a file in nothing but its ``report``."""
+    try:
+        other = load_spec(path, allow_code=True)  # which imports nothing
+    except SpecError:
+        return False
+    return other.report != spec.report and other.model_copy(update={"report": spec.report}) == spec
 
 
 def is_finished(folder: Path) -> bool:

@@ -14,7 +14,7 @@ from ddco_pyro.drawing.colours import option_colour, option_rgb
 from ddco_pyro.drawing.diagrams import curves, dendrogram, path_film, transition_graph, typical_paths
 from ddco_pyro.drawing.figures import data_uri
 from ddco_pyro.drawing.page import Block, Card, Cell, Code, Drawing, Facts, Film, Films, Picture, Section, Text, note
-from ddco_pyro.drawing.shown import frames, jpeg, position_key, projection
+from ddco_pyro.drawing.shown import frames, jpeg, paths_of, positions, projection, told
 from ddco_pyro.drawing.words import duration, number, numbered_name, percent
 from ddco_pyro.errors import command
 from ddco_pyro.evaluation.options import SMALLEST_DIVERGENCE
@@ -214,12 +214,12 @@ class _Shown:
 
     def __init__(self, fit: Fit, demos: Demonstrations, pictures: Sequence[Observed]) -> None:
         self.demos, self.pictures = demos, pictures
-        self.position = None if pictures else fit.spec.report.trajectory or position_key(demos)
+        self.drawn = () if pictures else paths_of(fit.spec.report.trajectory, demos)
         self.films = 0
         self.paths: list[np.ndarray] = []
-        if self.position is not None:
-            places = [np.asarray(demo.observations[self.position])[:, :3].astype(float) for demo in self.demos]
-            turned = projection(np.concatenate(places))
+        if self.drawn:
+            places = [positions(demo, self.drawn) for demo in self.demos]
+            turned = projection(np.concatenate([place.reshape(-1, place.shape[-1]) for place in places]))
             self.paths = [place @ turned.T for place in places]
 
     def explained(self) -> str:
@@ -230,10 +230,10 @@ class _Shown:
         )
         if self.pictures:
             return f"Contact sheet: first, middle and last picture of a segment, a row each. {typical}"
-        if self.position is None:
+        if not self.drawn:
             return f"Lines: controls from the onset of each segment on. {typical}"
         return (
-            f"Drawings: observation “{self.position}” in space, from one side. Circle, square and triangle: first, "
+            f"Drawings: {told(self.drawn, self.demos)}. Circle, square and triangle: first, "
             f"middle and last step of a segment. {typical} Click a film to stop it."
         )
 
@@ -246,7 +246,7 @@ class _Shown:
             self.films += 1
             film = [Films([film_of(self.pictures, chosen, choice)])] if self.films <= MOST_FILMS else []
             return [sheet_of(self.pictures, chosen[:SHOWN], where), *film]
-        if self.position is not None:
+        if self.drawn:
             shown = list(dict.fromkeys([*(one.row for one in chosen[:SHOWN]), *range(len(self.demos))]))[:MOST_PATHS]
             segments = [(shown.index(one.row), one.start, one.end) for one in chosen[:SHOWN]]
             steps = aligned(chosen)

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d import Axes3D
@@ -14,7 +17,7 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.drawing.colours import add_legend, option_colour
 from ddco_pyro.drawing.figures import FAINT, INK, blank, save
 from ddco_pyro.drawing.page import Picture
-from ddco_pyro.drawing.shown import MOST_STRETCHED, position_key, spans, view
+from ddco_pyro.drawing.shown import LINES, MOST_STRETCHED, paths_of, positions, spans, told, view
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.report.activity import Activity, LevelActivity
 
@@ -22,55 +25,74 @@ MOST_TRAJECTORIES = 40
 MOST_POINTS = 300
 TURN = 70.0
 CHOSEN = (
-    "Among observations of three numbers or more, it moves the most as the controls say; report.trajectory in the spec "
-    "names another. "
+    "It moves the most as the controls say; “ddco-pyro report RUN --set report.trajectory=KEY” draws another "
+    "observation, [KEY, 3:6] other numbers of it, and a list of both a path for each arm. "
 )
 
 
 def picture(fit: Fit, demos: Demonstrations, activity: Activity) -> Picture | None:
-    """The demonstrations in space; None where no observation looks like a position."""
+    """The demonstrations in space or in the plane; None where no observation looks like a position."""
     named = fit.spec.report.trajectory
-    key = named or position_key(demos)
-    if key is None:
+    paths = paths_of(named, demos)
+    if not paths:
         return None
+    places = [positions(demo, paths) for demo in demos]
+    plane = places[0].shape[-1] == 2
+    seen = "Both axes have one scale." if plane else "Seen along the direction in which the trajectories spread least."
     caption = (
-        f"{min(len(demos), MOST_TRAJECTORIES)} demonstrations in space, coloured by the most likely option: first "
-        f"three numbers of observation “{key}”, in its own units. {'' if named else CHOSEN}Circles: first steps. Seen "
-        "from the direction in which the trajectories spread the most."
+        f"{min(len(demos), MOST_TRAJECTORIES)} demonstrations, coloured by the most likely option: "
+        f"{told(paths, demos)}, in its own units. {'' if named else CHOSEN}Circles: first steps. {seen}"
     )
-    figure = draw(activity, [np.asarray(demo.observations[key])[:, :3] for demo in demos], key)
-    alt = f"Trajectories of {key} in three dimensions, coloured by option"
+    names = [f"{paths[0].key}[{place}]" for place in paths[0].among(demos.observation_shapes[paths[0].key][0])]
+    figure = draw(activity, places, names if len(paths) == 1 else ["x", "y", "z"][: len(names)])
+    alt = f"Trajectories of {', '.join(map(str, paths))}, coloured by option"
     return save(figure, fit.run_folder / "figures" / "trajectories.png", alt, caption)
 
 
-def draw(activity: Activity, positions: Sequence[np.ndarray], key: str) -> Figure:
-    """The positions [T_n, 3] of each demonstration, a panel for each level; a single level is seen from two sides."""
+def draw(activity: Activity, places: Sequence[np.ndarray], names: Sequence[str]) -> Figure:
+    """The positions of each demonstration [P, T_n, D], a panel for each level; one level in space from two sides.
+
+    :param names: of the D axes.
+    """
+    plane = len(names) == 2
     figure = blank(0.55 + 4.2 * -(-max(2, len(activity.levels)) // 2))
-    figure.set_layout_engine("none")  # it leaves too little room for labels of 3D axes
-    turns = (0.0, TURN) if len(activity.levels) == 1 else (0.0,)
+    turns = (0.0, TURN) if len(activity.levels) == 1 and not plane else (0.0,)
     panels = [(level, turn) for level in reversed(activity.levels) for turn in turns]
-    for place, (level, turn) in zip(_places(len(panels), figure.get_figheight()), panels, strict=True):
-        axes = figure.add_axes(place, projection="3d", proj_type="ortho")
-        panel(axes, level, positions, key, turn)
+    if plane:
+        every = [*figure.subplots(-(-len(panels) // 2), min(2, len(panels)), squeeze=False).flat]
+    else:
+        figure.set_layout_engine("none")  # it leaves too little room for labels of 3D axes
+        places_of_panels = _places(len(panels), figure.get_figheight())
+        every = [figure.add_axes(place, projection="3d", proj_type="ortho") for place in places_of_panels]
+    for axes, (level, turn) in zip(every, panels, strict=False):
+        panel(axes, level, places, names, turn)
         axes.set_title(f"level “{level.name}”" + (f", turned by {turn:.0f}°" if turn else ""))
-    add_legend(figure, activity.choices, activity.names, "lower center")
+    add_legend(figure, activity.choices, activity.names, "outside lower center" if plane else "lower center")
     return figure
 
 
-def panel(axes: Axes3D, level: LevelActivity, positions: Sequence[np.ndarray], key: str, turn: float = 0.0) -> None:
-    """One level over the positions [T_n, 3], of at most :data:`MOST_TRAJECTORIES` demonstrations."""
-    chosen = np.unique(np.linspace(0, len(positions) - 1, min(len(positions), MOST_TRAJECTORIES)).round().astype(int))
-    lines, colours = [], []
+def panel(
+    axes: Axes, level: LevelActivity, places: Sequence[np.ndarray], names: Sequence[str], turn: float = 0.0
+) -> None:
+    """One level over the positions [P, T_n, D], of at most :data:`MOST_TRAJECTORIES` demonstrations."""
+    chosen = np.unique(np.linspace(0, len(places) - 1, min(len(places), MOST_TRAJECTORIES)).round().astype(int))
+    lines, colours, dashes = [], [], []
     for row in chosen:
-        steps = np.arange(0, len(positions[row]), -(-len(positions[row]) // MOST_POINTS))
-        points = positions[row][steps]
-        lines.append(np.stack([points[:-1], points[1:]], axis=1))
-        colours += [to_rgba(option_colour(int(choice))) for choice in level.path[row][steps[:-1]]]
-    if colours:
-        axes.add_collection3d(Line3DCollection(np.concatenate(lines), colors=colours, linewidths=1.3))
-    first = np.stack([positions[row][0] for row in chosen])
-    axes.scatter(*first.T, color="white", edgecolor=INK, s=12, linewidth=0.7, depthshade=False)
-    _frame(axes, np.concatenate([positions[row] for row in chosen]), key, turn)
+        length = places[row].shape[1]
+        steps = np.arange(0, length, -(-length // MOST_POINTS))
+        path = level.path[row][steps]
+        starts = np.flatnonzero(np.diff(path, prepend=-1))
+        for start, end in zip(starts, [*starts[1:], len(steps) - 1], strict=True):
+            for number, points in enumerate(places[row]):
+                lines.append(points[steps[start : end + 1]])
+                colours.append(to_rgba(option_colour(int(path[start]))))
+                dashes.append(LINES[number % len(LINES)])
+    kind = Line3DCollection if isinstance(axes, Axes3D) else LineCollection
+    axes.add_collection(kind(lines, colors=colours, linewidths=1.3, linestyles=dashes))
+    first = np.concatenate([places[row][:, 0] for row in chosen])
+    more: dict[str, Any] = {"depthshade": False} if isinstance(axes, Axes3D) else {"zorder": 3}
+    axes.scatter(*first.T, color="white", edgecolor=INK, linewidth=0.7, **{"s": 12, **more})
+    _frame(axes, np.concatenate([places[row].reshape(-1, len(names)) for row in chosen]), names, turn)
 
 
 def _places(count: int, height: float) -> list[tuple[float, float, float, float]]:
@@ -80,16 +102,21 @@ def _places(count: int, height: float) -> list[tuple[float, float, float, float]
     return [(0.5 * (n % 2), bottom + (rows - 1 - n // 2) * each, 0.5, 0.93 * each) for n in range(count)]
 
 
-def _frame(axes: Axes3D, points: np.ndarray, key: str, turn: float) -> None:
+def _frame(axes: Axes, points: np.ndarray, names: Sequence[str], turn: float) -> None:
+    """Limits, view and labels around positions [M, D]."""
     low, span = points.min(0), spans(points)
+    if not isinstance(axes, Axes3D):
+        axes.set(xlabel=names[0], ylabel=names[1], aspect="equal")
+        axes.margins(0.05)
+        return
     axes.set(xlim=(low[0], low[0] + span[0]), ylim=(low[1], low[1] + span[1]), zlim=(low[2], low[2] + span[2]))
     if span.max() <= MOST_STRETCHED * span.min():
         axes.set_box_aspect(span / span.max(), zoom=0.88)
     elevation, azimuth = view(points, span if span.max() > MOST_STRETCHED * span.min() else np.ones(3))
     axes.view_init(elev=elevation, azim=azimuth + turn)
-    for number, axis in enumerate((axes.xaxis, axes.yaxis, axes.zaxis)):
+    for name, axis in zip(names, (axes.xaxis, axes.yaxis, axes.zaxis), strict=True):
         axis.set_pane_color((1, 1, 1, 1))
-        axis.set_label_text(f"{key}[{number}]")
+        axis.set_label_text(name)
         axis.line.set_color(FAINT)
     axes.locator_params(nbins=5)
     axes.tick_params(labelsize=7)

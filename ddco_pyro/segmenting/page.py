@@ -17,7 +17,7 @@ from ddco_pyro.data.pictures import Observed
 from ddco_pyro.data.sources.recording import BOUNDARY
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.drawing.page import Block, Cell, Page, Section, Table, Text, note
-from ddco_pyro.drawing.shown import position_key
+from ddco_pyro.drawing.shown import paths_of
 from ddco_pyro.drawing.timeline import Lane, Runs, Timelines, Track, following
 from ddco_pyro.drawing.words import NAT, duration, label_name, number, numbered_name, option_name, percent
 from ddco_pyro.fitting.fitted import Fit
@@ -124,8 +124,8 @@ def followed(
     steps = min(sum(map(len, segmented.segments)), most_steps / len(segmented.counts))
     ordered = iter(demos)
     first = list(islice(ordered, FIRST))
-    position = fit.spec.report.trajectory or position_key(Demonstrations(tuple(first)))
-    return following(chain(first, ordered), pictures, int(steps), position)
+    paths = paths_of(fit.spec.report.trajectory, Demonstrations(tuple(first)))
+    return following(chain(first, ordered), pictures, int(steps), paths)
 
 
 def _level_lane(name: str, segmented: Segmented) -> Lane:

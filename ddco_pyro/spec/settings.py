@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import Field, TypeAdapter, model_validator
+from pydantic import BeforeValidator, Field, TypeAdapter, model_validator
 
-from ddco_pyro.spec.base import Count, Items, Model, Positive, Seed, Share, TaskName, Text, bare, invalid, nested
+from ddco_pyro.spec.base import Count, Items, Model, Positive, Seed, Share, TaskName, Text, bare, invalid, nested, show
 
 LabelNames = Annotated[Items[Text], Field(min_length=1)]
 Labels = Annotated[
@@ -289,9 +290,64 @@ class RolloutSpec(Model):
     """Scripted policies of the task that are rolled out for comparison, such as ``open_loop``."""
 
 
+SLICE = re.compile(r"\d{0,9}:\d{0,9}")
+
+
+class PathSpec(Model):
+    """Two or three numbers of an observation that are drawn as a path in space."""
+
+    key: Text
+    """Name of the observation."""
+    numbers: str | None = None
+    """Which of its numbers, as a Python slice such as ``3:6``; null: the first three, or both of two."""
+
+    @model_validator(mode="after")
+    def _is_slice(self) -> PathSpec:
+        if self.numbers is not None and not SLICE.fullmatch(self.numbers):
+            raise invalid(("", f"must be a slice such as 3:6 after the key, got {show(self.numbers)}"))
+        return self
+
+    def __str__(self) -> str:
+        return self.key if self.numbers is None else f"{self.key}[{self.numbers}]"
+
+    def among(self, size: int) -> list[int]:
+        """The places of the path's numbers in a vector of so many; at most as many as the slice has within it."""
+        ends = (self.numbers or ":3").split(":")
+        return list(range(size)[slice(*(int(end) if end else None for end in ends))])
+
+
+def _paths(value: Any) -> Any:
+    """One path or several, as a list of mappings."""
+    return [_path(one) for one in (value if isinstance(value, list | tuple) and not _is_pair(value) else (value,))]
+
+
+def _path(value: Any) -> Any:
+    if isinstance(value, Mapping | PathSpec):
+        return value
+    if not isinstance(value, str) and not _is_pair(value):
+        raise invalid(("", f"must be KEY or [KEY, slice], such as [pose, 3:6], got {show(value)}"))
+    return dict(zip(("key", "numbers"), (value,) if isinstance(value, str) else value, strict=False))
+
+
+def _is_pair(value: Any) -> bool:
+    """Whether a value is ``[key, slice]``."""
+    texts = isinstance(value, list | tuple) and len(value) == 2 and all(isinstance(part, str) for part in value)
+    return texts and SLICE.fullmatch(value[1]) is not None
+
+
+Drawn = str | tuple[str, str] | PathSpec
+
+
 class ReportSpec(Model):
     """What the report shows."""
 
-    trajectory: Text | None = None
-    """Observation whose first three numbers are drawn as spatial trajectories; null: the one that moves the most
-    as the controls say."""
+    trajectory: (
+        Annotated[
+            Items[PathSpec],
+            Field(min_length=1),
+            BeforeValidator(_paths, json_schema_input_type=Drawn | list[Drawn]),
+        ]
+        | None
+    ) = None
+    """What is drawn as paths in space: an observation (its first three numbers, or both of two), ``[key, slice]``, or a
+    list of these, one for each arm; null: the observation that moves most as the controls say."""

@@ -168,11 +168,11 @@ class Spec(Model):
                 )
         if not self.observed:
             yield "observations", f"{STEP} alone says nothing about the state; name an observation beside it"
-        drawn = self.report.trajectory
-        if drawn is not None and drawn not in self.observed:
-            there = ", ".join(self.observed)
-            text = f"there is no observation {drawn!r}{nearest(drawn, self.observed)}; there is: {there}"
-            yield "report.trajectory", text
+        for key in dict.fromkeys(path.key for path in self.report.trajectory or ()):
+            if key not in self.observed:
+                there = ", ".join(self.observed)
+                text = f"there is no observation {key!r}{nearest(key, self.observed)}; there is: {there}"
+                yield "report.trajectory", text
 
     def _labelled(self) -> Iterator[tuple[str, str]]:
         names, known = self.demonstrations.labels, [level.name for level in self._levels]

@@ -68,12 +68,7 @@ def build_hierarchy(spec: Spec, dimensions: Dimensions, seed: int | None = None)
     if missing:
         known = ", ".join(sorted(dimensions.shapes))
         raise SpecError(f"observations: there is no {', '.join(missing)} (there are: {known})")
-    drawn = spec.report.trajectory
-    shape = dimensions.shapes[drawn] if drawn else (3,)
-    if len(shape) != 1 or shape[0] < 3:
-        raise SpecError(
-            f"report.trajectory: {drawn!r} has shape {list(shape)} at each step; name a vector of three numbers or more"
-        )
+    _refuse_undrawable(spec, dimensions.shapes)
     scale, size = spec.control.scale, dimensions.control_size
     if isinstance(scale, tuple) and len(scale) != size:
         raise SpecError(f"control.scale: has {len(scale)} numbers, but the control has {size} dimensions")
@@ -86,6 +81,24 @@ def build_hierarchy(spec: Spec, dimensions: Dimensions, seed: int | None = None)
             return Hierarchy(spec, dimensions.shapes, size, dimensions.steps, dimensions.constant, parts)
     except ShapeError as error:
         raise SpecError(str(error)) from error
+
+
+def _refuse_undrawable(spec: Spec, shapes: Shapes) -> None:
+    drawn = spec.report.trajectory or ()
+    counts = []
+    for path in drawn:
+        shape = shapes[path.key]
+        counts.append(len(path.among(shape[0])) if len(shape) == 1 else 0)
+        if counts[-1] not in (2, 3):
+            raise SpecError(
+                f"report.trajectory: {str(path)!r} is {counts[-1]} numbers, of shape {list(shape)} at each step; name "
+                "two or three numbers of a vector, such as [KEY, 0:3]"
+            )
+    if len(set(counts)) > 1:
+        raise SpecError(
+            f"report.trajectory: {drawn[counts.index(2)]} is in the plane, {drawn[counts.index(3)]} in space; name "
+            "as many numbers of each"
+        )
 
 
 MOST_PARAMETERS = 50_000_000
