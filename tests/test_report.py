@@ -1,6 +1,7 @@
 import html
 import re
 from dataclasses import replace
+from datetime import datetime
 from html.parser import HTMLParser
 from types import SimpleNamespace
 
@@ -171,6 +172,53 @@ def test_the_segments_are_those_of_the_most_likely_path(labelled):
         np.testing.assert_array_equal(steps, path[row])
         half = len(steps) // 2
         assert lanes["phase"] == [(0, 0, half), (1, half, len(steps))]
+
+
+def sections(page):
+    """The names of the sections in order, and whether each is folded."""
+    found = re.findall(r'(</summary>\n)?<section id="([^"]*)">', page)
+    return [(name, bool(folded)) for folded, name in found]
+
+
+def test_the_top_of_the_page_is_a_verdict_skills_and_a_few_time_lines(labelled, deep):
+    found, page, _ = labelled
+    names = sections(page)
+    first = ["skills", "segments", "agreement"]
+    assert [name for name, folded in names if not folded and name != "warnings"] == first
+    assert names[0] == ("warnings", False) or names[-2] == ("warnings", True)
+    assert {("learning", True), ("dimensions", True), ("demonstrations", True), ("likelihood", True)} < set(names)
+    header = re.search("<header>.*?</header>", page, re.DOTALL)[0]
+    fitted = datetime.fromtimestamp((found.folder / "model.safetensors").stat().st_mtime)
+    assert "<h1>demos.hdf5 <small>DDCO, " in header
+    assert f"{found.folder.name}, fitted {fitted:%Y-%m-%d %H:%M}</small>" in header
+    assert f'<p class="verdict">{words.headline(found.metrics)}</p>' in header
+    nmi = words.number(found.metrics.agreement.valid[0].nmi)
+    assert f"<dt>Labels “phase”</dt><dd>NMI {nmi}, accuracy " in header
+    assert '<div class="tracks" style="max-height:336px">' in page  # six of 56 pixels
+    (folded,) = [folded for name, folded in sections(deep[1]) if name == "warnings"]
+    assert folded != bool(re.findall('<div class="warning">', deep[1]))
+
+
+def test_a_label_has_the_colour_of_the_option_that_it_is_matched_with(labelled):
+    found, page, _ = labelled
+    lanes = {lane["name"]: lane["colours"] for lane in embedded(page)["lanes"]}
+    (table,) = found.metrics.agreement.confusion
+    assert lanes["phase"] == {
+        str(label): lanes["option"][option]
+        for option, label in zip(table.options, table.matched, strict=True)
+        if label is not None
+    }
+    assert lanes["phase"]
+
+
+@pytest.mark.parametrize(("divergence", "proposed"), [(0.05, True), (0.5, False)])
+def test_only_options_that_act_alike_are_to_be_merged(labelled, divergence, proposed):
+    found, _, demos = labelled
+    data = found.metrics.model_dump()
+    for row in data["divergences"][0]:
+        row["divergence"] = divergence
+    other = replace(found, metrics=Metrics.model_validate(data))
+    assert ("ddco-pyro merge" in write_report(other, demos).read_text()) == proposed
 
 
 def test_a_long_list_is_folded_and_long_timelines_are_cut(labelled, monkeypatch, drawn_here):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import yaml
 from command_line import call, with_set
+from made_metrics import made_metrics
 from planted import LINEAR, small_spec
 from random_demonstrations import numbered
 from scipy import stats
@@ -105,7 +106,10 @@ def over_three(memory, errors):
     ],
 )
 def test_the_verdict_is_over_training_seeds(memory, said):
-    assert said in words.over_seeds(over_three(memory, [0.0, None, 0.0]), "DDCO", 10)
+    found = over_three(memory, [0.0, None, 0.0])
+    assert said in words.over_seeds(found, "DDCO", 10)
+    first = said.removeprefix("So ").replace("It is", "it is")
+    assert words.headline(made_metrics(10, seeds=found)).startswith(f"Over 3 training seeds {first}")
 
 
 @pytest.mark.parametrize(

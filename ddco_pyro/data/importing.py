@@ -264,7 +264,7 @@ def _slower(recording: Recording, frames: int) -> Recording:
                 if whole:
                     yield reduced(rows[:whole])
 
-        return Column((column.shape[0] // frames, *column.shape[1:]), column.dtype, blocks, column.video)
+        return replace(column, shape=(column.shape[0] // frames, *column.shape[1:]), blocks=blocks, kept=None)
 
     def each(columns: Mapping[str, Column]) -> dict[str, Column]:
         return {key: slower(column) for key, column in columns.items()}

@@ -15,7 +15,7 @@ WIDTH = 900
 """Units across a drawing as wide as the page."""
 
 RAREST = 0.01
-"""Transitions that make up a smaller share of all are not drawn."""
+"""Transitions that make up a smaller share of all are not drawn; starts and ends, of all demonstrations."""
 
 LETTERS = 16
 """Of a name beside a node, at most."""
@@ -65,7 +65,7 @@ def transition_graph(counts: np.ndarray, shares: Sequence[float], names: Sequenc
         (first, second, int(counts[first, second]))
         for first in starts
         for second in ends
-        if counts[first, second] >= max(1, RAREST * counts.sum())
+        if counts[first, second] >= max(1, RAREST * (counts[outside] if outside in (first, second) else counts).sum())
     ]
     up = max((_rise(ends[b] - starts[a], gap) for a, b, _ in edges if ends[b] > starts[a]), default=0.0) + 34
     down = max((_rise(starts[a] - ends[b], gap) for a, b, _ in edges if ends[b] < starts[a]), default=0.0) + 58

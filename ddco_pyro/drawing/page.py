@@ -172,13 +172,19 @@ class Card:
 Block = Text | Table | Picture | Facts | Folded | Columns | Code | Warned | Films | Drawing | Card | Timelines
 
 
+def footnote(text: str) -> Folded:
+    """The meaning of what stands above, which a click shows."""
+    return Folded("What this means", [note(text)])
+
+
 @dataclass(frozen=True)
 class Section:
-    """A titled part of a page; links reach it by ``name``."""
+    """A titled part of a page; links reach it by ``name``. A click on the title shows what is ``folded``."""
 
     name: str
     title: str
     blocks: Sequence[Block]
+    folded: bool = False
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,7 @@ def positions(demo: Demonstration, paths: Sequence[PathSpec]) -> np.ndarray:
     return np.stack([array[:, path.among(array.shape[1])] for path, array in zip(paths, arrays, strict=True)])
 
 
-def told(paths: Sequence[PathSpec], demos: Demonstrations) -> str:
+def in_words(paths: Sequence[PathSpec], demos: Demonstrations) -> str:
     """The paths in words: which numbers of which observations, and how the lines of several differ."""
     each = []
     for place, path in enumerate(paths):

@@ -37,12 +37,12 @@ class Lane:
     """A row of every demonstration: a level of options, or labels.
 
     :param names: of each choice of a level, control first, or of each label.
-    :param colours: of each choice; empty for labels.
+    :param colours: of each choice, or of each label that has one.
     """
 
     name: str
     names: Sequence[str] | Mapping[int, str]
-    colours: Sequence[str] = ()
+    colours: Sequence[str] | Mapping[int, str] = ()
 
 
 @dataclass(frozen=True)
@@ -95,11 +95,13 @@ class Timelines:
     """Demonstrations under one axis of time.
 
     :param frequency: steps per second (Hz); None where unknown.
+    :param rows: demonstrations that are seen at once, about; None for as many as a window has room for.
     """
 
     lanes: Sequence[Lane]
     tracks: Sequence[Track]
     frequency: float | None = None
+    rows: int | None = None
 
     @property
     def json(self) -> str:

@@ -245,6 +245,27 @@ def sound(metrics: Metrics) -> bool:
     return not any(apart(*_of_parts(one.log_likelihood_per_step)) for one in both)
 
 
+def headline(metrics: Metrics) -> str:
+    """The verdict in a line: over training seeds where there are several, else of this fit."""
+    held_out, seeds = len(metrics.valid), metrics.seeds
+    if seeds and "memory" in seeds.worth:
+        decided = _verdict(*_range(seeds.worth["memory"], seeds.standard_error["memory"], held_out))
+        decided = decided.removeprefix("So ").replace("It is", "it is")
+        return f"Over {len(seeds.training_seeds)} training seeds {decided}"
+    return DECIDED[_direction(metrics.worth.memory, held_out)] if metrics.worth else _explained(metrics)
+
+
+def leads(metrics: Metrics) -> dict[str, str]:
+    """Names and values: the leads over baselines in nats per step, over training seeds first, then of this fit."""
+    said, seeds, ours = {}, metrics.seeds, method(metrics.model)
+    if seeds and (parts := _parts(seeds.worth, ours)):
+        said[f"Nats per step, {len(seeds.training_seeds)} seeds"] = ", ".join(parts)
+    if metrics.comparison:
+        each = (f"{ours} − {method(name)} {with_error(one.difference)}" for name, one in metrics.comparison.items())
+        said["Nats per step, held out"] = ", ".join(each)
+    return said
+
+
 def division(counts: Counts) -> str:
     """The numbers of demonstrations that train, tune, and are held out."""
     held_out = "each held out from a fit without it" if counts.left_out else f"{counts.valid} held out"
@@ -291,6 +312,14 @@ def explains(name: str, differences: Mapping[str, Difference], held_out: int) ->
     return f"{text} (± is one standard error over {held_out} held-out demonstrations, for one fit of each model)."
 
 
+DECIDED = {
+    1: "In this fit options that last explain held-out controls better; one fit of each model is no verdict.",
+    0: "This fit does not show that options that last are worth anything.",
+    -1: "In this fit options that last explain held-out controls worse than the same policies without memory.",
+}
+"""The verdict of one fit on options that last, by the direction of their lead."""
+
+
 def worth(found: Worth, ours: str, held_out: int, sound: bool = True, frequency: float | None = None) -> str:
     """The worth of several policies and of options that last, in one fit of each model.
 
@@ -301,11 +330,7 @@ def worth(found: Worth, ours: str, held_out: int, sound: bool = True, frequency:
     parts = _divided(found, ours, f"{total} nats per step", "Held-out nats per step", with_error)
     if not sound:
         return parts
-    decided = {
-        1: "In this fit options that last explain held-out controls better; one fit of each model is no verdict.",
-        0: "This fit does not show that options that last are worth anything.",
-        -1: "In this fit options that last explain held-out controls worse than the same policies without memory.",
-    }[_direction(found.memory, held_out)]
+    decided = DECIDED[_direction(found.memory, held_out)]
     rows = found.steps_in_a_row
     if rows and all(row.options <= row.mixture for row in rows):
         own, mixture = (duration(frequency, steps) for steps in (rows[0].options, rows[0].mixture))
@@ -385,15 +410,20 @@ def over_seeds(found: Seeds, ours: str, held_out: int, sound: bool = True) -> st
 
 
 def _lasting(memory: Sequence[float], errors: Sequence[float | None], held_out: int) -> str:
-    """The verdict on options that last, by :func:`_wider` and :data:`SMALLEST`.
+    """The verdict on options that last, by :func:`_range` and :data:`SMALLEST`."""
+    low, high = _range(memory, errors, held_out)
+    wider = high > mean_interval(memory)[1]
+    said = f"Over held-out demonstrations it is {interval((low, high))}. " if wider else ""
+    return said + _verdict(low, high)
+
+
+def _range(memory: Sequence[float], errors: Sequence[float | None], held_out: int) -> tuple[float, float]:
+    """The interval of the worth of options that last, by :func:`_wider`.
 
     :param errors: standard errors over held-out demonstrations; None where there is one.
     """
     known = [error for error in errors if error is not None]
-    low, high = _wider(memory, float(np.mean(known)) if known else 0.0, held_out)
-    wider = high > mean_interval(memory)[1]
-    said = f"Over held-out demonstrations it is {interval((low, high))}. " if wider else ""
-    return said + _verdict(low, high)
+    return _wider(memory, float(np.mean(known)) if known else 0.0, held_out)
 
 
 def _wider(values: Sequence[float], error: float, trials: int) -> tuple[float, float]:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+from datetime import datetime
 from pathlib import Path
-
-from markupsafe import Markup
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
@@ -12,13 +11,12 @@ from ddco_pyro.data.pictures import Observed
 from ddco_pyro.data.sources import open_source
 from ddco_pyro.drawing import words
 from ddco_pyro.drawing.figures import style
-from ddco_pyro.drawing.page import Block, Facts, Page, Text, note
+from ddco_pyro.drawing.page import Block, Facts, Page, Text, footnote
 from ddco_pyro.drawing.shown import pictures, stored_pictures
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Metrics, Rate
 from ddco_pyro.report import agreement, inputs, likelihood, options, rollouts, skills, training, worth
 from ddco_pyro.report.activity import activity
-from ddco_pyro.report.training import degeneracies
 from ddco_pyro.segmenting.page import followed, timelines
 
 
@@ -31,7 +29,7 @@ def write_report(fit: Fit, demos: Demonstrations) -> Path:
     """
     path, metrics = fit.run_folder / "report.html", fit.metrics
     active = activity(fit, demos) if fit.spec.hierarchy else None
-    segmented = options.segmented(fit, demos, active) if active else None
+    segmented = options.segmented(fit, active) if active else None
     if segmented:
         ordered = demos.select([demo.name for demo in segmented.segments])
         shown = pictures(ordered) or _stored(fit, ordered)
@@ -39,26 +37,40 @@ def write_report(fit: Fit, demos: Demonstrations) -> Path:
         drawn = timelines(segmented, follows, options.MOST_STEPS)
     with style():
         learning = training.learning(fit)  # or a history is damaged, and no figure is written
+        warned = training.warnings(fit)
         sections = [
+            None if warned is None or warned.folded else warned,
             skills.section(fit, ordered, shown, segmented) if segmented else None,
             options.segments(drawn, len(metrics.demonstrations_by_likelihood)) if segmented else None,
+            agreement.section(fit, demos),
             worth.section(metrics),
+            rollouts.success(fit),
+            rollouts.films(fit),
             likelihood.section(fit),
             likelihood.demonstrations(metrics, {track.anchor for track in drawn.tracks} if segmented else ()),
             likelihood.dimensions(fit),
-            rollouts.success(fit),
-            learning,
             options.section(fit, demos, active) if active else None,
-            agreement.section(fit, demos),
             inputs.saliency(fit, demos),
             inputs.branches(fit),
-            training.warnings(fit),
-            rollouts.films(fit),
+            learning,
+            warned if warned and warned.folded else None,
             training.particulars(fit),
         ]
-    name = fit.run_folder.resolve().name
-    write_text(path, Page(words.method(fit.name), header(fit, metrics), sections, subtitle=name).html())
+    write_text(path, Page(title(fit), header(fit, metrics), sections, subtitle=subtitle(fit)).html())
     return path
+
+
+def title(fit: Fit) -> str:
+    """The file of the demonstrations, or their task."""
+    known = fit.spec.demonstrations.path
+    return Path(known).name if known else str(fit.spec.demonstrated_task)
+
+
+def subtitle(fit: Fit) -> str:
+    """The model, its run folder and the time at which it was fitted."""
+    folder = fit.run_folder.resolve()
+    fitted = datetime.fromtimestamp((folder / "model.safetensors").stat().st_mtime)
+    return f"{words.method(fit.name)}, {folder.parent.name}/{folder.name}, fitted {fitted:%Y-%m-%d %H:%M}"
 
 
 def _stored(fit: Fit, demos: Demonstrations) -> list[Observed]:
@@ -71,9 +83,11 @@ def _stored(fit: Fit, demos: Demonstrations) -> list[Observed]:
 
 
 def header(fit: Fit, metrics: Metrics) -> list[Block]:
-    """The verdict, success in rollouts, warnings, and facts about demonstrations and training."""
+    """The verdict, success in rollouts, and the main numbers."""
     counts = metrics.demonstrations
     facts = {
+        **words.leads(metrics),
+        **agreement.in_short(fit),
         "Demonstrations": words.division(counts),
         "Parameters": str(metrics.parameters),
         "Training": words.spent(metrics.training),
@@ -81,15 +95,11 @@ def header(fit: Fit, metrics: Metrics) -> list[Block]:
     supervisor = counts.supervisor.get("success")
     if isinstance(supervisor, Rate):
         facts["Supervisor’s own success"] = f"{words.rate(supervisor, 'demonstrations')}, 95 % interval"
-    blocks: list[Block] = [Text(words.verdict(metrics), "verdict")]
+    blocks: list[Block] = [Text(words.headline(metrics), "verdict")]
     if success := words.success(metrics):
         blocks.append(Text(success))
-    if found := degeneracies(fit):
-        signs = "1 sign" if len(found) == 1 else f"{len(found)} signs"
-        link = Markup('<a href="#warnings">Warnings</a>')
-        blocks.append(Text(Markup("{} of a degenerate solution: see {}.").format(signs, link)))
     held_out = "used neither in training nor in tuning, which decides when to stop"
     if counts.left_out:
         held_out = "each demonstration by the fit that was trained and tuned without it"
     explained = f"Held out: {held_out}. A nat is the unit of log-likelihood: {words.NAT}."
-    return [*blocks, note(explained), Facts(facts)]
+    return [*blocks, Facts(facts), footnote(explained)]

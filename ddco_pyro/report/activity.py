@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
 from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.sources.recording import label_names
 from ddco_pyro.drawing.words import option_name
 from ddco_pyro.evaluation.inferred import Inferred
 from ddco_pyro.fitting.fitted import Fit
+from ddco_pyro.segmenting import Segmented, Segments, of_piece, of_run
+from ddco_pyro.segmenting.page import label_colours
 
 MOST_BINS = 60
 
@@ -24,7 +28,6 @@ class LevelActivity:
     :param ended: whether the path makes a new choice at this step: 1, 0, or -1 past the end [N, T].
     :param termination: ψ_h(s_t) of the k options [N, T, k].
     :param lasts: whether options can be active for more than one step.
-    :param intervals: of the first steps of the path's segments, [segments, 2] for each demonstration.
     :param names: the name of each choice, control first.
     """
 
@@ -34,7 +37,6 @@ class LevelActivity:
     ended: np.ndarray
     termination: np.ndarray
     lasts: bool = field(default=True, kw_only=True)
-    intervals: Sequence[np.ndarray] = field(default=(), kw_only=True)
     names: Sequence[str] = field(default=(), kw_only=True)
 
     @property
@@ -43,12 +45,21 @@ class LevelActivity:
         return [choice for choice in range(self.active.shape[2]) if choice or self.active[..., 0].any()]
 
 
+NOTHING = Segmented((), {}, None)
+
+
 @dataclass(frozen=True)
 class Activity:
-    """All levels, lowest first, over the same demonstrations of ``lengths`` [N] steps."""
+    """All levels, lowest first, over the same demonstrations of ``lengths`` [N] steps, and their segments."""
 
     levels: tuple[LevelActivity, ...]
     lengths: np.ndarray
+    segmented: Segmented = NOTHING
+
+    @cached_property
+    def label_colours(self) -> dict[str, dict[int, str]]:
+        """The colour of each label by the name of the labels: that of the option that it is matched with."""
+        return label_colours(self.segmented)
 
     @property
     def choices(self) -> set[int]:
@@ -69,17 +80,17 @@ def activity(fit: Fit, demos: Demonstrations) -> Activity:
     """The activity of a fit with at least one level."""
     assert fit.spec.hierarchy is not None  # a baseline has no levels
     known = fit.spec.hierarchy.levels
-    parts, intervals = [], []
+    labels = {demo.name: {name: demo.labels[name] for name in fit.spec.demonstrations.label_names} for demo in demos}
+    parts: list[tuple[list[np.ndarray], ...]] = []
+    segments: list[Segments] = []
     for piece in fit.infer(demos):
         parts.append(_arrays(piece, max(demos.lengths)))
-        intervals += [piece.intervals(row, [level.lasts for level in known]) for row in range(len(piece.names))]
+        segments += of_piece(fit, piece, labels, intervals=True)
     levels = []
     for number, level in enumerate(known):
         arrays = (np.concatenate([part[what][number] for part in parts]) for what in range(4))
-        within = [each[number] for each in intervals]
-        names = fit.names[level.name]
-        levels.append(LevelActivity(level.name, *arrays, lasts=level.lasts, intervals=within, names=names))
-    return Activity(tuple(levels), np.array(demos.lengths))
+        levels.append(LevelActivity(level.name, *arrays, lasts=level.lasts, names=fit.names[level.name]))
+    return Activity(tuple(levels), np.array(demos.lengths), of_run(fit, segments, demos.frequency, label_names(demos.attributes)))
 
 
 def _arrays(piece: Inferred, steps: int) -> tuple[list[np.ndarray], ...]:

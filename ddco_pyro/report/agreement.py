@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.sources.recording import label_names
-from ddco_pyro.drawing.page import Block, Section, Table, Text, note
-from ddco_pyro.drawing.words import label_name, option_name, percent
+from ddco_pyro.drawing.page import Block, Section, Table, Text, footnote, note
+from ddco_pyro.drawing.words import label_name, number, option_name, percent
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Confusion, Scores
 from ddco_pyro.report.options import quoted
@@ -33,7 +33,7 @@ def section(fit: Fit, demos: Demonstrations) -> Section | None:
     known = label_names(demos.attributes)
     compared = quoted(fit.spec.demonstrations.label_names)
     blocks: list[Block] = [Text(f"Options and the ground-truth {compared}."), agreement_table(scores)]
-    blocks.append(note(f"{EXPLAINED} {tolerances(demos.frequency)}"))
+    blocks.append(footnote(f"{EXPLAINED} {tolerances(demos.frequency)}"))
     for level, label, own in zip(names, truth, record.confusion, strict=True):
         names_of_labels = [label_name(label, value, known.get(label, ()), level) for value in own.labels]
         title = f"Where each label’s steps lie: level “{level}”, label “{label}”"
@@ -47,6 +47,24 @@ def section(fit: Fit, demos: Demonstrations) -> Section | None:
         )
     )
     return Section("agreement", "Agreement with ground truth", blocks)
+
+
+def in_short(fit: Fit) -> dict[str, str]:
+    """NMI and accuracy of each level: names and values for the head of the page."""
+    record, said = fit.metrics.agreement, {}
+    if not record or fit.spec.hierarchy is None:
+        return {}
+    for place, label in enumerate(record.labels):
+        parts = {"held out": record.valid, "in training": record.train}
+        found = {part: scores[place] for part, scores in parts.items() if scores is not None}
+        each = [
+            f"NMI {number(one.nmi)}, accuracy {percent(one.matched_globally.accuracy)} {part}"
+            for part, one in found.items()
+            if one is not None
+        ]
+        level = f"{list(fit.names)[place]}: " if len(record.labels) > 1 else ""
+        said[f"{level}Labels “{label}”"] = "; ".join(each) or "–"
+    return said
 
 
 def confusion_table(record: Confusion, names: Sequence[str], labels: Sequence[str]) -> Table:

@@ -71,7 +71,7 @@ def saliency(fit: Fit, demos: Demonstrations) -> Section | None:
         "episode (<code>videos/saliency</code>)."
     ).format(command)
     picture = save(figure, fit.run_folder / "figures" / "looks.png", alt, caption)
-    return Section("looks", "What it looks at", [picture, note(limits)])
+    return Section("looks", "What it looks at", [picture, note(limits)], folded=True)
 
 
 def deciding(fit: Fit, demos: Demonstrations) -> dict[str, dict[str, dict[int, str]]]:
@@ -162,7 +162,9 @@ def branches(fit: Fit) -> Section | None:
         "can be compared between the options of a branch, not between branches. Nats lost can be compared everywhere."
     )
     picture = save(draw_branches(uses, names), fit.run_folder / "figures" / "branches.png", "Branches", caption)
-    return Section("branches", "Which inputs matter", [picture, branch_table(uses, names), note(explained)])
+    return Section(
+        "branches", "Which inputs matter", [picture, branch_table(uses, names), note(explained)], folded=True
+    )
 
 
 def branch_table(uses: Sequence[BranchUse], names: Sequence[Sequence[str]]) -> Table:

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from ddco_pyro.data.controls import ControlDimension
 from ddco_pyro.drawing.figures import Interval, Panel, interval_plot, save
 from ddco_pyro.drawing.page import Block, Cell, Section, Table, Text, note
-from ddco_pyro.drawing.words import about, capital, duration, effort, listed, method, number, with_error
+from ddco_pyro.drawing.words import about, capital, duration, effort, listed, method, number, verdict, with_error
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Compared, Metrics
 from ddco_pyro.segmenting.page import anchor
@@ -38,12 +38,13 @@ def section(fit: Fit) -> Section:
     )
     figure = draw(metrics, {name: one.held_out for name, one in fit.baselines.items()})
     blocks: list[Block] = [
+        Text(verdict(metrics)),
         Text(f"Nats per step; higher is better. {about(metrics.methods)} {stds(fit)}"),
         table(metrics),
         save(figure, fit.run_folder / "figures" / "likelihood.png", alt, caption),
         note(units),
     ]
-    return Section("likelihood", "Held-out log-likelihood", blocks)
+    return Section("likelihood", "Held-out log-likelihood", blocks, folded=True)
 
 
 def stds(fit: Fit) -> str:
@@ -111,9 +112,8 @@ def demonstrations(metrics: Metrics, anchors: Collection[str]) -> Section:
     )
     found = Table(["Demonstration", "", "Length", *map(method, methods)], rows, {0, 1})
     links = " A name leads to the demonstration’s segments." if anchors else ""
-    return Section(
-        "demonstrations", "Every demonstration", [Text(text + links), *found.folded(SHOWN, "demonstrations")]
-    )
+    blocks = [Text(text + links), *found.folded(SHOWN, "demonstrations")]
+    return Section("demonstrations", "Every demonstration", blocks, folded=True)
 
 
 def dimensions(fit: Fit) -> Section:
@@ -143,4 +143,4 @@ def dimensions(fit: Fit) -> Section:
     shown = "held-out" if held_out else "training"
     text = f"Nats per step on {shown} demonstrations."
     blocks: list[Block] = [Text(text), Table(head, rows, {0, len(head) - 2, len(head) - 1}), note(explained)]
-    return Section("dimensions", "Log-likelihood by control dimension", blocks)
+    return Section("dimensions", "Log-likelihood by control dimension", blocks, folded=True)

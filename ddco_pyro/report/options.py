@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -14,9 +15,8 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import MaxNLocator
 
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.data.sources.recording import label_names
-from ddco_pyro.drawing.colours import add_legend, option_colour
-from ddco_pyro.drawing.figures import FAINT, GRID, blank, hide_frame, save
+from ddco_pyro.drawing.colours import add_legend, is_bright, option_colour
+from ddco_pyro.drawing.figures import FAINT, GRID, INK, blank, hide_frame, save
 from ddco_pyro.drawing.page import Block, Cell, Picture, Section, Table, Text, note
 from ddco_pyro.drawing.timeline import Timelines
 from ddco_pyro.drawing.words import duration, label_name, number, numbered_name, percent
@@ -24,7 +24,7 @@ from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import NamedByLabel
 from ddco_pyro.report import trajectories
 from ddco_pyro.report.activity import Activity, Bins, LevelActivity, bins
-from ddco_pyro.segmenting import LevelLabels, Segmented, Segments
+from ddco_pyro.segmenting import Segmented
 from ddco_pyro.segmenting.page import HOW
 
 EXAMPLES = 4
@@ -36,6 +36,9 @@ MOST_POINTS = 400
 LEAST_SHARE = 0.01
 """A termination is drawn where its option is active in at least this share of the demonstrations."""
 
+ROWS = 6
+"""Time lines that are seen at once."""
+
 MOST_STEPS = 1_000_000
 """Steps of all levels in time lines, about; ``ddco-pyro segment --html`` makes a page of more."""
 
@@ -43,7 +46,7 @@ CHARACTER = 0.016
 """The share of a posterior's width that a character of a label takes, about."""
 
 LABEL_SHADES = ("#ffffff", "#d4d4d4")
-"""Shades of ground-truth segments, in turn: colours belong to options."""
+"""Shades of segments whose label is matched with no option, in turn."""
 
 
 def section(fit: Fit, demos: Demonstrations, activity: Activity) -> Section:
@@ -69,7 +72,7 @@ def section(fit: Fit, demos: Demonstrations, activity: Activity) -> Section:
     blocks.append(use_table(fit))
     link = Markup('<a href="#segments">segments of every demonstration</a>')
     blocks += [used, Text(Markup("Step by step: {}.").format(link))]
-    return Section("options", "Which option is active when", blocks)
+    return Section("options", "Which option is active when", blocks, folded=True)
 
 
 def use_table(fit: Fit, levels: Sequence[str] | None = None) -> Table:
@@ -121,8 +124,8 @@ def _posterior_picture(
         "demonstrations (u in the paper), stacked. Path: the most likely sequence of options."
     )
     if known := labels[examples[names[0]]]:
-        caption += f" Boxes: ground-truth {quoted(known)}."
-    figure = draw_posteriors(activity, examples, labels, label_names(demos.attributes))
+        caption += f" Boxes: ground-truth {quoted(known)}, in the colour of the option that a label is matched with."
+    figure = draw_posteriors(activity, examples, labels, activity.segmented.label_names)
     alt = f"Stacked probabilities of the options over time in {', '.join(names)}"
     return save(figure, fit.run_folder / "figures" / "posterior.png", alt, caption)
 
@@ -173,7 +176,8 @@ def _example(
         hide_frame(strip)
         strip.set_ylabel("path", **beside)
     for strip, (name, values) in zip(panels, labels.items(), strict=True):
-        _labels(strip, values, [label_name(name, value, known.get(name, ())) for value in values.tolist()])
+        text = [label_name(name, value, known.get(name, ())) for value in values.tolist()]
+        _labels(strip, values, text, activity.label_colours.get(name, {}))
         strip.set_ylabel("label" if len(labels) == 1 else name, **beside)
     last = figure.axes[-1]
     last.set_xlim(-0.5, length - 0.5)
@@ -190,13 +194,16 @@ def _stack(axes: Axes, shares: np.ndarray, edges: np.ndarray) -> None:
     axes.set(xlim=(edges[0], edges[-1]), ylim=(0, 1))
 
 
-def _labels(axes: Axes, labels: np.ndarray, names: Sequence[str]) -> None:
+def _labels(axes: Axes, labels: np.ndarray, names: Sequence[str], colours: Mapping[int, str]) -> None:
     """One demonstration's labels [T] as boxes, with their names where there is room."""
     edges = np.concatenate([[0], np.flatnonzero(np.diff(labels)) + 1, [len(labels)]])
     for place, (start, end) in enumerate(pairwise(edges.tolist())):
-        axes.axvspan(start - 0.5, end - 0.5, facecolor=LABEL_SHADES[place % 2], edgecolor=FAINT, linewidth=0.5)
+        colour = colours.get(int(labels[start]), LABEL_SHADES[place % 2])
+        axes.axvspan(start - 0.5, end - 0.5, facecolor=colour, edgecolor=FAINT, linewidth=0.5)
         if end - start > CHARACTER * len(names[start]) * len(labels):
-            axes.text((start + end - 1) / 2, 0.45, names[start], ha="center", va="center", fontsize=7.5)
+            ink = INK if is_bright(colour) else "white"
+            middle = (start + end - 1) / 2
+            axes.text(middle, 0.45, names[start], ha="center", va="center", fontsize=7.5, color=ink)
     axes.set_xlim(-0.5, len(labels) - 0.5)
     hide_frame(axes)
 
@@ -211,7 +218,7 @@ def _rows_picture(fit: Fit, activity: Activity, labels: Sequence[Mapping[str, np
         "the option first changes."
     )
     if labels[0]:
-        caption += " Ground-truth labels in shades of grey."
+        caption += " A ground-truth label has the colour of the option that it is matched with, or is grey."
     figure = draw_rows(activity, {name: [each[name] for each in labels] for name in labels[0]})
     alt = f"Rows of colour: the most likely option at each step of {count} demonstrations"
     return save(figure, fit.run_folder / "figures" / "segments.png", alt, caption)
@@ -231,7 +238,9 @@ def draw_rows(activity: Activity, labels: Mapping[str, Sequence[np.ndarray]]) ->
     images = [(f"level “{level.name}”", colour_image(level.path[rows])) for level in reversed(activity.levels)]
     for name, values in labels.items():
         title = "ground-truth labels" if len(labels) == 1 else f"labels “{name}”"
-        images.append((title, label_image([values[row] for row in rows], activity.lengths.max())))
+        colours = activity.label_colours.get(name, {})
+        image = label_image([values[row] for row in rows], activity.lengths.max(), colours)
+        images.append((title, image))
     figure = blank(float(np.clip(0.9 + 0.045 * len(rows), 2.2, 7)))
     panels = figure.subplots(1, len(images), sharey=True, squeeze=False)[0]
     for axes, (title, image) in zip(panels, images, strict=True):
@@ -252,13 +261,14 @@ def colour_image(path: np.ndarray) -> np.ndarray:
     return image
 
 
-def label_image(labels: Sequence[np.ndarray], steps: int) -> np.ndarray:
-    """Labels [T_n] of N demonstrations as shades of grey [N, steps, 3]; white past the end."""
+def label_image(labels: Sequence[np.ndarray], steps: int, colours: Mapping[int, str]) -> np.ndarray:
+    """Labels [T_n] of N demonstrations in their colours or in shades of grey [N, steps, 3]; white past the end."""
     values = sorted({int(value) for array in labels for value in np.unique(array)})
-    shades = np.linspace(0.86, 0.1, len(values))
+    greys = np.linspace(0.86, 0.1, len(values))
+    palette = np.array([to_rgb(colours.get(value, str(grey))) for value, grey in zip(values, greys, strict=True)])
     image = np.ones((len(labels), steps, 3))
     for row, array in zip(image, labels, strict=True):
-        row[: len(array)] = shades[np.searchsorted(values, array), None]
+        row[: len(array)] = palette[np.searchsorted(values, array)]
     return image
 
 
@@ -320,34 +330,21 @@ def terminations(level: LevelActivity, gathered: Bins) -> np.ndarray:
 # --- segments ---------------------------------------------------------------------------------------------------------
 
 
-def segmented(fit: Fit, demos: Demonstrations, activity: Activity) -> Segmented:
-    """Segments of the demonstrations in the order of ``demonstrations_by_likelihood``."""
-    entries = {entry.name: entry for entry in fit.metrics.demonstrations_by_likelihood}
-    places = {name: row for row, name in enumerate(demos.names)}
-    segments = []
-    for name, entry in entries.items():
-        if name in places:
-            demo, row = demos[places[name]], places[name]
-            levels = {
-                level.name: LevelLabels.of(
-                    *(array[row, : len(demo)] for array in (level.path, level.ended, level.active)),
-                    lasts=level.lasts,
-                    intervals=level.intervals[row],
-                )
-                for level in activity.levels
-            }
-            labels = {label: demo.labels[label] for label in fit.spec.demonstrations.label_names}
-            value = entry.log_likelihood_per_step[fit.name]
-            segments.append(Segments(name, levels, value, entry.part == "valid", labels))
-    counts = {level.name: level.active.shape[2] - 1 for level in activity.levels}
-    known = label_names(demos.attributes)
-    return Segmented(tuple(segments), counts, demos.frequency, names=fit.names, label_names=known)
+def segmented(fit: Fit, activity: Activity) -> Segmented:
+    """The segments in the order of ``demonstrations_by_likelihood``, with its numbers."""
+    found = {demo.name: demo for demo in activity.segmented.segments}
+    ordered = [
+        replace(found[one.name], log_likelihood=one.log_likelihood_per_step[fit.name], held_out=one.part == "valid")
+        for one in fit.metrics.demonstrations_by_likelihood
+        if one.name in found
+    ]
+    return replace(activity.segmented, segments=tuple(ordered))
 
 
 def segments(drawn: Timelines, demonstrations: int) -> Section:
     """The time lines; a note on the others where not all of so many demonstrations have one."""
     explained = Markup('{} The order is that of the <a href="#demonstrations">list</a>.').format(HOW)
-    blocks: list[Block] = [note(explained), drawn]
+    blocks: list[Block] = [note(explained), replace(drawn, rows=ROWS)]
     if len(drawn.tracks) < demonstrations:
         command = Markup("<code>ddco-pyro segment RUN FILE --html PAGE</code>")
         blocks.append(note(Markup("The others would make this page slow; {} makes a page of them.").format(command)))

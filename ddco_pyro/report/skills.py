@@ -13,8 +13,22 @@ from ddco_pyro.data.pictures import Observed
 from ddco_pyro.drawing.colours import option_colour, option_rgb
 from ddco_pyro.drawing.diagrams import curves, dendrogram, path_film, transition_graph, typical_paths
 from ddco_pyro.drawing.figures import data_uri
-from ddco_pyro.drawing.page import Block, Card, Cell, Code, Drawing, Facts, Film, Films, Picture, Section, Text, note
-from ddco_pyro.drawing.shown import frames, jpeg, paths_of, positions, projection, told
+from ddco_pyro.drawing.page import (
+    Block,
+    Card,
+    Cell,
+    Code,
+    Drawing,
+    Facts,
+    Film,
+    Films,
+    Folded,
+    Picture,
+    Section,
+    Text,
+    note,
+)
+from ddco_pyro.drawing.shown import frames, in_words, jpeg, paths_of, positions, projection
 from ddco_pyro.drawing.words import duration, number, numbered_name, percent
 from ddco_pyro.errors import command
 from ddco_pyro.evaluation.options import SMALLEST_DIVERGENCE
@@ -135,6 +149,7 @@ def section(fit: Fit, demos: Demonstrations, pictures: Sequence[Observed], segme
             facts = _facts(steps[choice] / steps.sum(), every[choice], counts, choice, names, segmented.frequency)
             labels = [one for one in fit.metrics.named_by_labels if (one.level, one.option) == (level, choice)]
             facts |= {f"Label {one.labels}, agreement": agreeing(one) for one in labels}
+            facts |= _not_a_skill(every[choice], segmented)
             facts |= {what: values[choice] for what, values in reads.get(level, {}).items() if choice in values}
             facts = {what: said.replace(" %", "\N{NO-BREAK SPACE}%") for what, said in facts.items()}
             title = Cell(numbered_name(choice, names), colour=option_colour(choice))
@@ -148,8 +163,9 @@ def section(fit: Fit, demos: Demonstrations, pictures: Sequence[Observed], segme
         order = sorted(present, key=onset.__getitem__)
         caption = (
             "Order of the options: numbers count transitions between segments; the width of an arc is the share of its "
-            "start's transitions. Arcs above lead to the right, arcs below back. Transitions below 1 % of all are left "
-            "out. The area of a circle is the share of steps. From left to right, by mean onset: "
+            "start's transitions. Arcs above lead to the right, arcs below back. Arcs of less than 1 % of transitions, "
+            "or of starts or ends, are left out. The area of a circle is the share of steps. From left to right, by "
+            "mean onset: "
             f"{', '.join(names[choice] for choice in order)}."
         )
         blocks.append(Drawing(transition_graph(counts, steps / steps.sum(), names, order), caption))
@@ -176,6 +192,20 @@ def _facts(
     }
 
 
+WHOLE = 0.9
+"""An option with this share of the steps of its demonstrations takes them whole."""
+
+
+def _not_a_skill(found: Sequence[Instance], segmented: Segmented) -> dict[str, str]:
+    """A fact on an option that some demonstrations have from their start to their end; empty for others."""
+    rows = {one.row for one in found}
+    share = sum(map(len, found)) / sum(len(segmented.segments[row]) for row in rows)
+    if share < WHOLE or len(rows) == len(segmented):
+        return {}
+    takes = f"takes {percent(share)} of the {len(rows)} demonstrations that have it"
+    return {"No skill": f"{takes}: it says which demonstration, not which skill"}
+
+
 def _frequent(counts: np.ndarray, names: Sequence[str], most: int = 2) -> str:
     """The most frequent neighbours with their shares."""
     first = np.argsort(-counts, kind="stable")[:most]
@@ -183,7 +213,7 @@ def _frequent(counts: np.ndarray, names: Sequence[str], most: int = 2) -> str:
 
 
 def _alike(fit: Fit, place: int, level: str, names: Sequence[str]) -> list[Block]:
-    """The dendrogram of a level's options, and the command that merges the closest pair."""
+    """The dendrogram of a level's options, and the command that merges the closest pair where it acts alike."""
     known = {row.options: row.divergence for row in fit.metrics.divergences[place] if row.divergence is not None}
     used = [row.choice for row in fit.metrics.options[place] if row.choice and row.share > 0]
     pairs = [(a, b) for n, a in enumerate(used) for b in used[n + 1 :]]
@@ -198,14 +228,14 @@ def _alike(fit: Fit, place: int, level: str, names: Sequence[str]) -> list[Block
             "How alike options act: the divergence of their policies, the mean of both Kullback–Leibler divergences in "
             "nats per step, averaged over the pairs of two groups; square-root scale."
         )
-        blocks.append(Drawing(dendrogram(merges, used, names), caption))
+        blocks.append(Folded("How alike options act", [Drawing(dendrogram(merges, used, names), caption)]))
     held = fit.spec.training.labels is not None and fit.spec.training.labels.hold
     if not held:
         a, b = min(pairs, key=known.__getitem__)
-        alike = "act alike" if known[a, b] < SMALLEST_DIVERGENCE else "are the closest pair"
-        text = f"{names[a]} and {names[b]} {alike}: {number(known[a, b])} nats per step. To fit again with both as one:"
-        named = ("--level", level) if len(fit.names) > 1 else ()
-        blocks += [Text(text), Code(command("merge", fit.run_folder, *named, "--options", a, b))]
+        if known[a, b] < SMALLEST_DIVERGENCE:
+            text = f"{names[a]} and {names[b]} act alike: {number(known[a, b])} nats per step. To fit with both as one:"
+            named = ("--level", level) if len(fit.names) > 1 else ()
+            blocks += [Text(text), Code(command("merge", fit.run_folder, *named, "--options", a, b))]
     return blocks
 
 
@@ -233,7 +263,7 @@ class _Shown:
         if not self.drawn:
             return f"Lines: controls from the onset of each segment on. {typical}"
         return (
-            f"Drawings: {told(self.drawn, self.demos)}. Circle, square and triangle: first, "
+            f"Drawings: {in_words(self.drawn, self.demos)}. Circle, square and triangle: first, "
             f"middle and last step of a segment. {typical} Click a film to stop it."
         )
 

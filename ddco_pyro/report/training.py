@@ -70,7 +70,7 @@ def learning(fit: Fit) -> Section | None:
     explained = [STAGES[kind] for kind in kinds if kind in STAGES]
     explained.append(f"In history.csv and on the console the stages are {', '.join(names)}.")
     picture = save(draw_curves(curves), fit.run_folder / "figures" / "learning.png", alt, caption)
-    return Section("learning", "Learning curves", [picture, note(" ".join(explained))])
+    return Section("learning", "Learning curves", [picture, note(" ".join(explained))], folded=True)
 
 
 def read_curves(histories: Mapping[str, Path]) -> list[Curves]:
@@ -131,12 +131,16 @@ def _limits(values: np.ndarray) -> tuple[float, float]:
 
 
 def warnings(fit: Fit) -> Section | None:
-    """Signs of too short a training and of a degenerate solution; None for a converged policy without options."""
+    """Signs of too short a training and of a degenerate solution, folded where there are none.
+
+    None for a converged policy without options.
+    """
     blocks: list[Block] = [Warned(*sign) for sign in words.unconverged(fit.metrics)]
     if fit.spec.hierarchy is None:
         return Section("warnings", "Warnings", blocks) if blocks else None
     signs = degeneracies(fit)
     blocks += [Warned(*sign) for sign in signs]
+    found = bool(blocks)
     if not signs:
         blocks.append(
             Text(
@@ -146,7 +150,7 @@ def warnings(fit: Fit) -> Section | None:
                 "No caller emits the control itself most of the time."
             )
         )
-    return Section("warnings", "Warnings", blocks)
+    return Section("warnings", "Warnings", blocks, folded=not found)
 
 
 def degeneracies(fit: Fit) -> list[tuple[str, str]]:
@@ -220,4 +224,4 @@ def particulars(fit: Fit) -> Section:
         Facts(fit.metrics.versions, "Versions"),
     ]
     spec = Folded("The whole spec, with its defaults", [Code(dump_spec(fit.spec))])
-    return Section("particulars", "How this run was made", [Columns(facts), spec])
+    return Section("particulars", "How this run was made", [Columns(facts), spec], folded=True)

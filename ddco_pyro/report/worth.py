@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ddco_pyro.drawing import words
-from ddco_pyro.drawing.page import Section, Table, note
+from ddco_pyro.drawing.page import Section, Table, footnote
 from ddco_pyro.metrics import Metrics
 
 EXPLAINED = (
@@ -40,4 +40,4 @@ def section(metrics: Metrics) -> Section | None:
         for part, name in parts.items()
         if getattr(found, part)
     ]
-    return Section("worth", "What options are worth", [Table(["Part", *columns], rows), note(EXPLAINED)])
+    return Section("worth", "What options are worth", [Table(["Part", *columns], rows), footnote(EXPLAINED)])

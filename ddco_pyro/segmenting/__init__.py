@@ -20,7 +20,6 @@ from ddco_pyro.evaluation.inferred import Inferred, started
 from ddco_pyro.events import BaselineSegmented, DemonstrationsDone, OnEvent, ignore
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.segmenting import baselines
-from ddco_pyro.spec import LevelSpec
 from ddco_pyro.training.data import parts
 
 __all__ = ["LevelLabels", "Segmented", "Segments", "beside_baselines", "recorded", "segments"]
@@ -135,19 +134,28 @@ def segments(fit: Fit, source: Source, on_event: OnEvent = ignore, intervals: bo
     :raises BadInput: the run has no options.
     :raises DemonstrationsError: a demonstration cannot be used, or lacks an observation of the run.
     """
-    hierarchy = fit.spec.hierarchy
-    if hierarchy is None:
+    if fit.spec.hierarchy is None:
         raise BadInput(f"{fit.place}: is a {fit.name} policy without options; name a run that has options")
-    counts = {level.name: level.count for level in hierarchy.levels}
     chosen, known = chosen_names(source, fit), label_names(source.attributes)
     labels: dict[str, dict[str, np.ndarray]] = {}
     segmented: list[Segments] = []
     for piece in fit.infer(_demonstrations(source, chosen, fit, labels)):
-        segmented += _segments(fit, piece, hierarchy.levels, labels, intervals)
+        segmented += of_piece(fit, piece, labels, intervals)
         on_event(DemonstrationsDone(len(segmented), len(chosen)))
+    return of_run(fit, segmented, source.frequency, known)
+
+
+def of_run(
+    fit: Fit, segmented: Sequence[Segments], frequency: float | None, known: Mapping[str, Sequence[str]]
+) -> Segmented:
+    """These segments with what a run says of all: the number and the names of its options, and its labels.
+
+    :param known: for labels in the file, the names of labels 0, 1, ...
+    """
+    counts = {level.name: level.count for level in fit.spec.hierarchy.levels} if fit.spec.hierarchy else {}
     names = fit.spec.demonstrations.labels_by_level(len(counts))
     truth = dict(zip(counts, names, strict=bool(names)))
-    return Segmented(tuple(segmented), counts, source.frequency, truth, fit.names, known)
+    return Segmented(tuple(segmented), counts, frequency, truth, fit.names, known)
 
 
 def beside_baselines(
@@ -229,13 +237,15 @@ def _demonstration(recording: Recording, fit: Fit) -> Demonstration:
     return Demonstration(recording.name, {key: known[key].observed() for key in shapes}, recording.actions.array())
 
 
-def _segments(
-    fit: Fit,
-    piece: Inferred,
-    levels: Sequence[LevelSpec],
-    labels: dict[str, dict[str, np.ndarray]],
-    intervals: bool,
+def of_piece(
+    fit: Fit, piece: Inferred, labels: Mapping[str, dict[str, np.ndarray]], intervals: bool
 ) -> Iterator[Segments]:
+    """The segments of each demonstration that was inferred.
+
+    :param labels: ground-truth labels of each demonstration, by its name.
+    :raises DemonstrationsError: no options explain a demonstration.
+    """
+    levels = fit.spec.hierarchy.levels if fit.spec.hierarchy else ()
     for row, (name, steps) in enumerate(zip(piece.names, piece.lengths, strict=True)):
         known = piece.intervals(row, [level.lasts for level in levels]) if intervals else [None] * len(levels)
         each = {

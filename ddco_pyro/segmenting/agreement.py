@@ -9,7 +9,7 @@ import numpy as np
 
 from ddco_pyro.drawing.page import Table
 from ddco_pyro.drawing.words import duration, number
-from ddco_pyro.evaluation.agreement import MATCHED, TOLERANCES, UNMATCHED, agreement
+from ddco_pyro.evaluation.agreement import MATCHED, TOLERANCES, UNMATCHED, agreement, confusion
 from ddco_pyro.metrics import Scores
 from ddco_pyro.segmenting import Segmented, Segments
 from ddco_pyro.segmenting.baselines import BASELINES, EQUAL, equal_lengths
@@ -102,6 +102,21 @@ def level_agreements(segmented: Segmented) -> dict[str, LevelAgreement]:
 def of_equal_lengths(labels: Sequence[np.ndarray], count: int) -> Scores | None:
     """The agreement with labels [T] of demonstrations that are cut into ``count`` equal parts."""
     return agreement([equal_lengths(len(own), count) for own in labels], labels)
+
+
+def matched(segmented: Segmented) -> dict[str, dict[int, int]]:
+    """For labels that the run's spec compares with a level: the option that each label is matched with.
+
+    They are matched in held-out demonstrations, or in all where none is held out, as in tables. Labels of several
+    levels are matched with the lowest one's options.
+    """
+    found: dict[str, dict[int, int]] = {}
+    for level, truth in segmented.truth.items():
+        labelled = next(iter(_groups(segmented, truth).values()), ())
+        table = confusion([demo.levels[level].options for demo in labelled], [demo.labels[truth] for demo in labelled])
+        pairs = zip(table.matched, table.options, strict=True)
+        found.setdefault(truth, {label: option for label, option in pairs if label is not None})
+    return found
 
 
 def _groups(segmented: Segmented, truth: str) -> dict[str, Sequence[Segments]]:

@@ -16,21 +16,22 @@ from ddco_pyro.data.files import write_text
 from ddco_pyro.data.pictures import Observed
 from ddco_pyro.data.sources.recording import BOUNDARY
 from ddco_pyro.drawing.colours import option_colour
-from ddco_pyro.drawing.page import Block, Cell, Page, Section, Table, Text, note
+from ddco_pyro.drawing.page import Block, Cell, Page, Section, Table, Text, footnote, note
 from ddco_pyro.drawing.shown import paths_of
 from ddco_pyro.drawing.timeline import Lane, Runs, Timelines, Track, following
 from ddco_pyro.drawing.words import NAT, duration, label_name, number, numbered_name, option_name, percent
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.segmenting import Segmented, Segments
-from ddco_pyro.segmenting.agreement import EXPLAINED, LevelAgreement, agreement_table, tolerances
+from ddco_pyro.segmenting.agreement import EXPLAINED, LevelAgreement, agreement_table, matched, tolerances
 
 FIRST = 10
 """Demonstrations among which an observation that moves like a position is sought."""
 
 HOW = (
     "Time runs to the right. Colours are options; the height of a band is the posterior probability of its option. A "
-    "bar below a boundary is the 90 % interval of its step, over draws from the posterior. Grey rows are labels. "
-    "Numbers, the trajectory and pictures below follow the cursor."
+    "bar below a boundary is the 90 % interval of its step, over draws from the posterior. Rows without such bands are "
+    "labels: each has the colour of the option that it is matched with, or is grey. Numbers, paths and pictures below "
+    "follow the cursor."
 )
 
 
@@ -74,7 +75,7 @@ def _level(name: str, segmented: Segmented, agreement: LevelAgreement | None) ->
     blocks: list[Block] = [Table(head, rows)]
     if agreement:
         blocks.append(Text(f"Agreement with the label “{agreement.labels}”", "heading"))
-        blocks += [agreement_table(agreement.scores), note(f"{EXPLAINED} {tolerances(segmented.frequency)}")]
+        blocks += [agreement_table(agreement.scores), footnote(f"{EXPLAINED} {tolerances(segmented.frequency)}")]
     return Section(f"level-{quote(name, safe='')}", f"Level “{name}”", blocks)
 
 
@@ -91,7 +92,8 @@ def timelines(
     :param follows: what follows the cursor, of :func:`~ddco_pyro.drawing.timeline.following`.
     """
     lanes = {name: _level_lane(name, segmented) for name in reversed(segmented.counts)}
-    lanes |= {name: Lane(name, names) for name, names in _values(segmented).items()}
+    colours = label_colours(segmented)
+    lanes |= {name: Lane(name, names, colours.get(name, {})) for name, names in _values(segmented).items()}
     before = accumulate((len(demo) * len(segmented.counts) for demo in segmented.segments), initial=0)
     shown = [demo for demo, steps in zip(segmented.segments, before, strict=False) if steps < most_steps]
     tracks = [
@@ -107,6 +109,14 @@ def timelines(
         for demo, followed in zip_longest(shown, islice(follows, len(shown)))
     ]
     return Timelines(list(lanes.values()), tracks, segmented.frequency)
+
+
+def label_colours(segmented: Segmented) -> dict[str, dict[int, str]]:
+    """The colour of each label: that of the option that it is matched with."""
+    return {
+        name: {label: option_colour(option) for label, option in options.items()}
+        for name, options in matched(segmented).items()
+    }
 
 
 def followed(
