@@ -91,8 +91,9 @@ def report(run: RunPath, overrides: Overrides = [], allow_code: AllowCode = Fals
     from ddco_pyro.report import write_report
 
     fitted = load(run, allow_code, overrides)
-    _check_run(run, "spec.yaml")
-    claim(run, fitted.spec)
+    _check_run(run, *(["spec.yaml"] if overrides else []))
+    if overrides:
+        claim(run, fitted.spec)
     print(f"report: {write_report(fitted, fitted.demonstrations)}")
 
 

@@ -54,7 +54,7 @@ def claim(folder: Path, spec: Spec, resume: bool = True) -> None:
     text, path = dump_spec(spec), folder / "spec.yaml"
     if path.exists():
         same = path.read_bytes() == text.encode()
-        if not same and not _differs_in_report(spec, path):
+        if not same and not _is_of(spec, path):
             raise RunError(f"{folder}: holds a run of another spec; choose another --out or remove it")
         if not resume and is_finished(folder) and (folder / "report.html").exists():  # what `fit` writes last
             raise RunError(
@@ -67,13 +67,13 @@ def claim(folder: Path, spec: Spec, resume: bool = True) -> None:
     write_text(path, text)
 
 
-def _differs_in_report(spec: Spec, path: Path) -> bool:
-    """Whether a spec differs from that in a file in nothing but its ``report``."""
+def _is_of(spec: Spec, path: Path) -> bool:
+    """Whether a spec differs from that in a file in its ``report`` at most."""
     try:
         other = load_spec(path, allow_code=True)  # which imports nothing
     except SpecError:
         return False
-    return other.report != spec.report and other.model_copy(update={"report": spec.report}) == spec
+    return other.model_copy(update={"report": spec.report}) == spec
 
 
 def is_finished(folder: Path) -> bool:

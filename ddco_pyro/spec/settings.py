@@ -335,9 +335,6 @@ def _is_pair(value: Any) -> bool:
     return texts and SLICE.fullmatch(value[1]) is not None
 
 
-Drawn = str | tuple[str, str] | PathSpec
-
-
 class ReportSpec(Model):
     """What the report shows."""
 
@@ -345,7 +342,7 @@ class ReportSpec(Model):
         Annotated[
             Items[PathSpec],
             Field(min_length=1),
-            BeforeValidator(_paths, json_schema_input_type=Drawn | list[Drawn]),
+            BeforeValidator(_paths, json_schema_input_type=str | PathSpec | list[str | list[str] | PathSpec]),
         ]
         | None
     ) = None
