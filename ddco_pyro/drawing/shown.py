@@ -61,7 +61,7 @@ LINES = ("solid", "dashed", "dotted")
 
 
 def position_key(demos: Demonstrations) -> str | None:
-    """The vector that controls :func:`move <movement>` most: of three numbers or more, or else of two; None without one.
+    """The vector that controls :func:`move <movement>` most, of three numbers or more, or else of two; None without.
 
     An object that the hand moves later may move more than the hand, but controls say less of where the object goes.
     """

@@ -246,13 +246,16 @@ def sound(metrics: Metrics) -> bool:
 
 
 def headline(metrics: Metrics) -> str:
-    """The verdict in a line: over training seeds where there are several, else of this fit."""
+    """The verdict in a line: over training seeds where there are several, else of this fit; first :func:`caution`."""
     held_out, seeds = len(metrics.valid), metrics.seeds
+    if not sound(metrics):
+        return caution(metrics)
     if seeds and "memory" in seeds.worth:
         decided = _verdict(*_range(seeds.worth["memory"], seeds.standard_error["memory"], held_out))
         decided = decided.removeprefix("So ").replace("It is", "it is")
         return f"Over {len(seeds.training_seeds)} training seeds {decided}"
-    return DECIDED[_direction(metrics.worth.memory, held_out)] if metrics.worth else _explained(metrics)
+    said = DECIDED[_direction(metrics.worth.memory, held_out)] if metrics.worth else _explained(metrics)
+    return f"{caution(metrics)} {said}".lstrip()
 
 
 def leads(metrics: Metrics) -> dict[str, str]:

@@ -90,7 +90,8 @@ def activity(fit: Fit, demos: Demonstrations) -> Activity:
     for number, level in enumerate(known):
         arrays = (np.concatenate([part[what][number] for part in parts]) for what in range(4))
         levels.append(LevelActivity(level.name, *arrays, lasts=level.lasts, names=fit.names[level.name]))
-    return Activity(tuple(levels), np.array(demos.lengths), of_run(fit, segments, demos.frequency, label_names(demos.attributes)))
+    segmented = of_run(fit, segments, demos.frequency, label_names(demos.attributes))
+    return Activity(tuple(levels), np.array(demos.lengths), segmented)
 
 
 def _arrays(piece: Inferred, steps: int) -> tuple[list[np.ndarray], ...]:
