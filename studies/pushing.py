@@ -3,10 +3,12 @@
     python studies/pushing.py sample_complexity [--seeds 5] [--demonstrations 40 80] [--methods "flat MLP" "DDCO MLP"]
     python studies/pushing.py number_of_options|augmentation [--options 1 2 4 8]
     python studies/pushing.py variants [--variants "exact hand" "std 0.5"]
+    python studies/pushing.py acting --first 10 --seeds 20 --demonstrations 40 80 --out docs/results/memory.csv
 
-``--demonstrations``, ``--options``, ``--methods`` and ``--variants`` do a part of a study. ``pushing_settings.json``
-has what a sweep over demonstrations and episodes of development seeds chose for each method: learning rate, weight
-decay, and how it acts. A cell that was done is not done again. Adds its numbers to ``docs/results/pushing.csv``.
+``acting`` plays options and a mixture by each way of choosing among them. ``--demonstrations``, ``--options``,
+``--methods`` and ``--variants`` do a part of a study. ``pushing_settings.json`` has what a sweep over demonstrations
+and episodes of development seeds chose for each method: learning rate, weight decay, and how it acts. The mixture has
+the settings of the options. A cell that was done is not done again. Adds its numbers to ``docs/results/pushing.csv``.
 """
 
 from __future__ import annotations
@@ -45,7 +47,12 @@ UPDATES = 3000  # gradient steps of a fit, whatever the method and the number of
 TRAINING, HELD_OUT_SEED, EVALUATION = 100_000, 900_000, 2_000_000
 """Seeds of the simulation; the sweep's demonstrations began at 800 000, and its episodes at 500 000."""
 COUNTS, OPTIONS = (5, 20, 40, 80), (1, 2, 3, 4, 5, 6, 7, 8)
-OWN_OPTIONS = {"DDCO linear": 5, "DDCO MLP": 2, "hybrid MLP": 2}  # what the specs say
+OWN_OPTIONS = {"DDCO linear": 5, "DDCO MLP": 2, "hybrid MLP": 2, "mixture MLP": 2}  # what the specs say
+ACTING = {  # the most likely option of a mixture is its marginal one
+    "mixture MLP": ("mixture", ("marginal", "sample")),
+    "DDCO MLP": ("options", ("marginal", "sample", "most_likely")),
+}
+"""Name of a method to its name in the table of memory, and the ways in which it chooses options."""
 DEFAULTS = Settings({}, Path("runs/pushing"))
 
 EQUAL = "flat MLP, equal parameters"
@@ -57,6 +64,7 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "DDCO linear": ("pushing_linear", {}),
     "DDCO MLP": ("pushing_mlp", {}),
     "hybrid MLP": ("pushing_mlp", {"hierarchy.meta_policy.emits": ["options", "control"]}),
+    "mixture MLP": ("pushing_mlp", {"hierarchy.levels.0.termination": "always", "compare_with": []}),
 }
 """Name of a method to its spec and what it changes there; the one of equal parameters is the flat policy beside it."""
 
@@ -124,6 +132,34 @@ class PushingCell(Cell):
         if own["dwell"] is not None:
             yield Row(*named, "steps an option lasts", own["dwell"])
             yield Row(*named, "steps under own control", own["own_control"])
+
+
+class ActingCell(PushingCell):
+    """A method that acts by each way of choosing options, without a limit."""
+
+    @property
+    def name(self) -> str:
+        """A file name."""
+        return f"acting-{super().name}"
+
+    def results(self, settings: Settings, folder: Path) -> dict[str, Any]:
+        """Fit, and play from the same starts by each way."""
+        spec = spec_of(self)
+        demos = pool(settings.runs, spec)
+        hierarchy = fit(spec, demos.select(demos.names[: self.demonstrations]), folder)
+        first = EVALUATION + 1000 * self.seed
+        goals = {}
+        for way in ACTING[self.method][1]:
+            controller = Controller.from_spec(hierarchy, spec.rollout.model_copy(update={"options": way}))
+            goals[way] = summary(play(pushing.task, controller, range(first, first + EPISODES)))["goals"]
+        return {"nats": per_step(Fit(spec, hierarchy), held_out(settings.runs, spec)), "goals": goals}
+
+    def rows(self, results: Mapping[str, Any]) -> Iterator[Row]:
+        """Means over episodes, and the held-out likelihood."""
+        named = "pushing", "pushing", ACTING[self.method][0], self.demonstrations, self.seed
+        yield Row(*named, "nats", results["nats"])
+        for way, goals in results["goals"].items():
+            yield Row(*named, f"goals, acting by {way}", float(np.mean(goals)))
 
 
 def spec_of(cell: PushingCell) -> Spec:
@@ -195,21 +231,25 @@ def summary(episodes: Sequence[Episode]) -> dict[str, Any]:
 
 def cells(own: argparse.Namespace) -> list[PushingCell]:
     """The part of a study that is asked for, one seed after the other."""
+    kind = ActingCell if own.study == "acting" else PushingCell
     return [
-        PushingCell(method, k, count, seed, variant, own.study)
-        for seed in range(own.seeds)
+        kind(method, k, count, seed, variant, own.study)
+        for seed in range(own.first, own.first + own.seeds)
         for method, k, count, variant in grid(own.study)
         if method in own.methods and count in own.demonstrations and variant in own.variants
-        if own.study in ("sample_complexity", "variants") or k in own.options
+        if own.study in ("sample_complexity", "variants", "acting") or k in own.options
     ]
 
 
 def grid(study: str) -> Iterator[tuple[str, int, int, str]]:
     """Method, options, demonstrations and variant of each cell of a seed."""
     if study == "sample_complexity":
-        methods = [name for name in METHODS if not name.startswith("hybrid")]
+        methods = [name for name in METHODS if not name.startswith(("hybrid", "mixture"))]
         for count, name in itertools.product(COUNTS, methods):
             yield name, OWN_OPTIONS.get(name, 0), count, "base"
+    elif study == "acting":
+        for count, name in itertools.product(COUNTS, ACTING):
+            yield name, OWN_OPTIONS[name], count, "base"
     elif study == "variants":
         for variant, count, name in itertools.product(VARIANTS, (40, 80), ("flat MLP", EQUAL, "DDCO MLP")):
             if name in OWN_OPTIONS or variant != "most likely options":
@@ -223,7 +263,9 @@ def grid(study: str) -> Iterator[tuple[str, int, int, str]]:
 def main() -> None:
     """Run one study."""
     parser = described(__doc__)
-    parser.add_argument("study", choices=["sample_complexity", "number_of_options", "augmentation", "variants"])
+    studies = ["sample_complexity", "number_of_options", "augmentation", "variants", "acting"]
+    parser.add_argument("study", choices=studies)
+    parser.add_argument("--first", type=int, default=0, help="the first training seed")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--demonstrations", type=int, nargs="+", default=COUNTS)
     parser.add_argument("--options", type=int, nargs="+", default=OPTIONS)

@@ -475,7 +475,12 @@ by_hand,a,theirs,20,1,success,0.5
 by_hand,a,theirs,20,2,success,1.0
 by_hand,b,summary,,,nats,-2.5
 other,a,theirs,20,0,success,0.0
-"""
+""" + "".join(  # "two" is above "base" with a one-sided p of 0.018
+    f"family,a,{name},{count},{seed},goals,{value}\n"
+    for name, values in {"one": [3, 4, 5, 4], "two": [1, 2, 3, 1], "base": [0] * 4}.items()
+    for count in (10, 20)
+    for seed, value in enumerate(values)
+)
 
 
 @pytest.mark.parametrize(
@@ -490,6 +495,14 @@ other,a,theirs,20,0,success,0.0
         ("ours, k = 2 - theirs; success; 10 - 20; study=by_hand; show=above", "2 of 3"),
         ("ours, k = 2 - theirs; success; 10 - 20; study=by_hand; show=mean; form=+.2f", "+0.07"),
         ("summary; nats", "−2.50"),
+        ("one - base; goals; 10; form=+.1f", "**+4.0 [+2.7, +5.3]**"),
+        ("base - one; goals; 10; show=±; form=.1f", "**−4.0 ± 1.3**"),
+        ("one - base; goals; 10; show=verdict", "holds"),
+        ("base - one; goals; 10; show=verdict", "does not hold"),
+        ("base - base; goals; 10; show=verdict", "not tested"),
+        ("one - base; goals; 10; task=a; seed=1", "+4.00"),
+        ("base; goals; 10", "0.00"),
+        ("one - base; goals; 10; show=median", "+4.00"),
         (
             "ours, k = 2 | theirs; success; 10 | 20; study=by_hand",
             "\n\n| demonstrations | measure | ours, k = 2 | theirs |\n|--:|---|--:|--:|\n"
@@ -502,6 +515,37 @@ def test_a_table_is_quoted_as_by_hand(tmp_path, quotation, said):
     assert render(f"<!-- table hand: {quotation} -->?<!-- / -->", ROOT, tmp_path) == (
         f"<!-- table hand: {quotation} -->{said}<!-- / -->"
     )
+
+
+def test_a_page_has_the_bold_words_that_holm_leaves(tmp_path):
+    """Two differences of one family at a one-sided p of 0.018 are inconclusive together."""
+    (tmp_path / "hand.csv").write_text(HAND)
+    own = "<!-- table hand: two - base; goals; 10; show={} --><!-- / -->"
+    alone = render(own.format("±") + own.format("verdict"), ROOT, tmp_path)
+    assert "**+1.75" in alone
+    assert "holds" in alone
+    other = "<!-- table hand: two - base; goals; 20 --><!-- / -->"
+    both = render(own.format("±") + own.format("verdict") + other, ROOT, tmp_path)
+    assert "**" not in both
+    assert "-->inconclusive<" in both
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"one": [3, 4, 5, 4]}, ["holds"]),
+        ({"one": [-3, -4, -5, -4]}, ["does not hold"]),
+        ({"one": [1, 2, 3, 1]}, ["holds"]),
+        ({"one": [-1, -2, -3, -1]}, ["does not hold"]),
+        ({"one": [1, 2, 3, 1], "two": [-1, -2, -3, -1]}, ["inconclusive"] * 2),  # 2 × 0.018 > 0.025 on either side
+        ({"one": [-1, -2, -3, -1], "two": [-1, -2, -3, -1]}, ["inconclusive"] * 2),
+        ({"one": [1, 1, 1, 1]}, ["not tested"]),
+        ({}, []),
+    ],
+)
+def test_both_sides_of_a_verdict_have_holms_correction(values, said):
+    family = [(statistics.estimate({"": dict(enumerate(map(float, own)))}), 0.0) for own in values.values()]
+    assert [verdict for verdict, _ in report.verdicts(family)] == said
 
 
 class Told:
@@ -590,6 +634,6 @@ def test_a_quoted_difference_is_that_of_both_tables():
     test = stats.ttest_rel([found["mixture"][seed] for seed in found["flat"]], [*found["flat"].values()])
     low, high = test.confidence_interval(0.95)
     mean = np.mean([found["mixture"][seed] - found["flat"][seed] for seed in found["flat"]])
-    assert f"<!-- study needle: mixture - flat; success; 100 -->**{mean:+.0%} [{low:+.0%}, {high:+.0%}]**" in (
+    assert f"<!-- study needle: mixture - flat; success; 100 -->{mean:+.0%} [{low:+.0%}, {high:+.0%}]<" in (
         ROOT / "README.md"
     ).read_text().replace("−", "-")

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy import stats
 
-from ddco_pyro.study.statistics import bootstrap, estimate, holm, p_value, paired
+from ddco_pyro.study.statistics import estimate, holm, p_value, paired
+
+ROOT = Path(__file__).parents[1]
 
 
 def by_seed(values):
@@ -22,14 +26,14 @@ def test_one_task_is_the_paired_t_test_over_seeds():
         assert p_value(found, bound) == pytest.approx(test.pvalue)
     interval = stats.ttest_rel(ours, theirs).confidence_interval(0.95)
     assert found.interval == pytest.approx((interval.low, interval.high))
-    assert (found.freedom, found.units) == (7, pytest.approx(tuple(ours - theirs)))
+    assert found.units == pytest.approx(tuple(ours - theirs))
 
 
 def test_the_units_of_several_tasks_are_their_means():
     tasks = {"a": by_seed([0, 1]), "b": by_seed([1, 2, 3]), "c": by_seed([4])}
     found, test = estimate(tasks), stats.ttest_1samp([0.5, 2, 4], 1.0, alternative="greater")
     assert p_value(found, 1.0) == pytest.approx(test.pvalue)
-    assert (found.value, found.freedom, found.range) == (pytest.approx(6.5 / 3), 2, (0.5, 4))
+    assert (found.value, len(found.units), found.range) == (pytest.approx(6.5 / 3), 3, (0.5, 4))
 
 
 def test_pairs_need_both_values():
@@ -37,46 +41,60 @@ def test_pairs_need_both_values():
     assert found == {"a": {1: 3.0}}
 
 
-def test_the_bootstrap_is_that_of_scipy_where_there_is_one_task():
-    values = np.random.default_rng(1).normal(size=12)
-    low, high = bootstrap({"push": by_seed(values)})
-    random = np.random.default_rng(2)
-    theirs = stats.bootstrap([values], np.mean, method="percentile", n_resamples=5000, rng=random).confidence_interval
-    assert (low, high) == pytest.approx((theirs.low, theirs.high), abs=0.05)
+def successes(random, rates, starts=20):
+    return random.binomial(starts, rates) / starts
 
 
-def test_the_bootstrap_draws_tasks_and_seeds():
-    """Its variance is that of tasks' means among tasks, and that of seeds within tasks."""
-    random = np.random.default_rng(3)
-    values = random.normal(size=(12, 1)) + random.normal(size=(12, 5))
-    low, high = bootstrap({str(n): by_seed(own) for n, own in enumerate(values)})
-    variance = (values.mean(1).var() + values.var(1).mean() / 5) / 12
-    assert high - low == pytest.approx(2 * 1.96 * np.sqrt(variance), rel=0.08)
+def bimodal(random, tasks):
+    """Tasks are easy or hard for both methods; a fit of either collapses in one of five seeds."""
+    levels = np.where(random.random((tasks, 1)) < 0.5, 0.95, 0.15)
+    ours, theirs = (np.where(random.random((tasks, 5)) < 0.2, 0.3, levels) for _ in range(2))
+    return successes(random, ours) - successes(random, theirs)
 
 
-def test_intervals_cover_the_mean_of_bimodal_results():
-    """Tasks are easy (0.95) or hard (0.15), seeds succeed or collapse: 12 tasks of 5 seeds."""
-    random, studies = np.random.default_rng(4), 400
-    truth = 0.5 * (0.8 * 0.95 + 0.2 * 0.3) + 0.5 * (0.8 * 0.15 + 0.2 * 0.3)
-    covered = np.zeros(2)
-    for study in range(studies):
-        level = np.where(random.random((12, 1)) < 0.5, 0.95, 0.15)
-        rates = np.where(random.random((12, 5)) < 0.2, 0.3, level)
-        values = random.binomial(50, rates) / 50
-        tasks = {str(n): by_seed(own) for n, own in enumerate(values)}
-        for number, (low, high) in enumerate((estimate(tasks).interval, bootstrap(tasks, 400, study))):
-            covered[number] += low <= truth <= high
-    assert 0.92 <= covered[0] / studies <= 0.98  # two standard errors of 400 studies are 0.022
-    assert 0.88 <= covered[1] / studies <= 0.98  # a percentile interval of twelve units is somewhat short
+def near_the_ceiling(random, tasks):
+    """Both methods nearly always succeed, but theirs fails on one of seven tasks in most seeds."""
+    fails = (random.random((tasks, 1)) < 0.15) & (random.random((tasks, 3)) < 0.7)
+    return successes(random, np.full((tasks, 3), 0.97)) - successes(random, np.where(fails, 0.3, 0.95))
 
 
-@pytest.mark.parametrize(("seeds", "covered"), [(5, 0.67), (10, 0.88)])
-def test_few_seeds_that_may_collapse_are_too_few(seeds, covered):
-    """One task: a fit collapses in one of five seeds, so none of five does so with probability 0.8⁵ = 0.33."""
-    random, studies = np.random.default_rng(6), 500
-    rates = np.where(random.random((studies, seeds)) < 0.2, 0.3, 0.95)
-    found = [estimate({"push": by_seed(own)}).interval for own in random.binomial(50, rates) / 50]
-    assert sum(low <= 0.82 <= high for low, high in found) / studies == pytest.approx(covered, abs=0.05)
+def rare_collapse(random, seeds):
+    """One task: a fit of theirs collapses in one of ten seeds."""
+    theirs = np.where(random.random((seeds, 1)) < 0.1, 0.3, 0.95)
+    return successes(random, np.full((seeds, 1), 0.95), 50) - successes(random, theirs, 50)
+
+
+def heavy_tails(random, tasks):
+    """Nats: a few tasks have differences that are ten times those of the others."""
+    return np.exp(random.normal(0, 1.5, (tasks, 1))) * random.normal(0.3, 0.5, (tasks, 1))
+
+
+COVERAGE = {
+    "twelve tasks, easy or hard": (bimodal, 12, 0.95),
+    "nine tasks near the ceiling": (near_the_ceiling, 9, 0.76),
+    "one task, a collapse in one of ten seeds; five seeds": (rare_collapse, 5, 0.56),
+    "the same, ten seeds": (rare_collapse, 10, 0.63),
+    "nine tasks, heavy-tailed nats": (heavy_tails, 9, 0.75),
+}
+"""Simulated differences, how many units a study has, and how many t intervals of 95 % cover the mean."""
+
+
+@pytest.mark.parametrize("named", COVERAGE)
+def test_intervals_of_differences_cover_as_the_docs_say(named):
+    population, units, said = COVERAGE[named]
+    random, studies = np.random.default_rng(4), 2000
+    means = population(random, 100 * studies).mean(1)
+    found = population(random, units * studies).mean(1).reshape(studies, units)
+    low, high = stats.ttest_1samp(found, 0.0, axis=1).confidence_interval(0.95)
+    assert estimate({"a": by_seed(found[0])}).interval == pytest.approx((low[0], high[0]))
+    covered = np.mean((low <= means.mean()) & (means.mean() <= high))
+    assert covered == pytest.approx(said, abs=0.025)  # two standard errors of 2000 studies are at most 0.022
+    ranks, median = estimate({"a": by_seed(range(units))}).median[1], np.median(means)
+    if units > 5:
+        least, most = np.sort(found)[:, np.array(ranks, int)].T
+        assert np.mean((least <= median) & (median <= most)) >= 0.95
+    line = f"| {named} | {100 * said:.0f} % | {'95 % or more' if units > 5 else '–'} |"
+    assert line in (ROOT / "docs" / "studies.md").read_text()
 
 
 def test_a_test_errs_as_often_as_its_level_says():
@@ -95,12 +113,18 @@ def test_holm_gives_what_hand_computation_gives():
     assert holm([]) == []
 
 
-@pytest.mark.parametrize(("value", "p"), [(0.1, 0.0), (0.0, 1.0), (-0.1, 1.0)])
-def test_equal_values_are_certain(value, p):
-    assert p_value(estimate({"push": by_seed([value] * 3)}), 0.0) == pytest.approx(p)
-
-
-def test_a_single_value_has_no_interval():
-    found = estimate({"push": {0: 1.0}})
-    assert found.value == 1
-    assert np.isnan([*found.interval, p_value(found, 0.0)]).all()
+def test_equal_units_have_the_interval_of_their_trials_or_none():
+    """Wilson's for none of 60: 0 to z² / (60 + z²)."""
+    most = 1.959964**2 / (60 + 1.959964**2)
+    for value, lowest, interval in (
+        (0.0, -1.0, (-most, most)),
+        (0.0, 0.0, (0.0, most)),
+        (1.0, 0.0, (1 - most, 1.0)),
+        (-1.0, -1.0, (-1.0, most - 1)),
+    ):
+        found = estimate({"push": by_seed([value] * 3)}, trials=20, lowest=lowest)
+        assert found.interval == pytest.approx(interval, abs=1e-6)
+        assert (p_value(found, 0.0) < 0.001) == (value > 0)
+    for values in ([0.1 + 0.2, 0.3], [0.0] * 3, [1.0]):
+        found = estimate({"push": by_seed(values)})
+        assert np.isnan([*found.interval, p_value(found, 0.0)]).all()

@@ -6,7 +6,7 @@ import itertools
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,12 +25,14 @@ from ddco_pyro.metrics import write_table
 from ddco_pyro.segmenting.agreement import measure_names
 from ddco_pyro.study.cells import COLUMNS, Folder, Row, State, earlier, read_tidy, tidy
 from ddco_pyro.study.declaration import NATS, ContrastSpec, Study
-from ddco_pyro.study.statistics import LEVEL, BySeed, Estimate, bootstrap, estimate, holm, p_value, paired
+from ddco_pyro.study.statistics import LEVEL, BySeed, Estimate, estimate, holm, p_value, paired
 
 FILES = ("table.csv", "page.md", "page.html", "contrasts.png", "methods.png")
 """The files of a study's report."""
 
 COLUMNS_OF_PANELS = 4
+NOT_TESTED = "not tested"
+DECIDED = ("holds", "does not hold")
 
 
 def values(
@@ -52,23 +54,14 @@ def values(
 
 @dataclass(frozen=True)
 class Tested:
-    """A primary contrast with its estimate (None without any cell), its p-value and Holm's adjusted one."""
+    """A primary contrast with its estimate (None without any cell), its verdict and Holm's adjusted p-value."""
 
     spec: ContrastSpec
     demonstrations: int
-    found: Estimate | None
-    p: float
-    adjusted: float
     differences: BySeed
-
-    @property
-    def verdict(self) -> str:
-        """Whether the contrast holds; inconclusive where neither that nor its contrary is significant."""
-        if self.found is None or not self.found.freedom:
-            return "not tested"
-        if self.adjusted <= LEVEL:
-            return "holds"
-        return "does not hold" if self.found.interval[1] < self.spec.bound else "inconclusive"
+    found: Estimate | None
+    verdict: str = NOT_TESTED
+    adjusted: float = math.nan
 
     @property
     def name(self) -> str:
@@ -82,11 +75,29 @@ def tested(study: Study, rows: Sequence[Row]) -> list[Tested]:
     for contrast in study.declared.contrasts:
         count = contrast.demonstrations or study.declared.demonstrations.counts[0]
         differences = values(rows, contrast.contrast, contrast.measure, [count])
-        estimated = estimate(differences) if differences else None
-        p = math.nan if estimated is None else p_value(estimated, contrast.bound)
-        found.append(Tested(contrast, count, estimated, p, math.nan, differences))
-    adjusted = holm([one.p for one in found])
-    return [replace(one, adjusted=p) for one, p in zip(found, adjusted, strict=True)]
+        known = estimate(differences, trials(study, contrast.measure)) if differences else None
+        found.append(Tested(contrast, count, differences, known))
+    judged = verdicts([(one.found, one.spec.bound) for one in found])
+    return [replace(one, verdict=name, adjusted=p) for one, (name, p) in zip(found, judged, strict=True)]
+
+
+def verdicts(family: Sequence[tuple[Estimate | None, float]]) -> list[tuple[str, float]]:
+    """Whether each estimate exceeds its bound, and Holm's p-value; both sides are corrected for the whole family.
+
+    ``does not hold``: the contrary holds, that the estimate is below the bound. ``inconclusive``: neither does.
+    """
+    p = [math.nan if found is None else p_value(found, bound) for found, bound in family]
+    found = []
+    for one, above, below in zip(p, holm(p), holm([1 - one for one in p]), strict=True):
+        known = "holds" if above <= LEVEL else "does not hold" if below <= LEVEL else "inconclusive"
+        found.append((NOT_TESTED if math.isnan(one) else known, above))
+    return found
+
+
+def trials(study: Study, measure: str) -> int:
+    """The starts of each fit, where the measure is a rate of them; else 0."""
+    starts = study.declared.starts
+    return starts.test.count if starts and measure.startswith("success") else 0
 
 
 def write(folder: Folder, state: State, to: Path) -> Path:
@@ -136,20 +147,21 @@ def _plural(name: str, count: int) -> str:
 
 
 def _contrasts(found: Sequence[Tested], to: Path) -> list[Block]:
-    head = ["contrast", "measure", "demos", "verdict", "has to exceed", "difference [95 % t]", "bootstrap", "p (Holm)"]
+    head = ["contrast", "measure", "demos", "verdict", "has to exceed", "mean [95 % t]", "median [95 %]", "p (Holm)"]
     table = []
     for one in found:
         named = [one.spec.contrast, name_of(one.spec.measure), str(one.demonstrations), one.verdict]
         numbers = ["–"] * 3
         if one.found:
-            p = "–" if math.isnan(one.p) else words.p_value(one.adjusted)
-            numbers = [shown(one.found, "+.2f"), words.interval(bootstrap(one.differences)), p]
+            p = "–" if one.verdict == NOT_TESTED else words.p_value(one.adjusted)
+            numbers = [shown(one.found, "+.2f"), _between(*one.found.median, "+.2f"), p]
         table.append([*named, words.signed(one.spec.bound), *numbers])
     text = (
         "Differences are paired by task and training seed. The test of each contrast is one-sided, at 2.5 %. For "
         "superiority the difference has to exceed the margin, for non-inferiority minus the margin. Holm's correction "
         "is over these contrasts; intervals are not corrected. With several tasks the units are tasks, so an interval "
-        "speaks of further tasks. The bootstrap draws tasks, and seeds within each."
+        "speaks of further tasks. Rare failures and outliers make t intervals too short: they may cover 75 %. The "
+        "median's interval is exact, and needs six units."
     )
     known = [one for one in found if one.found]
     measures = dict.fromkeys(one.spec.measure for one in known)
@@ -190,7 +202,7 @@ def _methods(study: Study, rows: Sequence[Row], to: Path) -> list[Block]:
     for measure in study.declared.measures:
         table = []
         for label in labels:
-            cells = [_estimated(values(rows, label, measure, [count])) for count in counts]
+            cells = [_estimated(study, measure, values(rows, label, measure, [count])) for count in counts]
             if any(cells):
                 table.append([label, *(shown(cell) if cell else "–" for cell in cells)])
         head = [name_of(measure), *(f"{count} demonstrations" for count in counts)]
@@ -213,11 +225,10 @@ def draw(study: Study, rows: Sequence[Row]) -> Figure:
     """
     counts, labels, measures = study.declared.demonstrations.counts, study.declared.labels, study.declared.measures
     if len(counts) == 1:
-        by_method = {(m, label): values(rows, label, m, counts[:1]) for m in measures for label in labels}
-        panels = [
-            Panel("", name_of(m), [_drawn(_estimated(by_method[m, one]), by_method[m, one]) for one in labels])
-            for m in measures
-        ]
+        panels = []
+        for m in measures:
+            found = [values(rows, label, m, counts[:1]) for label in labels]
+            panels.append(Panel("", name_of(m), [_drawn(_estimated(study, m, one), one) for one in found]))
         with style():
             return interval_plot(labels, panels)
     several = len(study.tasks) > 1
@@ -230,7 +241,7 @@ def draw(study: Study, rows: Sequence[Row]) -> Figure:
         all_axes = figure.subplots(lines, columns, squeeze=False).flat
         for axes, (measure, task) in zip(all_axes, wanted, strict=False):
             for number, label in enumerate(labels, start=1):
-                points = [(n, _estimated(values(rows, label, measure, [n], task))) for n in counts]
+                points = [(n, _estimated(study, measure, values(rows, label, measure, [n], task))) for n in counts]
                 known = [(n, one) for n, one in points if one]
                 middle = [one.value for _, one in known]
                 both = [one.interval if task is None else one.range for _, one in known]
@@ -251,8 +262,8 @@ def draw(study: Study, rows: Sequence[Row]) -> Figure:
     return figure
 
 
-def _estimated(by_seed: BySeed) -> Estimate | None:
-    return estimate(by_seed) if by_seed else None
+def _estimated(study: Study, measure: str, by_seed: BySeed) -> Estimate | None:
+    return estimate(by_seed, trials(study, measure), lowest=0.0) if by_seed else None
 
 
 def design(study: Study, rows: Sequence[Row], state: State) -> list[str]:
@@ -274,8 +285,8 @@ def design(study: Study, rows: Sequence[Row], state: State) -> list[str]:
         lines.append(f"Every method acts from the same {declared.starts.test.count} starts, others for every seed.")
     if declared.kept:
         tables = dict.fromkeys(one.table for one in declared.kept)
-        text = "have the data and seeds of their own studies, and may be older than the contrasts"
-        lines.append(f"Results that are kept in {', '.join(tables)} {text}.")
+        text = "have data of their own studies, whose seeds may share them. They may be older than the contrasts"
+        lines.append(f"This is so in new cells. Results that are kept in {', '.join(tables)} {text}.")
     if declared.choose is not None:
         first = {cell.of: cell.point for cell in state.cells if cell.part == "test"}
         points = ", ".join(declared.label(method, dict(point), "") for method, point in first.items())
@@ -311,8 +322,12 @@ def name_of(measure: str) -> str:
 
 def shown(found: Estimate, form: str = ".2f") -> str:
     """A mean and its 95 % t interval, such as ``0.82 [0.75, 0.89]``."""
-    ends = "" if math.isnan(found.error) else f" [{', '.join(format(end, form) for end in found.interval)}]"
-    return f"{found.value:{form}}{ends}".replace("-", "−")
+    return _between(found.value, found.interval, form)
+
+
+def _between(value: float, ends: tuple[float, float], form: str) -> str:
+    between = "" if math.isnan(ends[0]) else f" [{', '.join(format(end, form) for end in ends)}]"
+    return f"{value:{form}}{between}".replace("-", "−")
 
 
 # --- numbers that other pages quote -----------------------------------------------------------------------------------
@@ -320,6 +335,7 @@ def shown(found: Estimate, form: str = ".2f") -> str:
 _QUOTED = re.compile(
     r"<!-- (?P<kind>study|table) (?P<name>[\w-]+): (?P<what>.*?) -->(?P<text>.*?)<!-- / -->", re.DOTALL
 )
+_Key = tuple[Any, ...]
 _SETTING = re.compile(r"(?P<key>study|task|seed|form|show|times|by)=(?P<value>.*)", re.DOTALL)
 
 
@@ -327,40 +343,60 @@ def render(text: str, studies: Path, tables: Path = Path()) -> str:
     """A page's text with every quoted number as the tables have it.
 
     A quotation is ``<!-- study NAME: options - flat; success; 50 -->…<!-- / -->``: a method or a contrast, a measure,
-    and a number of demonstrations, none where the table has none. A difference is bold where its interval excludes 0.
-    ``40 - 80`` gives both methods of a contrast a number of their own. Several methods, measures or numbers, between
-    ``|``, make a table, of means and of differences with intervals. These settings may follow:
+    and a number of demonstrations, none where the table has none. A difference is bold where it is not inconclusive
+    after Holm's correction: for the primary contrasts of ``study NAME``, which has no other bold ones, or for all
+    differences of one measure that the page quotes from one study of ``table NAME``. ``40 - 80`` gives both methods of
+    a contrast a number of their own. Several methods, measures or numbers, between ``|``, make a table, of means and of
+    differences with intervals. These settings may follow:
 
     - ``study=NAME``, ``task=NAME`` and ``seed=NAME`` take rows of one study of the table, one task or one seed;
-    - ``show`` is ``mean``, ``±`` (half of the interval), ``sd``, ``se``, ``range`` (least and greatest unit) or
-      ``above`` (how many units are above 0); else mean and interval;
+    - ``show`` is ``mean``, ``±`` (half of the interval), ``sd``, ``se``, ``median`` (and its interval), ``range``
+      (least and greatest unit), ``above`` (how many units are above 0) or ``verdict``; else mean and interval;
     - ``times=900`` multiplies, ``form=+.0%`` formats as Python does, and ``by=task`` gives a table rows for each task.
 
     :param studies: the folder of the declarations, whose tables ``kept`` have the numbers of ``study NAME``.
     :param tables: the folder of ``NAME.csv``, which has the numbers of ``table NAME``.
     :raises BadInput: a quotation is wrong, or there is no such value.
     """
-    known: dict[tuple[str, str], list[Row]] = {}
+    known: dict[tuple[str, str], _Source] = {}
+    families: dict[_Key, dict[_Key, Estimate]] = {}
+    judged: dict[_Key, str] = {}
 
     def quoted(match: re.Match[str]) -> str:
-        source, what = (match["kind"], match["name"]), match["what"]
-        if source not in known:  # nothing of a study is imported for its numbers
-            of_study = match["kind"] == "study"
-            own = studies / f"{match['name']}.yaml"
-            known[source] = (
-                earlier(Study.load(own, allow_code=True)) if of_study else read_tidy(tables / f"{match['name']}.csv")
-            )
-        return f"<!-- {' '.join(source)}: {what} -->{_quoted(known[source], ' '.join(source), what)}<!-- / -->"
+        named = match["kind"], match["name"]
+        if named not in known:  # nothing of a study is imported for its numbers
+            study = Study.load(studies / f"{named[1]}.yaml", allow_code=True) if named[0] == "study" else None
+            rows = earlier(study) if study else read_tidy(tables / f"{named[1]}.csv")
+            known[named] = _Source(" ".join(named), rows, study)
+        own = _quoted(known[named], match["what"], families, judged)
+        return f"<!-- {' '.join(named)}: {match['what']} -->{own}<!-- / -->"
 
+    _QUOTED.sub(quoted, text)  # finds the families
+    for family in families.values():
+        names = [verdict for verdict, _ in verdicts([(one, 0.0) for one in family.values()])]
+        judged.update(zip(family, names, strict=True))
+    for source in known.values():
+        for one in tested(source.study, source.rows) if source.study else ():
+            key = source.name, " - ".join(one.spec.pair), one.spec.measure, (str(one.demonstrations),), None
+            judged[key] = one.verdict
     return _QUOTED.sub(quoted, text)
 
 
-def _quoted(rows: Sequence[Row], source: str, quotation: str) -> str:
+@dataclass(frozen=True)
+class _Source:
+    name: str
+    rows: Sequence[Row]
+    study: Study | None
+
+
+def _quoted(
+    source: _Source, quotation: str, families: dict[_Key, dict[_Key, Estimate]], judged: Mapping[_Key, str]
+) -> str:
     fields = [part.strip() for part in quotation.split(";")]
     settings = {found["key"]: found["value"] for part in fields if (found := _SETTING.fullmatch(part))}
     plain = [part.split(" | ") for part in fields if not _SETTING.fullmatch(part)]
     show, form = settings.get("show"), settings.get("form")
-    counts = [one.split(" - ") for one in plain[2]] if len(plain) == 3 else [[]]
+    counts = [tuple(one.split(" - ")) for one in plain[2]] if len(plain) == 3 else [()]
     try:
         times, _ = float(settings.get("times", 1)), format(0.0, form or "")
         wrong = not all(n.isdecimal() for one in counts for n in one)
@@ -368,25 +404,34 @@ def _quoted(rows: Sequence[Row], source: str, quotation: str) -> str:
         wrong = True
     if wrong or len(plain) not in (2, 3) or show not in (None, *SHOWN):
         raise BadInput(
-            f"{source}: {quotation!r}: write a method or contrast, a measure and a number of demonstrations, such as: "
-            f"options - flat; success; 50. After show= stands one of: {', '.join(SHOWN)}; form= is Python's"
+            f"{source.name}: {quotation!r}: write a method or contrast, a measure and a number of demonstrations, such "
+            f"as: options - flat; success; 50. After show= stands one of: {', '.join(SHOWN)}; form= is Python's"
         )
-    wanted = {key: settings[key] for key in ("study", "seed") if key in settings}
-    rows = [row for row in rows if all(str(getattr(row, key)) == value for key, value in wanted.items())]
+    wanted = tuple(sorted((key, settings[key]) for key in ("study", "seed") if key in settings))
+    rows = [row for row in source.rows if all(str(getattr(row, key)) == value for key, value in wanted)]
 
-    (methods, measures), task = plain[:2], settings.get("task")
+    (methods, measures), task, by_task = plain[:2], settings.get("task"), settings.get("by") == "task"
     single = len(methods) * len(measures) * len(counts) == 1
 
-    def cell(what: str, measure: str, count: Sequence[str], task: str | None) -> str:
+    def cell(what: str, measure: str, count: tuple[str, ...], task: str | None) -> str:
         own = values(rows, what, measure, list(map(int, count)) or [None], task)
+        if not own:
+            return ""
         several = any(seed != "" for one in own.values() for seed in one)  # a row without seed is their summary
         scaled = {t: {s: times * v for s, v in one.items() if s != "" or not several} for t, one in own.items()}
         difference = " - " in what
         how = show or ("interval" if single or difference else "mean")
         own_form = f"+{form}" if form and difference and not single else form
-        return _shown(estimate(scaled), difference, measure, how, own_form) if own else ""
+        starts = trials(source.study, measure) if source.study and times == 1 else 0
+        found = estimate(scaled, starts, -1.0 if difference else 0.0)
+        key = source.name, what, measure, count, task, *wanted
+        if difference and how in ("interval", "±", "verdict") and source.study is None:
+            families.setdefault((source.name, measure, *wanted), {})[key] = found
+        if how == "verdict":
+            return judged.get(key, NOT_TESTED)
+        text = _shown(found, difference, measure, how, own_form)
+        return f"**{text}**" if how in ("interval", "±") and judged.get(key) in DECIDED else text
 
-    by_task = settings.get("by") == "task"
     tasks = sorted({row.task for row in rows}) if by_task else [task]
     table = []
     for one, count, measure in itertools.product(tasks, counts, measures):
@@ -395,14 +440,14 @@ def _quoted(rows: Sequence[Row], source: str, quotation: str) -> str:
             named = [str(one), " − ".join(count), name_of(measure)]
             table.append([*named[not by_task :], *(text or "–" for text in cells)])
     if not table:
-        raise BadInput(f"{source}: its tables have no {quotation!r}; check its names")
+        raise BadInput(f"{source.name}: its tables have no {quotation!r}; check its names")
     if single:
         return table[0][-1]
     head = ["task", "demonstrations", "measure", *(one.replace(" - ", " − ") for one in methods)]
     return f"\n\n{Table(head[not by_task :], table, {0, 2} if by_task else {1}).markdown()}\n\n"
 
 
-SHOWN = ("interval", "mean", "±", "sd", "se", "range", "above")
+SHOWN = ("interval", "mean", "±", "sd", "se", "median", "range", "above", "verdict")
 """How a quotation shows an estimate."""
 
 
@@ -414,10 +459,10 @@ def _shown(found: Estimate, difference: bool, measure: str, show: str, form: str
         return f"{sum(unit > 0 for unit in found.units)} of {number}"
     if show == "range":
         text = " to ".join(format(end, form) for end in found.range)
-    elif show in half:
+    elif show in half and not math.isnan(half[show]):
         text = f"{found.value:{form}} ± {half[show]:{form.replace('+', '')}}"
+    elif show == "median":
+        text = _between(*found.median, form)
     else:
-        text = shown(found, form) if show == "interval" else format(found.value, form)
-    bold = difference and show in ("interval", "±") and found.interval[0] * found.interval[1] > 0
-    text = text.replace("-", "−")
-    return f"**{text}**" if bold else text
+        text = shown(found, form) if show == "interval" else f"{found.value:{form}}"
+    return text.replace("-", "−")

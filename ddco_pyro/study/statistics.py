@@ -1,8 +1,7 @@
 """Statistics of results over training seeds, nested in tasks: intervals, one-sided tests, and Holm's correction.
 
 Several tasks are the sample: an interval speaks of further tasks, and its unit is a task's mean over seeds. With a
-single task the training seeds are the sample. Fits share neither demonstrations nor starts across seeds, so no test
-pools their episodes.
+single task the training seeds are the sample. No test pools episodes of several fits.
 """
 
 from __future__ import annotations
@@ -25,15 +24,13 @@ BySeed = Mapping[str, Mapping[Any, float]]
 class Estimate:
     """A mean over tasks of means over seeds.
 
-    :param error: the standard error; NaN for a single unit, as the interval is.
-    :param freedom: degrees of freedom of the t interval: tasks − 1, or seeds − 1 for a single task.
+    :param error: the standard error; NaN, as the interval is, where the units have no spread or there is one.
     :param interval: the 95 % t interval.
     :param units: the means of the tasks, or the values of the seeds of a single task.
     """
 
     value: float
     error: float
-    freedom: int
     interval: tuple[float, float]
     units: tuple[float, ...]
 
@@ -41,6 +38,15 @@ class Estimate:
     def range(self) -> tuple[float, float]:
         """The least and the greatest unit."""
         return min(self.units), max(self.units)
+
+    @property
+    def median(self) -> tuple[float, tuple[float, float]]:
+        """The median unit and its exact interval of at least 95 %, whatever the distribution; NaN below six units."""
+        from scipy.stats import quantile_test
+
+        middle = float(np.median(self.units))
+        ends = quantile_test(self.units, q=middle, p=0.5).confidence_interval(1 - 2 * LEVEL)
+        return middle, (float(ends.low), float(ends.high))
 
 
 def paired(ours: BySeed, theirs: BySeed) -> dict[str, dict[Any, float]]:
@@ -57,57 +63,45 @@ def paired(ours: BySeed, theirs: BySeed) -> dict[str, dict[Any, float]]:
     return {task: own for task, own in both.items() if own}
 
 
-def estimate(values: BySeed) -> Estimate:
+def estimate(values: BySeed, trials: int = 0, lowest: float = -1.0) -> Estimate:
     """The mean and its t interval.
 
     >>> found = estimate({"push": {0: 1.0, 1: 2.0, 2: 3.0}})
-    >>> found.value, found.freedom, round(found.interval[0], 3)
-    (2.0, 2, -0.484)
+    >>> found.value, round(found.interval[0], 3)
+    (2.0, -0.484)
 
+    :param trials: of each fit, where the values are rates or their differences. Equal units have Wilson's interval of
+        all trials, a difference that of as many trials with different outcomes.
+    :param lowest: the least possible value of a rate: 0, or -1 of a difference.
     :raises ValueError: there are no values.
     """
-    from scipy.special import stdtrit
+    from scipy.stats import binomtest, norm, ttest_1samp
 
     by_task = [np.array(list(own.values()), float) for own in values.values()]
     means = np.array([own.mean() for own in by_task])
     units = means if len(means) > 1 else by_task[0]
-    value, freedom = float(means.mean()), len(units) - 1
-    error = float(units.std(ddof=1) / math.sqrt(len(units))) if freedom else math.nan
-    half = error * float(stdtrit(freedom, 1 - LEVEL)) if freedom else math.nan
-    return Estimate(value, error, freedom, (value - half, value + half), tuple(map(float, units)))
-
-
-def bootstrap(values: BySeed, draws: int = 4000, seed: int = 0) -> tuple[float, float]:
-    """The 95 % percentile interval of a bootstrap that draws tasks, and seeds within each task.
-
-    With few tasks or seeds the interval is too short: t is the test, and the bootstrap stands beside it.
-
-    >>> [round(end, 1) for end in bootstrap({"push": {0: 1.0, 1: 2.0, 2: 3.0}})]
-    [1.0, 3.0]
-    """
-    random, by_task = np.random.default_rng(seed), [list(own.values()) for own in values.values()]
-    lengths = np.array([len(own) for own in by_task])
-    padded = np.array([own + [0.0] * (lengths.max() - len(own)) for own in by_task])
-    tasks = random.integers(len(by_task), size=(draws, len(by_task)))
-    there = np.arange(lengths.max()) < lengths[tasks][..., None]
-    seeds = (random.random(there.shape) * lengths[tasks][..., None]).astype(int)
-    drawn = np.where(there, padded[tasks[..., None], seeds], 0).sum(-1) / lengths[tasks]
-    low, high = np.quantile(drawn.mean(-1), [LEVEL, 1 - LEVEL])
-    return float(low), float(high)
+    value, error, interval = float(means.mean()), math.nan, (math.nan, math.nan)
+    if len(units) > 1 and not np.allclose(units, units[0], rtol=1e-9, atol=1e-12):
+        low, high = ttest_1samp(units, 0.0).confidence_interval(1 - 2 * LEVEL)
+        error, interval = float(units.std(ddof=1) / math.sqrt(len(units))), (float(low), float(high))
+    elif len(units) > 1 and trials:
+        number = trials * sum(map(len, by_task))
+        count = round(abs(value) * number)
+        ends = binomtest(count, number).proportion_ci(1 - 2 * LEVEL, "wilson")
+        low, high = sorted(math.copysign(end, value) for end in (ends.low, ends.high))
+        interval = (low, high) if count else (max(lowest, -ends.high), ends.high)
+        error = (interval[1] - interval[0]) / 2 / float(norm.isf(LEVEL))
+    return Estimate(value, error, interval, tuple(map(float, units)))
 
 
 def p_value(found: Estimate, bound: float) -> float:
-    """The one-sided p-value of the t test of "the mean is at most ``bound``"; NaN for a single unit.
+    """The one-sided p-value of the t test of "the mean is at most ``bound``"; NaN without a standard error.
 
     Superiority by a margin has the bound +margin, non-inferiority −margin.
     """
-    from scipy.special import stdtr
+    from scipy.stats import t
 
-    if not found.freedom:
-        return math.nan
-    if found.error == 0:
-        return 0.0 if found.value > bound else 1.0
-    return float(stdtr(found.freedom, (bound - found.value) / found.error))
+    return float(t.sf((found.value - bound) / found.error, len(found.units) - 1))
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
@@ -117,8 +111,6 @@ def holm(p_values: Sequence[float]) -> list[float]:
     [0.03, 0.06, 0.06]
     """
     known = np.nan_to_num(np.array(p_values, float), nan=1.0)
-    order, most, adjusted = np.argsort(known, kind="stable"), 0.0, known.copy()
-    for rank, place in enumerate(order):
-        most = max(most, min(1.0, (len(known) - rank) * known[place]))
-        adjusted[place] = most
-    return [float(p) for p in adjusted]
+    order = np.argsort(known)
+    known[order] = np.minimum(np.maximum.accumulate(known[order] * np.arange(len(known), 0, -1)), 1.0)
+    return known.tolist()
