@@ -2,8 +2,8 @@
 
     python studies/memory.py
 
-Both differences of every comparison, by the tables that ``needle.yaml``, ``pushing.yaml``, ``arena.yaml`` and
-``bins.yaml`` keep. The numbers of the pages are quoted by ``ddco-pyro study render``.
+Both differences of every comparison, by the tables that ``needle.yaml``, ``pushing.yaml``,
+``pushing_test.yaml``, ``arena.yaml`` and ``bins.yaml`` keep. The numbers of the pages are quoted by ``ddco-pyro study render``.
 """
 
 from __future__ import annotations
@@ -21,8 +21,14 @@ from ddco_pyro.study.report import name_of, values
 from ddco_pyro.study.statistics import estimate
 
 COLOURS = {"mixture - flat": "#c08a30", "options - mixture": "#1f3f70"}
-NAMED = {"needle": "needle", "pushing": "pushing", "arena": "Meta-World", "bins": "bin picking"}
-WORTH = (("arena", "nmi"), ("needle", "success"), ("arena", "success"), ("bins", "success"), ("pushing", "goals"))
+NAMED = {
+    "needle": "needle",
+    "pushing": "pushing",
+    "pushing_test": "pushing (test)",
+    "arena": "Meta-World",
+    "bins": "bin picking",
+}
+WORTH = (("arena", "nmi"), ("needle", "success"), ("arena", "success"), ("bins", "success"), ("pushing_test", "goals"))
 """The studies and measures of README's figure, with most demonstrations."""
 
 Line = tuple[str, int, str]

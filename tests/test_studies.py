@@ -503,6 +503,8 @@ other,a,theirs,20,0,success,0.0
         ("one - base; goals; 10; task=a; seed=1", "+4.00"),
         ("base; goals; 10", "0.00"),
         ("one - base; goals; 10; show=median", "+4.00"),
+        ("one; goals; 10; seed=1-2; show=range", "4.00 to 5.00"),
+        ("theirs; success; 20; without=b; study=other", "0%"),
         (
             "ours, k = 2 | theirs; success; 10 | 20; study=by_hand",
             "\n\n| demonstrations | measure | ours, k = 2 | theirs |\n|--:|---|--:|--:|\n"

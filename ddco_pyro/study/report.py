@@ -336,7 +336,7 @@ _QUOTED = re.compile(
     r"<!-- (?P<kind>study|table) (?P<name>[\w-]+): (?P<what>.*?) -->(?P<text>.*?)<!-- / -->", re.DOTALL
 )
 _Key = tuple[Any, ...]
-_SETTING = re.compile(r"(?P<key>study|task|seed|form|show|times|by)=(?P<value>.*)", re.DOTALL)
+_SETTING = re.compile(r"(?P<key>study|task|without|seed|form|show|times|by)=(?P<value>.*)", re.DOTALL)
 
 
 def render(text: str, studies: Path, tables: Path = Path()) -> str:
@@ -345,13 +345,15 @@ def render(text: str, studies: Path, tables: Path = Path()) -> str:
     A quotation is ``<!-- study NAME: options - flat; success; 50 -->…<!-- / -->``: a method or a contrast, a measure,
     and a number of demonstrations, none where the table has none. A difference is bold where it is not inconclusive
     after Holm's correction: for the primary contrasts of ``study NAME``, which has no other bold ones, or for all
-    differences of one measure that the page quotes from one study of ``table NAME``. ``40 - 80`` gives both methods of
-    a contrast a number of their own. Several methods, measures or numbers, between ``|``, make a table, of means and of
+    differences of one measure (up to a comma) that the page quotes from one study of ``table NAME``. ``40 - 80`` gives
+    both methods of a contrast a number of their own. Several methods, measures or numbers, between ``|``, make a table, of means and of
     differences with intervals. These settings may follow:
 
-    - ``study=NAME``, ``task=NAME`` and ``seed=NAME`` take rows of one study of the table, one task or one seed;
+    - ``study=NAME``, ``task=NAME`` and ``seed=NAME`` take rows of one study of the table, one task or one seed, and
+      ``seed=10-29`` of these; ``without=NAME`` leaves a task out;
     - ``show`` is ``mean``, ``±`` (half of the interval), ``sd``, ``se``, ``median`` (and its interval), ``range``
-      (least and greatest unit), ``above`` (how many units are above 0) or ``verdict``; else mean and interval;
+      (least and greatest unit), ``units`` (how many), ``above`` (how many are above 0) or ``verdict``; else mean and
+      interval;
     - ``times=900`` multiplies, ``form=+.0%`` formats as Python does, and ``by=task`` gives a table rows for each task.
 
     :param studies: the folder of the declarations, whose tables ``kept`` have the numbers of ``study NAME``.
@@ -399,6 +401,8 @@ def _quoted(
     counts = [tuple(one.split(" - ")) for one in plain[2]] if len(plain) == 3 else [()]
     try:
         times, _ = float(settings.get("times", 1)), format(0.0, form or "")
+        first, _, last = settings.get("seed", "").partition("-")
+        seeds = {first} if not last else {str(seed) for seed in range(int(first), int(last) + 1)}
         wrong = not all(n.isdecimal() for one in counts for n in one)
     except ValueError:
         wrong = True
@@ -407,8 +411,9 @@ def _quoted(
             f"{source.name}: {quotation!r}: write a method or contrast, a measure and a number of demonstrations, such "
             f"as: options - flat; success; 50. After show= stands one of: {', '.join(SHOWN)}; form= is Python's"
         )
-    wanted = tuple(sorted((key, settings[key]) for key in ("study", "seed") if key in settings))
-    rows = [row for row in source.rows if all(str(getattr(row, key)) == value for key, value in wanted)]
+    some = tuple((key, settings[key]) for key in ("study", "without", "seed") if key in settings)
+    rows = [row for row in source.rows if row.task != settings.get("without")]
+    rows = [row for row in rows if settings.get("study") in (None, row.study) and seeds & {"", str(row.seed)}]
 
     (methods, measures), task, by_task = plain[:2], settings.get("task"), settings.get("by") == "task"
     single = len(methods) * len(measures) * len(counts) == 1
@@ -424,9 +429,9 @@ def _quoted(
         own_form = f"+{form}" if form and difference and not single else form
         starts = trials(source.study, measure) if source.study and times == 1 else 0
         found = estimate(scaled, starts, -1.0 if difference else 0.0)
-        key = source.name, what, measure, count, task, *wanted
+        key = source.name, what, measure, count, task, *some
         if difference and how in ("interval", "±", "verdict") and source.study is None:
-            families.setdefault((source.name, measure, *wanted), {})[key] = found
+            families.setdefault((source.name, measure.partition(",")[0], *some), {})[key] = found
         if how == "verdict":
             return judged.get(key, NOT_TESTED)
         text = _shown(found, difference, measure, how, own_form)
@@ -447,7 +452,7 @@ def _quoted(
     return f"\n\n{Table(head[not by_task :], table, {0, 2} if by_task else {1}).markdown()}\n\n"
 
 
-SHOWN = ("interval", "mean", "±", "sd", "se", "median", "range", "above", "verdict")
+SHOWN = ("interval", "mean", "±", "sd", "se", "median", "range", "units", "above", "verdict")
 """How a quotation shows an estimate."""
 
 
@@ -457,6 +462,8 @@ def _shown(found: Estimate, difference: bool, measure: str, show: str, form: str
     half = {"±": found.interval[1] - found.value, "se": found.error, "sd": found.error * math.sqrt(number)}
     if show == "above":
         return f"{sum(unit > 0 for unit in found.units)} of {number}"
+    if show == "units":
+        return str(number)
     if show == "range":
         text = " to ".join(format(end, form) for end in found.range)
     elif show in half and not math.isnan(half[show]):
