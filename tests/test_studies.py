@@ -592,6 +592,7 @@ def test_pages_of_the_project_agree_with_the_tables(path):
     [
         ("needle", set()),
         ("pushing", set()),
+        ("pushing_test", set()),
         ("arena", {"options by em", "options by em without ridges"}),
         ("bins", set()),
         ("tuned", set()),

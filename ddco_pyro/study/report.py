@@ -346,8 +346,8 @@ def render(text: str, studies: Path, tables: Path = Path()) -> str:
     and a number of demonstrations, none where the table has none. A difference is bold where it is not inconclusive
     after Holm's correction: for the primary contrasts of ``study NAME``, which has no other bold ones, or for all
     differences of one measure (up to a comma) that the page quotes from one study of ``table NAME``. ``40 - 80`` gives
-    both methods of a contrast a number of their own. Several methods, measures or numbers, between ``|``, make a table, of means and of
-    differences with intervals. These settings may follow:
+    both methods of a contrast a number of their own. Several methods, measures or numbers, between ``|``, make a table,
+    of means and of differences with intervals. These settings may follow:
 
     - ``study=NAME``, ``task=NAME`` and ``seed=NAME`` take rows of one study of the table, one task or one seed, and
       ``seed=10-29`` of these; ``without=NAME`` leaves a task out;
@@ -380,7 +380,7 @@ def render(text: str, studies: Path, tables: Path = Path()) -> str:
     for source in known.values():
         for one in tested(source.study, source.rows) if source.study else ():
             key = source.name, " - ".join(one.spec.pair), one.spec.measure, (str(one.demonstrations),), None
-            judged[key] = one.verdict
+            judged.setdefault(key, one.verdict)
     return _QUOTED.sub(quoted, text)
 
 
@@ -401,8 +401,6 @@ def _quoted(
     counts = [tuple(one.split(" - ")) for one in plain[2]] if len(plain) == 3 else [()]
     try:
         times, _ = float(settings.get("times", 1)), format(0.0, form or "")
-        first, _, last = settings.get("seed", "").partition("-")
-        seeds = {first} if not last else {str(seed) for seed in range(int(first), int(last) + 1)}
         wrong = not all(n.isdecimal() for one in counts for n in one)
     except ValueError:
         wrong = True
@@ -411,6 +409,9 @@ def _quoted(
             f"{source.name}: {quotation!r}: write a method or contrast, a measure and a number of demonstrations, such "
             f"as: options - flat; success; 50. After show= stands one of: {', '.join(SHOWN)}; form= is Python's"
         )
+    seeds, several = {settings.get("seed", "")}, re.fullmatch(r"(\d+)-(\d+)", settings.get("seed", ""))
+    if several:
+        seeds = set(map(str, range(int(several[1]), int(several[2]) + 1)))
     some = tuple((key, settings[key]) for key in ("study", "without", "seed") if key in settings)
     rows = [row for row in source.rows if row.task != settings.get("without")]
     rows = [row for row in rows if settings.get("study") in (None, row.study) and seeds & {"", str(row.seed)}]
@@ -422,8 +423,8 @@ def _quoted(
         own = values(rows, what, measure, list(map(int, count)) or [None], task)
         if not own:
             return ""
-        several = any(seed != "" for one in own.values() for seed in one)  # a row without seed is their summary
-        scaled = {t: {s: times * v for s, v in one.items() if s != "" or not several} for t, one in own.items()}
+        each = any(seed != "" for one in own.values() for seed in one)  # a row without seed is their summary
+        scaled = {t: {s: times * v for s, v in one.items() if s != "" or not each} for t, one in own.items()}
         difference = " - " in what
         how = show or ("interval" if single or difference else "mean")
         own_form = f"+{form}" if form and difference and not single else form
