@@ -3,7 +3,7 @@
     python studies/memory.py
 
 Both differences of every comparison, by the tables that ``needle.yaml``, ``pushing.yaml``,
-``pushing_test.yaml``, ``arena.yaml`` and ``bins.yaml`` keep. ``ddco-pyro study render`` quotes the numbers of the pages.
+``pushing_test.yaml``, ``arena.yaml`` and ``bins.yaml`` keep. ``ddco-pyro study render`` quotes the pages' numbers.
 """
 
 from __future__ import annotations
