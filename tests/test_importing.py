@@ -247,7 +247,7 @@ def batched(samples: list[Any]) -> Any:
         return {key: batched([sample[key] for sample in samples]) for key in samples[0]}
     if isinstance(samples[0], tuple):
         return tuple(map(batched, map(list, zip(*samples, strict=True))))
-    return np.stack(samples)
+    return samples if isinstance(samples[0], str) else np.stack(samples)
 
 
 @pytest.fixture
@@ -321,6 +321,14 @@ def test_minari_with_nested_actions(written_by_minari, out: Path) -> None:
     np.testing.assert_array_equal(Demonstrations.read(out)[3].actions, np.hstack([grasp[:, None], base]))
     with pytest.raises(DemonstrationsError, match=r"no action 'hand/0' \(did you mean 'hands/0'\?\); there is: arm"):
         import_demonstrations(folder, out.with_name("x"), choice=Choice(actions=("hand/0",)))
+
+
+def test_minaris_text_is_no_control(written_by_minari, out: Path) -> None:
+    folder, _ = written_by_minari(spaces.Dict({"jaw": spaces.Box(-1, 1, (1,)), "say": spaces.Text(5)}))
+    with pytest.raises(DemonstrationsError, match=r"demo_0: say holds <U5, not numbers; choose with --action$"):
+        import_demonstrations(folder, out)
+    import_demonstrations(folder, out, choice=Choice(actions=("jaw",)))
+    assert Demonstrations.read(out).control_size == 1
 
 
 def test_minaris_environment_is_never_made(written_by_minari, out: Path) -> None:

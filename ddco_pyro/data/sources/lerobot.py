@@ -21,7 +21,7 @@ import numpy as np
 
 from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError
 from ddco_pyro.data.memory import refuse_too_much
-from ddco_pyro.data.pictures import channels_last, turned
+from ddco_pyro.data.pictures import block_steps, channels_last, turned
 from ddco_pyro.data.sources.metadata import check_links, filled, first_missing, inside, rate, stored_keys
 from ddco_pyro.data.sources.recording import LABEL_NAMES, Column, Format, Recording, damaged, joined, of_array
 from ddco_pyro.data.sources.video import video_column
@@ -45,9 +45,8 @@ OBSERVATION, ACTION = "observation.", "action"
 SUBTASK = "subtask_index"
 ANNOTATIONS = Path("meta") / "lerobot_annotations.json"
 IMAGES_AT_ONCE = 32
-UNEVEN = 0.3
-"""Gaps between times are even if they differ from their median by less than UNEVEN × the median. A missing frame is a
-gap of twice the median, and clocks of robots jitter by less."""
+LONGEST_GAP = 1.5
+"""Frames are missing where a gap between times is longer than LONGEST_GAP × the median gap."""
 _NO_CONTROL = {"timestamp", "frame_index", "episode_index", "index", "task_index", "image", "video", "string"}
 """Names and types of features that are never the control."""
 _LONGEST = 1e9
@@ -107,8 +106,8 @@ class LeRobot:
 
     def _check_actions(self) -> None:
         """Refuse features that do not exist as the control."""
-        types = {feature: str(about["dtype"]) for feature, about in self.features.items()}
-        there = [feature for feature, dtype in types.items() if not {feature, dtype} & _NO_CONTROL]
+        types = {name: about.get("dtype") if isinstance(about, dict) else None for name, about in self.features.items()}
+        there = [name for name, dtype in types.items() if not {name, str(dtype)} & _NO_CONTROL]
         for feature in self._actions:
             if feature not in there:
                 close = [name for name in there if name.startswith(ACTION)] or there
@@ -278,14 +277,12 @@ def _problem_of_times(times: np.ndarray, frequency: float, column: str) -> str:
     wrong = ~(np.abs(times - expected) < 0.5 / frequency)
     if not wrong.any():
         return ""
+    if (np.abs(times - times[0] - expected) < 0.5 / frequency).all():
+        return f"{column} starts at {times[0]:.6g}, not at 0; subtract that from each"
     gaps = np.diff(times)
-    typical = float(np.median(gaps)) if len(gaps) else 1 / frequency
-    if typical > 0 and (np.abs(gaps - typical) < UNEVEN * typical).all():
-        mean = float(gaps.mean()) if len(gaps) else typical
-        if abs(mean * frequency - 1) * len(times) < 0.5:
-            return f"{column} starts at {times[0]:.6g}, not at 0; subtract that from each"
-        if column == "timestamp":
-            return f"{column} runs at {1 / mean:.4g} Hz, and meta/info.json says {frequency:g}; correct one of them"
+    if column == "timestamp" and len(gaps) and gaps.min() > 0 and gaps.max() < LONGEST_GAP * np.median(gaps):
+        rate = 1 / gaps.mean()
+        return f"{column} runs at {rate:.4g} Hz, and meta/info.json says {frequency:g}; correct one of them"
     at = int(wrong.argmax())
     return f"{column} is {times[at]:g} in row {at}, not {expected[at]:g}: frames are missing or out of order"
 
@@ -309,18 +306,17 @@ class _Rows:
 
     def vectors(self, key: str, shape: Sequence[int] = (1,)) -> Column:
         """A column of numbers or lists of numbers; ``shape`` is the shape of a step."""
-        size = math.prod(shape)
+        size, dtype = math.prod(shape), self._dtype(key)
 
         def blocks() -> Iterator[np.ndarray]:
             at = 0
             try:
-                for batch in self._batches(key, 4096):
+                for batch in self._batches(key, block_steps(tuple(shape), dtype)):
                     yield turned(self._numbers(batch.column(0), size, key, at).reshape(len(batch), *shape))
                     at += len(batch)
             except _DAMAGE as error:
                 raise damaged(self.path, f"{self.name}: {key}", error) from error
 
-        dtype = self._dtype(key)
         return Column(channels_last((len(self), *shape), dtype), dtype, blocks, named=key)
 
     def _dtype(self, key: str) -> np.dtype:

@@ -60,11 +60,11 @@ class Minari:
         steps, total = len(actions), facts.get("total_steps")
         if total is not None and total != steps:
             raise DemonstrationsError(f"{self.folder}: {name}: total_steps is {total}, and there are {steps} actions")
-        leaves = list(_leaves(episode["observations"], ""))
-        names = [key for key, _ in leaves]
         # an observation with another number of steps stays, and is refused later
-        arrays = [of_array(array[:-1] if len(array) == steps + 1 else array) for _, array in leaves]
-        observations = dict(zip(stored_keys(self.folder, names, names), arrays, strict=True))
+        observations = {
+            key: of_array(array[:-1] if len(array) == steps + 1 else array)
+            for key, array in self._flat(episode["observations"], BARE).items()
+        }
         seed = facts.get("seed")
         known: dict[str, Attribute] = {"episode_index": index}
         if seed is not None:
@@ -73,13 +73,19 @@ class Minari:
 
     def _control(self, actions: Any, where: str) -> np.ndarray:
         """The chosen actions [T, A] of an episode."""
-        parts = dict(_leaves(actions, "", "actions"))
+        parts = self._flat(actions, "actions")
         for key in self._actions:
             if key not in parts:
                 raise DemonstrationsError(
                     f"{where}: there is no action {key!r}{nearest(key, parts)}; there is: {', '.join(parts)}"
                 )
         return joined({key: parts[key] for key in self._actions or parts}, where)
+
+    def _flat(self, nested: Any, bare: str) -> dict[str, np.ndarray]:
+        """Each array by its key; ``bare`` is the key of an array that is not nested."""
+        leaves = list(_leaves(nested, "", bare))
+        names = [name for name, _ in leaves]
+        return dict(zip(stored_keys(self.folder, names, names), (array for _, array in leaves), strict=True))
 
     def _check_stored(self, index: int) -> None:
         """Refuse an episode in HDF5 whose arrays are not stored."""
@@ -92,20 +98,17 @@ class Minari:
                         dataset_at(episode, key, f"episode_{index}/", self._external)
 
 
-def _leaves(observations: Any, key: str, bare: str = BARE) -> Iterator[tuple[str, np.ndarray]]:
-    """Path and array of each nested observation or action.
-
-    :param bare: the path of an array that is not nested.
-    """
-    if isinstance(observations, dict):
-        for name, below in observations.items():
-            yield from _leaves(below, f"{key}/{name}" if key else str(name))
-    elif isinstance(observations, tuple):
-        for number, below in enumerate(observations):
-            yield from _leaves(below, f"{key}/{number}" if key else str(number))
+def _leaves(nested: Any, key: str, bare: str) -> Iterator[tuple[str, np.ndarray]]:
+    """Path and array of each nested observation or action; ``bare`` is the path of an array that is not nested."""
+    if isinstance(nested, dict):
+        for name, below in nested.items():
+            yield from _leaves(below, f"{key}/{name}" if key else str(name), bare)
+    elif isinstance(nested, tuple):
+        for number, below in enumerate(nested):
+            yield from _leaves(below, f"{key}/{number}" if key else str(number), bare)
     else:
-        observations = np.asarray(observations)  # a list of text
-        yield key or bare, observations[:, None] if observations.ndim == 1 else observations
+        array = np.asarray(nested)  # a list of text
+        yield key or bare, array[:, None] if array.ndim == 1 else array
 
 
 def _stored(folder: Path) -> set[int]:

@@ -144,12 +144,16 @@ def joined(parts: Mapping[str, np.ndarray], where: str) -> np.ndarray:
     """Arrays [T, ...] by name as one array [T, D], in this order.
 
     :param where: the demonstration, for messages.
-    :raises DemonstrationsError: an array holds no numbers, or has another number of steps than the first.
+    :raises DemonstrationsError: there is no array, one holds no numbers, or has another number of steps than the first.
     """
-    first, steps = next((name, len(array)) for name, array in parts.items())
+    first, steps = next(((name, len(array)) for name, array in parts.items()), ("", 0))
+    if not parts:
+        raise DemonstrationsError(f"{where}: has no actions")
     for name, array in parts.items():
         if array.dtype.kind not in "fiub":
-            raise DemonstrationsError(f"{where}: {name} holds {array.dtype}, controls have to be numbers")
+            raise DemonstrationsError(
+                f"{where}: {name} holds {array.dtype}, not numbers; name the control with --action"
+            )
         if len(array) != steps:
             raise DemonstrationsError(f"{where}: {name} has {len(array)} steps, but {first} has {steps}")
     return np.concatenate([array.reshape(steps, math.prod(array.shape[1:])) for array in parts.values()], axis=1)
