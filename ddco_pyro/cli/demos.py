@@ -102,8 +102,9 @@ def init(
     check_outputs([Output("--out", out)], [file])
     if out.exists() and not force:
         raise BadInput(f"{out}: exists; choose another --out, or replace it with --force")
+    facts = look(file)
     refuse_foreign(file)
-    text = starting_spec(look(file), file).replace("THIS_FILE", quote(str(out)))
+    text = starting_spec(facts, file).replace("THIS_FILE", quote(str(out)))
     write_text(out, text)
     fit = command("fit", out, "--out", f"runs/{out.stem}")
     print(f"{out}{hint(f': fit it with: {fit}')}")
