@@ -6,6 +6,8 @@ import difflib
 import shlex
 from collections.abc import Iterable
 from numbers import Integral
+from os import PathLike
+from pathlib import Path
 from typing import Any
 
 
@@ -24,6 +26,17 @@ def check_whole(name: str, given: Any, least: int = 0) -> None:
     """
     if not isinstance(given, Integral) or given < least:
         raise BadInput(f"{name}={given!r}: has to be a whole number from {least} on")
+
+
+def path_of(given: Any, what: str) -> Path:
+    """The path of a file or folder.
+
+    :param what: the name of the argument in errors.
+    :raises BadInput: it is something else.
+    """
+    if not isinstance(given, str | PathLike):
+        raise BadInput(f"{what}: has to be the path of a file or folder; got {type(given).__name__}")
+    return Path(given)
 
 
 def command(*words: object) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 from ddco_pyro.data.controls import difference
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.pictures import same
-from ddco_pyro.errors import BadInput
+from ddco_pyro.errors import BadInput, path_of
 from ddco_pyro.evaluation.agreement import UNMATCHED
 from ddco_pyro.evaluation.worth import paired
 from ddco_pyro.fitting.fitted import Fit, load
@@ -113,7 +113,7 @@ def compare(runs: Sequence[str | Path], allow_code: bool = False) -> Comparison:
     :raises CompareError: there are fewer than two runs, one is named twice, or they held out different data.
     :raises RunError: a folder is not a finished run.
     """
-    folders = [Path(run) for run in runs]
+    folders = [path_of(run, "runs") for run in runs]
     if len({folder.resolve() for folder in folders}) < len(folders):
         raise CompareError("the same run is given twice; name each once")
     if len(folders) < 2:

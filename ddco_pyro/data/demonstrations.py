@@ -26,7 +26,7 @@ from ddco_pyro.data.pictures import Observed, Pictures
 from ddco_pyro.data.sources import refuse_foreign
 from ddco_pyro.data.sources.recording import Column, Recording, of_array
 from ddco_pyro.data.sources.robomimic import Robomimic, frequency_of, open_robomimic, robomimic_file, write_recording
-from ddco_pyro.errors import check_whole
+from ddco_pyro.errors import check_whole, path_of
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -167,7 +167,7 @@ class Demonstrations(Sequence[Demonstration]):
         :param exclude: names of demonstrations that are not read and are removed from masks.
         :raises DemonstrationsError: the file cannot be read, lacks something asked for, or does not fit into memory.
         """
-        with _opened(Path(path)) as source:
+        with _opened(path_of(path, "demonstrations")) as source:
             needed = PROGRAM + _extent(source, observations, labels, exclude).size
             refuse_too_much(needed, "reading it", "read only some observations, or scale pictures down")
             read = tuple(map(Demonstration.of, _recordings(source, observations, labels, exclude)))

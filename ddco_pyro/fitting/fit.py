@@ -20,6 +20,7 @@ from ddco_pyro.data.files import leftovers
 from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.memory import allowed
 from ddco_pyro.data.sources.recording import label_names
+from ddco_pyro.errors import path_of
 from ddco_pyro.events import Event, OnEvent, TrainingBegan, ignore
 from ddco_pyro.fitting.digest import record, recorded
 from ddco_pyro.fitting.evaluation import evaluate
@@ -93,7 +94,7 @@ def fit(
     :raises OtherDemonstrations: the folder is a run of other demonstrations.
     :raises TrainingError: training stopped; the checkpoints stay.
     """
-    spec, folder = spec if isinstance(spec, Spec) else load_spec(spec), None if out is None else Path(out)
+    spec, folder = spec if isinstance(spec, Spec) else load_spec(spec), None if out is None else path_of(out, "out")
     check_jobs(jobs)
     _check_shards(spec.training.shards)
     allowed()  # or $DDCO_PYRO_MEMORY is wrong
@@ -109,7 +110,7 @@ def fit(
             demos: Demonstrations | None = seen(spec, given)
         else:
             if demonstrations is not None:
-                spec = with_overrides(spec, {"demonstrations.path": str(demonstrations)})
+                spec = with_overrides(spec, {"demonstrations.path": str(path_of(demonstrations, "demonstrations"))})
             demos = known_demonstrations(spec)
         models, known = check_models(spec, dimensions(spec, demos)), demos is not None
         if demos is not None:

@@ -17,7 +17,7 @@ from ddco_pyro.acting.monitor import Monitor, run_lengths
 from ddco_pyro.data.checks import unknown
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.drawing.words import choice_names
-from ddco_pyro.errors import BadInput
+from ddco_pyro.errors import BadInput, path_of
 from ddco_pyro.evaluation.inferred import Inferred, Segmentation, infer, started
 from ddco_pyro.fitting.digest import record, recorded
 from ddco_pyro.fitting.draws import Draws, draw
@@ -285,7 +285,7 @@ def load(folder: str | Path, allow_code: bool = False, overrides: Iterable[str] 
     :raises BadInput: ``names.yaml`` does not fit the spec.
     :raises SpecError: its spec names user code, and that is not allowed; or an override is no setting of the report.
     """
-    folder = Path(folder)
+    folder = path_of(folder, "folder")
     missing = [name for name in ("spec.yaml", "model.safetensors", "metrics.json") if not (folder / name).exists()]
     if missing:
         what = "not a run folder" if "spec.yaml" in missing else "an unfinished run: fit it again to continue it"

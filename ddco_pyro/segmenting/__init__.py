@@ -123,7 +123,7 @@ def segment(fit: Fit, path: str | Path) -> Segmented:
     :raises BadInput: the run has no options, or was fitted to other observations.
     :raises DemonstrationsError: a demonstration cannot be used.
     """
-    with open_source(Path(path)) as source:
+    with open_source(path) as source:
         return segments(fit, source)
 
 

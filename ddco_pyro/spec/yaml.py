@@ -11,6 +11,7 @@ from typing import Any, get_args
 
 import yaml
 
+from ddco_pyro.errors import path_of
 from ddco_pyro.spec.base import Importable, Model, SpecError, show
 from ddco_pyro.spec.spec import Spec, parse_spec, plain, with_overrides
 
@@ -70,7 +71,7 @@ def load_spec(path: str | Path, overrides: Iterable[str] = (), allow_code: bool 
     :raises SpecError: the file cannot be read, is not YAML, is not a valid spec, or names code that is not allowed; one
         line for each problem.
     """
-    data = read_mapping(path, "spec")
+    data = read_mapping(path_of(path, "spec"), "spec")
     try:
         spec = parse_spec(data, dict(_parse_override(text) for text in overrides))
     except SpecError as error:

@@ -18,7 +18,7 @@ import h5py
 
 from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError
 from ddco_pyro.data.sources.recording import Column, Format, Recording
-from ddco_pyro.errors import command
+from ddco_pyro.errors import command, path_of
 
 __all__ = ["Column", "Format", "Recording", "Source", "open_source", "refuse_foreign"]
 
@@ -65,7 +65,7 @@ def open_source(
     :param actions: names of the arrays that are the control together, where a LeRobot or Minari dataset has several.
     :raises DemonstrationsError: the source cannot be read, or has another format.
     """
-    path = Path(path)
+    path = path_of(path, "demonstrations")
     form = form or format_of(path)
     if actions and form not in ("lerobot", "minari"):
         raise DemonstrationsError(
