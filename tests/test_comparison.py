@@ -119,9 +119,9 @@ def test_a_run_that_fell_apart_comes_first_in_the_verdict():
     rows = [row(name, rank, each, model, own) for rank, (name, model, each, own) in enumerate(runs)]
     said = page.verdict(Comparison(rows, tuple("klmn"), (1, 1, 1, 1), [], [], "b"))
     assert said.startswith(
-        "B fell apart on held-out demonstrations: −8.50 nats per step there, 6.00 in training. C fell"
+        "b fell apart on held-out demonstrations: −8.50 nats per step there, 6.00 in training. c fell"
     )
-    assert "B is below a by 12.50 ± 0.29 nats per step" in said
+    assert "b is below a by 12.50 ± 0.29 nats per step" in said
     assert "explain held-out controls" not in said
 
 

@@ -189,10 +189,10 @@ def caution(metrics: Metrics) -> str:
     The same for several runs is :func:`cautions`.
     """
     flats = {name: metrics.comparison[name].difference for name in FLAT if name in metrics.comparison}
-    ours = method(metrics.model)
+    ours = capital(method(metrics.model))
     lowest = min(flats, key=lambda name: flats[name].nats_per_step, default=None)
     below = {} if lowest is None else {ours: (method(lowest), flats[lowest])}
-    values = {method(name): _of_parts(one.log_likelihood_per_step) for name, one in metrics.methods.items()}
+    values = {capital(method(name)): _of_parts(one.log_likelihood_per_step) for name, one in metrics.methods.items()}
     return cautions(values, below, len(metrics.valid))
 
 
@@ -208,7 +208,7 @@ def cautions(
     :param flats: the difference of a model to a flat one, with that one's name.
     """
     said = [
-        f"{capital(name)} fell apart on held-out demonstrations: {number(held)} nats per step there, "
+        f"{name} fell apart on held-out demonstrations: {number(held)} nats per step there, "
         f"{number(trained)} in training."
         for name, (trained, held) in values.items()
         if apart(trained, held)
@@ -223,7 +223,7 @@ def cautions(
         if _direction(difference, held_out) < 0 or difference.nats_per_step < -FAR:
             by = f"{number(-difference.nats_per_step)} ± {number(difference.standard_error)}"
             said.append(
-                f"{capital(name)} is below {flat} by {by} nats per step on held-out demonstrations. Take {flat}, or "
+                f"{name} is below {flat} by {by} nats per step on held-out demonstrations. Take {flat}, or "
                 "compare numbers of options and their networks by cross-validation (ddco-pyro select)."
             )
     return " ".join(said)
