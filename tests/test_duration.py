@@ -12,7 +12,7 @@ from scipy import integrate, stats
 
 import ddco_pyro
 from ddco_pyro.inference import log_likelihood
-from ddco_pyro.model.links import log_termination
+from ddco_pyro.model.outputs import log_termination
 from ddco_pyro.spec import DurationSpec
 from ddco_pyro.training.checkpoint import Progress
 from ddco_pyro.training.loop import backward

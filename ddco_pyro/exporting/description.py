@@ -10,7 +10,7 @@ import torch
 
 from ddco_pyro.exporting.program import StepProgram
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.model.links import TERMINATION_BOUND
+from ddco_pyro.model.outputs import TERMINATION_BOUND
 from ddco_pyro.spec import STEP, RolloutSpec
 
 Arrays = dict[str, np.ndarray]

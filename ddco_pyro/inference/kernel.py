@@ -1,47 +1,32 @@
-"""Forward-backward over the joint choices of a hierarchy in scaled probability space, compiled; O(D·S) a step.
+"""The recursions of the AHMM over a trajectory, compiled; O(D·S) a step for S joint choices.
 
-Four trajectories go side by side, each in a lane of :mod:`ddco_pyro.model.elementary`. Their steps go in blocks: passes
-fill a block of rows, the forward pass goes on through it, and on the way back each block's posteriors become gradients
-before the next block's are computed. :class:`Structure` defines how joint choices and messages are numbered.
+:func:`_predict` and :func:`_act` are the forward recursion in any semiring. :func:`eliminate` runs them over
+probabilities and goes back for the gradient. :func:`trace` runs them over logarithms and goes back along paths.
 
-Row t of ``messages`` [1 + T, messages, lanes] begins with the filtered probabilities of the joint choices at t - 1.
-Above level 1 the row holds the mass that goes up from them at t: the mass that terminated at every level below.
-Row t of ``spread`` [T, messages, lanes] holds the mass that comes down again, for levels D + 1 to 2: the terminated
-mass, spread by the selections, and the kept mass.
+:class:`Structure` numbers joint choices and messages. Row t of ``messages`` [1 + T, M] begins with the forward mass of
+the joint choices at t - 1. Above level 1 the row has the mass that terminated at every level below, at t. Row t of
+``spread`` [T, M] has the mass that comes down again: the selected mass and the kept mass.
+
+Tables of all levels stand side by side in rows [N·T, columns]: selections, terminations, the meta-policy's control, the
+options' controls, and factors of the joint choices where there is evidence.
+
+All compiled functions are in this file, so that numba's cache, which looks at the file of an entry point, is right.
+Arrays are allocated by callers and indexed in full: numba takes seconds to compile allocations and slices.
 """
 
 from __future__ import annotations
 
-import threading
+import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numba
 import numpy as np
 import torch
 
-from ddco_pyro.model.elementary import (
-    LANES,
-    Array,
-    Outer,
-    Plane,
-    absolute,
-    apart,
-    at,
-    exponential,
-    jit,
-    lanes,
-    logarithm,
-    number,
-    put,
-    record,
-    where,
-    whole,
-    write,
-)  # fmt: skip
-from ddco_pyro.model.passes import LAST, Lot, Room, Rows, View, fill, give, slope, take, task
+Array = np.ndarray
 
 IMPOSSIBLE = -1
 """Marks a joint choice with an option below a choice 0, and a caller that is itself below a choice 0."""
@@ -49,45 +34,34 @@ IMPOSSIBLE = -1
 TOLERANCE = 1e-9
 """Allowed error of Σ_s α_t(s) β_t(s) = 1. Rounding changes the sum by less than 1e-12 over 10 000 steps."""
 
-STEPS_A_THREAD = 4096
-"""Steps of trajectories that are worth a thread of their own."""
-
-BLOCK = 32
-"""Steps of a block: what passes hand each other stays in the first cache."""
-
 SMALL, LARGE = 1e-300, 1e300
 """Mass of a step, and backward messages, beyond which a trajectory is done in log space."""
 
-releasing = numba.njit(  # type: ignore[call-overload]
-    cache=True, error_model="numpy", nogil=True, no_cfunc_wrapper=True, no_rewrites=True, pipeline_class=Outer
-)
-"""Keeps the compiled function on disk, with all that it calls. numba looks at this file alone: delete ``*.nb?`` in
-``__pycache__`` after a change to :mod:`ddco_pyro.model.passes` or :mod:`ddco_pyro.model.elementary`."""
+STEPS_A_THREAD = 4096
+"""Steps of trajectories that are worth a thread of their own."""
 
 
 class Structure(NamedTuple):
     """Index tables of D levels, lowest first. C_d = 1 + k_d counts a level's choices, control among them.
 
     A joint choice is one index, with h^D as the slowest digit and h^1 as the fastest. A *message* of level d runs over
-    (h^D, ..., h^d). The messages of levels 1 to D + 1 stand one after the other; level D + 1 has a single entry.
-    Each row of a table holds the levels side by side.
+    (h^D, ..., h^d). The messages of levels 1 to D + 1 stand one after the other, M entries in all; level D + 1 has one.
 
-    :param sizes: C_d, [D].
-    :param starts: first index of each level's message, and the number of all entries, [D + 2].
-    :param ends: first column of each level in a row of terminations, where a level has [k_d, 2], [D].
-    :param callers: for each message entry, its first column in a row of selections as the caller of the level below,
-        where a level has [callers, C_d]; :data:`IMPOSSIBLE` for a caller below a choice 0.
-    :param actors: for each joint choice, the acting caller's column in a row of controls, [S]. A row has the
-        meta-policy, then each level's k_d options; the column is :data:`IMPOSSIBLE` where the joint choice is.
-    :param choices: for each joint choice, the columns of its choices in a row of marginals, [S, D].
+    :param columns: of a row, without the factors of joint choices.
+    :param callers: for each message entry above level 1: its first entry below, the number C of entries below, its
+        first column in a row as their caller, and the column of their first termination; [M - S, 4]. A caller below a
+        choice 0 has no column, but :data:`IMPOSSIBLE`.
+    :param actors: for each joint choice, the acting caller's column; :data:`IMPOSSIBLE` where the joint choice is, [S].
+    :param choices: for each joint choice, the columns of its choices in a row of posteriors, which has marginals in
+        place of the factors, [S, D].
+    :param above: for each message entry below level D + 1, the entry of its caller, [M - 1].
     """
 
-    sizes: Array
-    starts: Array
-    ends: Array
+    columns: int
     callers: Array
     actors: Array
     choices: Array
+    above: Array
 
     @classmethod
     @cache
@@ -95,35 +69,27 @@ class Structure(NamedTuple):
         """The structure of levels with these numbers of choices C_d, lowest first."""
         depth = len(sizes)
         messages = [int(np.prod(sizes[level:])) for level in range(depth + 1)]
+        calling = [*(size - 1 for size in sizes[1:]), 1]
+        selection = _offsets([size * number for size, number in zip(sizes, calling, strict=True)])
+        termination = selection[-1] + _offsets([2 * (size - 1) for size in sizes])
+        control = termination[-1] + _offsets([1, *(size - 1 for size in sizes)])
         digits = np.indices(sizes[::-1]).reshape(depth, -1)[::-1].T  # [S, D], lowest level first
-        callers = [np.full(messages[0], IMPOSSIBLE)]  # level 1 calls no level
-        first = 0
-        for level, size in enumerate(sizes):
-            digit = np.arange(messages[level + 1]) % sizes[level + 1] if level + 1 < depth else np.ones(1, np.int64)
-            callers.append(np.where(digit > 0, first + (digit - 1) * size, IMPOSSIBLE))
-            first += size * (sizes[level + 1] - 1 if level + 1 < depth else 1)
-        controls = _offsets([1, *(size - 1 for size in sizes)])[1:]
-        actors = np.zeros(len(digits), np.int64)  # the meta-policy, where every choice is 0
+        actors = np.full(len(digits), control[0])  # the meta-policy, where every choice is 0
         for level in range(depth - 1, -1, -1):
             chosen = digits[:, level] > 0
             valid = (digits[chosen, level:] > 0).all(1)
-            actors[chosen] = np.where(valid, controls[level] + digits[chosen, level] - 1, IMPOSSIBLE)
-        return cls(
-            sizes=np.array(sizes),
-            starts=_offsets(messages),
-            ends=_offsets([2 * (size - 1) for size in sizes])[:-1],
-            callers=np.concatenate(callers),
-            actors=actors,
-            choices=np.ascontiguousarray(digits + _offsets(sizes)[:-1]),
-        )
-
-    def digits(self, joint: Array) -> tuple[Array, ...]:
-        """The choice of each level, lowest first, in joint choices of any shape."""
-        choices = []
-        for size in self.sizes:
-            choices.append(joint % size)
-            joint = joint // size
-        return tuple(choices)
+            actors[chosen] = np.where(valid, control[level + 1] + digits[chosen, level] - 1, IMPOSSIBLE)
+        starts, callers, above = _offsets(messages), [], []
+        for level, (size, number) in enumerate(zip(sizes, messages[1:], strict=True)):
+            each = np.arange(number)
+            digit = each % sizes[level + 1] if level + 1 < depth else np.ones(1, np.int64)
+            first = np.where(digit > 0, selection[level] + (digit - 1) * size, IMPOSSIBLE)
+            ends = np.full(number, termination[level])
+            callers.append(np.stack([starts[level] + each * size, np.full(number, size), first, ends], 1))
+            above.append(starts[level + 1] + each.repeat(size))
+        columns = int(control[-1])
+        choices = np.ascontiguousarray(columns + digits + _offsets(sizes)[:-1])
+        return cls(columns, np.concatenate(callers), actors, choices, np.concatenate(above))
 
 
 def _offsets(sizes: Sequence[int]) -> Array:
@@ -132,8 +98,7 @@ def _offsets(sizes: Sequence[int]) -> Array:
 
 
 def on_threads(run: Callable[[int, int], object], lengths: Array) -> None:
-    """Call ``run(first, last)`` for parts of the trajectories, or lots of them, on at most ``torch.get_num_threads()``
-    threads.
+    """Call ``run(first, last)`` for parts of the trajectories, on at most ``torch.get_num_threads()`` threads.
 
     :param lengths: steps of each, [N].
     """
@@ -147,464 +112,255 @@ def on_threads(run: Callable[[int, int], object], lengths: Array) -> None:
         list(pool.map(run, bounds[:-1], bounds[1:]))
 
 
-HELD = 4 * 10**6
-"""Most numbers of a buffer that is held from one call to the next, so that its pages need not be mapped again."""
+inner = numba.njit(error_model="numpy", fastmath={"contract"})
+entry = numba.njit(error_model="numpy", fastmath={"contract"}, nogil=True, cache=True)
 
-_held = threading.local()
-
-
-def placed(planes: Sequence[tuple[int, int]] | Array) -> tuple[Array, Array]:
-    """Room for planes of these rows and columns, one after the other; and the address and columns of each."""
-    rows, columns = np.array(planes).T
-    ends = np.cumsum(LANES * rows * columns)
-    buffer = _buffer(int(ends[-1]))
-    return buffer, np.stack([buffer.ctypes.data + 8 * np.append(0, ends[:-1]), columns], 1)
+SUM, LOG_SUM, LARGEST = range(3)
+"""Semirings: sums of probabilities; sums, and maxima, of their logarithms."""
 
 
-def _buffer(size: int) -> Array:
-    if size > HELD:
-        return np.empty(size)
-    held: Array | None = getattr(_held, "buffer", None)
-    if held is None or len(held) < size:
-        held = _held.buffer = np.empty(size)
-    return held
+@inner
+def _plus(semiring: int, first: float, second: float) -> float:
+    if semiring == SUM:
+        return first + second
+    larger, smaller = (first, second) if first >= second else (second, first)
+    if semiring == LARGEST or smaller == -np.inf:
+        return larger
+    return larger + math.log(1.0 + math.exp(smaller - larger))
 
 
-def lots_of(lengths: Array) -> tuple[Array, Array]:
-    """The trajectories of each lot and their lengths, int64 [lots, lanes], the shortest first; 0 is no trajectory.
+@inner
+def _times(semiring: int, first: float, second: float) -> float:
+    return first * second if semiring == SUM else first + second
 
-    :param lengths: steps of each trajectory, [N].
+
+@inner
+def _begin(semiring: int, messages: Array) -> None:
+    """Fill ``messages[0]``: at t = 0 everything is selected."""
+    for i in range(messages.shape[1]):
+        messages[0, i] = 0.0 if semiring == SUM else -np.inf
+    messages[0, messages.shape[1] - 1] = 1.0 if semiring == SUM else 0.0
+
+
+@inner
+def _predict(
+    semiring: int, t: int, row: int, rows: Array, messages: Array, spread: Array, callers: Array, actors: Array
+) -> None:
+    """Fill ``messages[t]`` above level 1 and ``spread[t]``: the mass of each joint choice before the control at t.
+
+    :param row: of the trajectory's step t.
     """
-    order = np.argsort(lengths, kind="stable")
-    trajectories, each = np.zeros((2, -(-len(lengths) // LANES), LANES), dtype=np.int64)
-    trajectories.reshape(-1)[-len(lengths) :], each.reshape(-1)[-len(lengths) :] = order, lengths[order]
-    return trajectories, each
+    last, zero = len(callers) - 1, 0.0 if semiring == SUM else -np.inf
+    if t > 0:
+        for i in range(len(callers)):
+            below, ends = callers[i, 0], callers[i, 3]
+            total = messages[t, below]  # choice 0 lasts one step
+            for j in range(1, callers[i, 1]):
+                ended = _times(semiring, messages[t, below + j], rows[row, ends + 2 * j - 1])
+                total = _plus(semiring, total, ended)
+            messages[t, len(actors) + i] = total
+    spread[t, len(actors) + last] = messages[t, len(actors) + last]
+    for i in range(last, -1, -1):
+        below, calls, ends, mass = callers[i, 0], callers[i, 2], callers[i, 3], spread[t, len(actors) + i]
+        spread[t, below] = mass if calls < 0 else _times(semiring, mass, rows[row, calls])
+        for j in range(1, callers[i, 1]):
+            arrived = zero
+            if calls >= 0:
+                arrived = _times(semiring, mass, rows[row, calls + j])
+                if t > 0:
+                    kept = _times(semiring, messages[t, below + j], rows[row, ends + 2 * j - 2])
+                    arrived = _plus(semiring, arrived, kept)
+            spread[t, below + j] = arrived
 
 
-class Sizes(NamedTuple):
-    """Columns of the planes of a run.
-
-    :param kept: lanes that passes keep of a step; ``shared`` of a trajectory.
-    :param room: the most numbers of a step that a pass takes or gives; ``controls`` likewise.
-    :param marginals: Σ C_d, or 0 without the posteriors of the choices.
-    """
-
-    selection: int
-    termination: int
-    control: int
-    choice: int
-    kept: int
-    shared: int
-    room: int
-    controls: int
-    messages: int
-    marginals: int
-
-    def planes(self, steps: int) -> Array:
-        """Rows and columns of the planes of a :class:`Run`, in its order, for trajectories of at most so many steps."""
-        rows = self.selection, self.termination, self.control
-        room = self.room, self.controls + 1, self.room, self.room, self.room
-        block = [(BLOCK, columns) for columns in (*room, *rows, self.marginals)]
-        once = [(1, self.messages), (1, self.shared + 2)]
-        step = [(steps, columns) for columns in (*rows, self.choice, self.kept, self.messages, 1)]
-        return np.array([*block, *once, *step, (1 + steps, self.messages)])
-
-
-class Shape(NamedTuple):
-    """A :class:`Structure` as compiled code reads it: the number of levels D, of joint choices S, and addresses."""
-
-    depth: int
-    joint: int
-    sizes: int
-    starts: int
-    ends: int
-    callers: int
-    actors: int
-    choices: int
-
-    @classmethod
-    @cache
-    def of(cls, sizes: tuple[int, ...]) -> Shape:
-        """The shape of a structure, whose arrays stay."""
-        structure = Structure.of(sizes)
-        return cls(len(structure.sizes), len(structure.actors), *(array.ctypes.data for array in structure))
-
-
-class Lots(NamedTuple):
-    """Addresses of the trajectories of each lot, [lots, lanes], and of their lengths."""
-
-    trajectories: int
-    lengths: int
-
-
-class Tasks(NamedTuple):
-    """The number of :class:`ddco_pyro.model.passes.Task`, their address, and that of their constants."""
-
-    number: int
-    address: int
-    constants: int
-
-
-class Run(NamedTuple):
-    """What a run reads, and its room.
-
-    :param found: address of a row for each trajectory, [N, n + 2]: the gradients of what steps share, then the
-        log-likelihood, and whether it is exact.
-    :param evidence: of the joint choices, [N, T, S]; ``marginals`` where those of the choices go, [N, T, Σ C_d].
-    :param room: of passes, for a block.
-    :param sums: the posteriors of a block.
-    :param back: [1, messages].
-    :param total: a row of ``found``.
-    :param rows: of all steps.
-    :param kept: what passes keep of each step.
-    """
-
-    lots: Lots
-    tasks: Tasks
-    evidence: View
-    marginals: View
-    found: int
-    of: Shape
-    room: Room
-    sums: Rows
-    back: Plane
-    total: Plane
-    rows: Rows
-    kept: Plane
-    spread: Plane
-    scale: Plane
-    messages: Plane
-
-
-def run(address: int, index: int) -> Any:
-    """A run of those at an address."""
-
-
-record(run, Run)
-
-
-# --- forward ----------------------------------------------------------------------------------------------------------
-
-
-@jit
-def _up(t: int, rows: Rows, messages: Plane, of: Shape) -> None:
-    """Fill row t of ``messages`` for levels 2 to D + 1."""
-    for d in range(of.depth):
-        c, below = whole(of.sizes, d), whole(of.starts, d)
-        for above in range(whole(of.starts, d + 1), whole(of.starts, d + 2)):
-            total = at(messages, t, below)  # choice 0 lasts one step
-            for j in range(1, c):
-                total = total + at(messages, t, below + j) * at(rows.termination, t, whole(of.ends, d) + 2 * j - 1)
-            put(messages, t, above, total)
-            below += c
-
-
-@jit
-def _down(t: int, rows: Rows, messages: Plane, spread: Plane, of: Shape) -> None:
-    """Fill row t of ``spread`` for levels D + 1 to 2."""
-    depth = of.depth
-    put(spread, t, whole(of.starts, depth), at(messages, t, whole(of.starts, depth)))
-    for d in range(depth - 1, 0, -1):
-        c, below = whole(of.sizes, d), whole(of.starts, d)
-        for above in range(whole(of.starts, d + 1), whole(of.starts, d + 2)):
-            mass, first = at(spread, t, above), whole(of.callers, above)
-            if first < 0:
-                put(spread, t, below, mass)
-                for j in range(1, c):
-                    put(spread, t, below + j, 0.0)
-            else:
-                put(spread, t, below, mass * at(rows.selection, t, first))
-                for j in range(1, c):
-                    kept = at(messages, t, below + j) * at(rows.termination, t, whole(of.ends, d) + 2 * j - 2)
-                    put(spread, t, below + j, mass * at(rows.selection, t, first + j) + kept)
-            below += c
-
-
-@jit
-def _act(t: int, rows: Rows, messages: Plane, spread: Plane, of: Shape) -> Any:
-    """Fill level 1 of row t + 1 of ``messages``, not yet normalised, and return its sum: the last step of
-    :func:`_down`, times the likelihood of the control.
-    """
-    c, below, total = whole(of.sizes, 0), 0, lanes(0.0)
-    weighted = rows.choice.columns > 0
-    for above in range(whole(of.starts, 1), whole(of.starts, 2)):
-        mass, first = at(spread, t, above), whole(of.callers, above)
-        message = mass * at(rows.control, t, whole(of.actors, below))
-        if weighted:
-            message = message * at(rows.choice, t, below)
-        if first < 0:
-            for j in range(1, c):
-                put(messages, t + 1, below + j, 0.0)
-        else:
-            message = message * at(rows.selection, t, first)
-            for j in range(1, c):
-                kept = at(messages, t, below + j) * at(rows.termination, t, 2 * j - 2)
-                option = (mass * at(rows.selection, t, first + j) + kept) * at(rows.control, t, j)
-                if weighted:
-                    option = option * at(rows.choice, t, below + j)
-                put(messages, t + 1, below + j, option)
-                total = total + option
-        put(messages, t + 1, below, message)
-        total = total + message
-        below += c
+@inner
+def _act(
+    semiring: int, t: int, row: int, rows: Array, columns: int, messages: Array, spread: Array, actors: Array
+) -> float:
+    """Fill level 1 of ``messages[t + 1]``: the mass of each joint choice and the control at t. Its sum."""
+    zero, weighted = 0.0 if semiring == SUM else -np.inf, rows.shape[1] > columns
+    total = zero
+    for s in range(len(actors)):
+        mass = zero
+        if actors[s] >= 0:
+            mass = _times(semiring, spread[t, s], rows[row, actors[s]])
+            if weighted:
+                mass = _times(semiring, mass, rows[row, columns + s])
+            total = _plus(semiring, total, mass)
+        messages[t + 1, s] = mass
     return total
 
 
-@jit
-def _forward(lot: Lot, own: Run) -> Any:
-    """Fill a block of ``messages``, ``spread`` and ``scale``; its log-likelihood, NaN where a step leaves no mass."""
-    rows, messages, spread, scale, of = own.rows, own.messages, own.spread, own.scale, own.of
-    apart()
-    value = lanes(0.0)
-    for t in range(lot.begin, lot.end):
-        if t > 0:
-            _up(t, rows, messages, of)
-        _down(t, rows, messages, spread, of)
-        total = _act(t, rows, messages, spread, of)
-        total = where(_alive(lot, t), total, 1.0)
-        value = value + where(total < SMALL, np.nan, logarithm(total))
-        inverse = 1.0 / total
-        put(scale, t, 0, inverse)
-        for s in range(of.joint):
-            put(messages, t + 1, s, at(messages, t + 1, s) * inverse)
-    return value
-
-
-@jit
-def _alive(lot: Lot, t: int) -> Any:
-    """The lanes whose trajectory has a step t."""
-    return float(t) < lot.own
-
-
-# --- backward ---------------------------------------------------------------------------------------------------------
-
-
-@jit
-def _add(rows: Plane, t: int, column: int, value: Any) -> None:
-    put(rows, t, column, at(rows, t, column) + value)
-
-
-@jit
+@inner
 def _adjoint_act(
-    t: int, i: int, rows: Rows, messages: Plane, spread: Plane, scale: Plane, back: Plane, sums: Rows, of: Shape
-) -> Any:
-    """Adjoint of :func:`_act` except for the kept mass; returns Σ_s α_t(s) β_t(s).
-
-    ``back`` holds β_t at level 1. It becomes the adjoint of the mass that came down and, at level 2, of ``spread``.
-
-    :param i: the row of ``sums``.
-    """
-    c, below, total = whole(of.sizes, 0), 0, lanes(0.0)
-    weighted = rows.choice.columns > 0
-    inverse = at(scale, t, 0)
-    for above in range(whole(of.starts, 1), whole(of.starts, 2)):
-        actor, first = whole(of.actors, below), whole(of.callers, above)
-        both = at(messages, t + 1, below) * at(back, 0, below)
-        total = total + both
-        _add(sums.control, i, actor, both)
-        over = at(back, 0, below) * at(rows.control, t, actor) * inverse
-        if weighted:
-            over = over * at(rows.choice, t, below)
-        if first >= 0:
-            mass = at(spread, t, above)
-            over = over * at(rows.selection, t, first)
-            _add(sums.selection, i, first, mass * over)
-            for j in range(1, c):
-                both = at(messages, t + 1, below + j) * at(back, 0, below + j)
-                total = total + both
-                _add(sums.control, i, j, both)
-                here = at(back, 0, below + j) * at(rows.control, t, j) * inverse
-                if weighted:
-                    here = here * at(rows.choice, t, below + j)
-                put(back, 0, below + j, here)
-                term = here * at(rows.selection, t, first + j)
-                over = over + term
-                _add(sums.selection, i, first + j, mass * term)
-        put(back, 0, above, over)
-        below += c
+    t: int, row: int, scale: float, rows: Array, columns: int, messages: Array, back: Array, posterior: Array,
+    actors: Array, choices: Array,
+) -> float:  # fmt: skip
+    """Adjoint of :func:`_act`: level 1 of ``back`` goes from β_t to the adjoint of ``spread``. Σ_s α_t(s) β_t(s)."""
+    total, weighted, marginals = 0.0, rows.shape[1] > columns, posterior.shape[1] > columns
+    for s in range(len(actors)):
+        if actors[s] < 0:
+            back[s] = 0.0
+        else:
+            both = messages[t + 1, s] * back[s]
+            total += both
+            posterior[row, actors[s]] += both
+            if marginals:
+                for d in range(choices.shape[1]):
+                    posterior[row, choices[s, d]] += both
+            back[s] *= rows[row, actors[s]] * scale
+            if weighted:
+                back[s] *= rows[row, columns + s]
     return total
 
 
-@jit
-def _adjoint_down(t: int, i: int, rows: Rows, spread: Plane, back: Plane, sums: Rows, of: Shape) -> None:
-    """Adjoint of the selections in :func:`_down`: ``back`` of levels 3 to D + 1 from level 2's."""
-    for d in range(1, of.depth):
-        c, below = whole(of.sizes, d), whole(of.starts, d)
-        for above in range(whole(of.starts, d + 1), whole(of.starts, d + 2)):
-            first = whole(of.callers, above)
-            if first < 0:
-                put(back, 0, above, at(back, 0, below))
-            else:
-                mass, total = at(spread, t, above), lanes(0.0)
-                for j in range(c):
-                    term = at(back, 0, below + j) * at(rows.selection, t, first + j)
-                    total = total + term
-                    _add(sums.selection, i, first + j, mass * term)
-                put(back, 0, above, total)
-            below += c
+@inner
+def _adjoint_predict(
+    t: int, row: int, rows: Array, messages: Array, spread: Array, back: Array, posterior: Array, callers: Array,
+    actors: Array,
+) -> None:  # fmt: skip
+    """Adjoint of :func:`_predict`: ``back`` goes from the adjoint of ``spread[t]`` to β of t - 1."""
+    for i in range(len(callers)):
+        below, calls, mass = callers[i, 0], callers[i, 2], spread[t, len(actors) + i]
+        total = back[below]
+        if calls >= 0:
+            total = 0.0
+            for j in range(callers[i, 1]):
+                term = back[below + j] * rows[row, calls + j]
+                total += term
+                posterior[row, calls + j] += mass * term
+        back[len(actors) + i] = total
+    if t > 0:
+        for i in range(len(callers) - 1, -1, -1):
+            below, ends, over = callers[i, 0], callers[i, 3], back[len(actors) + i]
+            back[below] = over
+            for j in range(1, callers[i, 1]):
+                keeping, ending = ends + 2 * j - 2, ends + 2 * j - 1
+                kept, ended, mass = (
+                    back[below + j] * rows[row, keeping],
+                    over * rows[row, ending],
+                    messages[t, below + j],
+                )
+                posterior[row, keeping] += mass * kept
+                posterior[row, ending] += mass * ended
+                back[below + j] = kept + ended
 
 
-@jit
-def _adjoint_up(t: int, i: int, rows: Rows, messages: Plane, back: Plane, sums: Rows, of: Shape) -> None:
-    """Adjoint of :func:`_up` and of the kept mass in :func:`_down`: ``back`` becomes that of row t of ``messages``."""
-    for d in range(of.depth - 1, -1, -1):
-        c, below = whole(of.sizes, d), whole(of.starts, d)
-        for above in range(whole(of.starts, d + 1), whole(of.starts, d + 2)):
-            over = at(back, 0, above)
-            put(back, 0, below, over)
-            for j in range(1, c):
-                column = whole(of.ends, d) + 2 * (j - 1)
-                mass = at(messages, t, below + j)
-                keeping = at(back, 0, below + j) * at(rows.termination, t, column)
-                stopping = over * at(rows.termination, t, column + 1)
-                _add(sums.termination, i, column, mass * keeping)
-                _add(sums.termination, i, column + 1, mass * stopping)
-                put(back, 0, below + j, keeping + stopping)
-            below += c
+@entry
+def eliminate(
+    first: int, last: int, steps: int, lengths: Array, rows: Array, posterior: Array, value: Array, exact: Array,
+    messages: Array, spread: Array, scales: Array, back: Array, columns: int, callers: Array, actors: Array,
+    choices: Array, above: Array,
+) -> None:  # fmt: skip
+    """Of trajectories ``first`` to ``last``, fill ``value``, ``exact`` and the posteriors, which are 0 before.
 
+    Each step is scaled to a mass of 1. Underflow there matters only where the past makes next to impossible what the
+    future demands. Then Σ_s α_t(s) β_t(s) is not 1, and the trajectory is not ``exact``.
 
-@jit
-def _backward(lot: Lot, own: Run) -> Any:
-    """Fill the posteriors of a block; the lanes in which Σ_s α_t(s) β_t(s) = 1 at every step.
-
-    Only underflow can change this sum.
+    :param steps: T.
+    :param rows: probabilities.
+    :param value: log p(ξ), [N]; ``exact`` likewise.
+    :param messages: room, as ``spread``, ``scales`` [T] and ``back`` [M].
     """
-    rows, messages, spread, scale = own.rows, own.messages, own.spread, own.scale
-    back, sums, of = own.back, own.sums, own.of
-    apart()
-    exact = lanes(0.0) == 0.0
-    for t in range(lot.end - 1, lot.begin - 1, -1):
-        i = t - lot.begin
-        if sums.choice.columns:
-            for s in range(of.joint):
-                if whole(of.actors, s) >= 0:
-                    for d in range(of.depth):
-                        _add(
-                            sums.choice, i, whole(of.choices, s * of.depth + d), at(messages, t + 1, s) * at(back, 0, s)
-                        )
-        total = _adjoint_act(t, i, rows, messages, spread, scale, back, sums, of)
-        exact = exact & (absolute(total - 1.0) <= TOLERANCE)  # NaN is not
-        _adjoint_down(t, i, rows, spread, back, sums, of)
-        if t > 0:
-            _adjoint_up(t, i, rows, messages, back, sums, of)
-        if t >= whole(lot.lengths, 0):  # gradients add up over steps
-            alive = _alive(lot, t)
-            for plane in (sums.selection, sums.termination, sums.control):
-                for column in range(plane.columns):
-                    put(plane, i, column, where(alive, at(plane, i, column), 0.0))
-    for s in range(back.columns):  # an overflow at t = 0 shows nowhere else
-        exact = exact & (at(back, 0, s) <= LARGE)
-    return exact
+    for n in range(first, last):
+        _begin(SUM, messages)
+        found, good = 0.0, True
+        for t in range(lengths[n]):
+            row = n * steps + t
+            _predict(SUM, t, row, rows, messages, spread, callers, actors)
+            total = _act(SUM, t, row, rows, columns, messages, spread, actors)
+            good = good and total >= SMALL
+            found += math.log(total)
+            scales[t] = 1.0 / total
+            for s in range(len(actors)):
+                messages[t + 1, s] *= scales[t]
+        for i in range(len(back)):
+            back[i] = 1.0
+        for t in range(lengths[n] - 1, -1, -1):
+            row = n * steps + t
+            both = _adjoint_act(t, row, scales[t], rows, columns, messages, back, posterior, actors, choices)
+            good = good and abs(both - 1.0) <= TOLERANCE  # NaN is not
+            _adjoint_predict(t, row, rows, messages, spread, back, posterior, callers, actors)
+        for i in range(len(back)):  # an overflow at t = 0 shows nowhere else
+            good = good and back[i] <= LARGE
+        value[n], exact[n] = found, good
 
 
-# --- whole trajectories -----------------------------------------------------------------------------------------------
+@inner
+def _share(semiring: int, part: float, whole: float) -> float:
+    """The probability of a part of the mass, of logarithms; of a part of the maximum, 1 where it is the maximum."""
+    if semiring == LARGEST:
+        return 1.0 if part == whole else 0.0
+    return math.exp(part - whole)
 
 
-@jit
-def _fill(lot: Lot, own: Run) -> Any:
-    """Fill a block of rows; the sum of the logarithms that densities of controls are scaled by.
+@inner
+def _back(
+    semiring: int, total: float, m: int, n: int, length: int, steps: int, rows: Array, messages: Array, spread: Array,
+    uniforms: Array, joint: Array, ended: Array, callers: Array, actors: Array, above: Array,
+) -> None:  # fmt: skip
+    """Fill a path from its last step to its first.
 
-    A step past a trajectory's length keeps every choice and emits nothing, so it changes no probability. A step without
-    a finite largest density is not scaled.
+    A number uniform in [0, 1) takes the first part of the mass up to which the shares sum to more.
     """
-    tasks, evidence, kept, rows, room, of = own.tasks, own.evidence, own.kept, own.rows, own.room, own.of
-    apart()
-    choices, columns = rows.choice.columns, rows.control.columns
-    for t in range(lot.begin, lot.end):
-        for j in range(columns):
-            put(rows.control, t, j, 0.0)
-    for i in range(tasks.number):
-        fill(task(tasks.address, i), lot, tasks.constants, kept, rows, room)
-    if evidence.address != 0:
-        take(evidence, lot, whole(of.starts, 1), np.intp(1), room.raw)
-        for t in range(lot.begin, lot.end):
-            for s in range(whole(of.starts, 1)):
-                if choices > 0:
-                    put(rows.choice, t, s, exponential(at(room.raw, t - lot.begin, s)))
-                else:  # a choice of the only level has a column among the controls
-                    put(rows.control, t, s, at(rows.control, t, s) + at(room.raw, t - lot.begin, s))
-    for t in range(max(lot.begin, whole(lot.lengths, 0)), lot.end):
-        _rest(t, lot, rows, of)
-    shift = lanes(0.0)
-    for t in range(lot.begin, lot.end):
-        top = at(rows.control, t, 0)
-        for j in range(1, columns):
-            x = at(rows.control, t, j)
-            top = where(top < x, x, top)
-        top = where(absolute(top) < np.inf, top, 0.0)
-        shift = shift + top
-        for j in range(columns):
-            put(rows.control, t, j, exponential(at(rows.control, t, j) - top))
-    return shift
+    entry, left = 0, uniforms[m, n, length, 0]
+    for s in range(len(actors)):
+        left -= _share(semiring, messages[length, s], total)
+        if left < 0:
+            entry = s
+            break
+    for t in range(length - 1, -1, -1):
+        row, level = n * steps + t, 0
+        joint[m, n, t] = entry
+        while entry < len(above):
+            i = above[entry] - len(actors)
+            j = entry - callers[i, 0]
+            if t > 0 and j > 0:
+                kept = messages[t, entry] + rows[row, callers[i, 3] + 2 * j - 2]
+                if uniforms[m, n, t, level] < _share(semiring, kept, spread[t, entry]):
+                    break
+            entry = above[entry]
+            level += 1
+        ended[m, n, t] = level
+        for d in range(level - 1 if t > 0 else -1, -1, -1):
+            i, mass, left = entry - len(actors), messages[t, entry], uniforms[m, n, t, uniforms.shape[3] // 2 + d]
+            entry = callers[i, 0]
+            for j in range(callers[i, 1]):
+                part = messages[t, callers[i, 0] + j]
+                if j > 0:
+                    part += rows[row, callers[i, 3] + 2 * j - 1]
+                left -= _share(semiring, part, mass)
+                if left < 0:
+                    entry = callers[i, 0] + j
+                    break
 
 
-@jit
-def _rest(t: int, lot: Lot, rows: Rows, of: Shape) -> None:
-    """Have the lanes whose trajectory is over keep every choice and emit nothing."""
-    apart()
-    alive = _alive(lot, t)
-    for j in range(rows.selection.columns):
-        put(rows.selection, t, j, where(alive, at(rows.selection, t, j), 0.0))
-    for above in range(whole(of.starts, 1), whole(of.starts, of.depth + 1)):
-        first = whole(of.callers, above)
-        if first >= 0:
-            put(rows.selection, t, first, where(alive, at(rows.selection, t, first), 1.0))
-    for j in range(rows.termination.columns):
-        put(rows.termination, t, j, where(alive, at(rows.termination, t, j), 1.0 - j % 2))
-    for j in range(rows.control.columns):
-        put(rows.control, t, j, where(alive, at(rows.control, t, j), 0.0))
-    for s in range(rows.choice.columns):
-        put(rows.choice, t, s, where(alive, at(rows.choice, t, s), 1.0))
+@entry
+def trace(
+    first: int, last: int, steps: int, semiring: int, lengths: Array, rows: Array, uniforms: Array, joint: Array,
+    ended: Array, possible: Array, messages: Array, spread: Array, columns: int, callers: Array, actors: Array,
+    choices: Array, above: Array,
+) -> None:  # fmt: skip
+    """Of trajectories ``first`` to ``last``, fill the ``joint`` choices [M, N, T] of M paths, and how many levels
+    ``ended`` before each. Paths are the most likely one (:data:`LARGEST`), or draws from p(ζ | ξ) (:data:`LOG_SUM`).
 
+    ``possible`` [N] says which trajectories have a probability above 0; nothing is filled for others.
 
-@jit
-def _clear(plane: Plane, steps: int) -> None:
-    apart()
-    for t in range(steps):
-        for j in range(plane.columns):
-            put(plane, t, j, 0.0)
-
-
-@releasing
-def eliminate(first: int, last: int, of_run: int) -> None:
-    """Of lots ``first`` to ``last``, fill what is found, and write the posteriors and gradients that tasks ask for.
-
-    :param of_run: address of a :class:`Run`.
+    :param steps: T.
+    :param rows: log-probabilities.
+    :param uniforms: numbers uniform in [0, 1), [M, N, 1 + T, 2·D]; zeros for the most likely path.
     """
-    own = run(of_run, 0)
-    lots, tasks, of = own.lots, own.tasks, own.of
-    rows, sums, total, messages = own.rows, own.sums, own.total, own.messages
-    shared = total.columns - 2
-    for lot_number in range(first, last):
-        who, lengths = lots.trajectories + 8 * LANES * lot_number, lots.lengths + 8 * LANES * lot_number
-        steps = whole(lengths, LAST)
-        for s in range(messages.columns):
-            put(messages, 0, s, 0.0)
-            put(own.back, 0, s, 1.0)  # level 1: β
-        put(messages, 0, whole(of.starts, of.depth), 1.0)  # at t = 0 everything is selected
-        for lane in range(LANES):
-            write(total.address, lane, float(whole(lengths, lane)))
-        until = at(total, 0, 0)
-        _clear(total, np.intp(1))
-        value, exact = lanes(0.0), lanes(0.0) == 0.0
-        for begin in range(0, steps, BLOCK):
-            lot = Lot(who, lengths, begin, min(begin + BLOCK, steps), until)
-            value = value + _fill(lot, own)
-            value = value + _forward(lot, own)
-        for begin in range((steps - 1) // BLOCK * BLOCK, -1, -BLOCK):
-            lot = Lot(who, lengths, begin, min(begin + BLOCK, steps), until)
-            for plane in (sums.selection, sums.termination, sums.control, sums.choice):
-                _clear(plane, np.intp(BLOCK))
-            exact = exact & _backward(lot, own)
-            for i in range(tasks.number):
-                slope(task(tasks.address, i), lot, tasks.constants, own.kept, rows, sums, total, own.room)
-            if own.marginals.address != 0:
-                give(own.marginals, lot, sums.choice.columns, np.intp(1), sums.choice)
-        put(total, 0, shared, value)
-        put(total, 0, shared + 1, where(exact, 1.0, 0.0))
-        for lane in range(LANES):
-            if whole(lengths, lane) > 0:
-                row = whole(who, lane)
-                for column in range(shared + 2):
-                    one = number(total.address, column * LANES + lane)
-                    write(own.found, row * (shared + 2) + column, one)
+    for n in range(first, last):
+        _begin(semiring, messages)
+        total = -np.inf
+        for t in range(lengths[n]):
+            row = n * steps + t
+            _predict(semiring, t, row, rows, messages, spread, callers, actors)
+            total = _act(semiring, t, row, rows, columns, messages, spread, actors)
+        possible[n] = total > -np.inf
+        if possible[n]:
+            for m in range(len(joint)):
+                _back(
+                    semiring, total, m, n, lengths[n], steps, rows, messages, spread, uniforms, joint, ended, callers,
+                    actors, above,
+                )  # fmt: skip

@@ -14,14 +14,11 @@ from functools import reduce
 from operator import add
 from typing import Any, Protocol, Self
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import logsigmoid, one_hot, pad
 from torch.special import ndtr
 
-from ddco_pyro.model.links import Link
-from ddco_pyro.model.passes import CATEGORIES, NORMAL, SWITCHES, Pass
 from ddco_pyro.model.tables import NEVER
 
 LOG_2PI = math.log(2 * math.pi)
@@ -110,10 +107,6 @@ class Emission(ABC):
             found.extend(tensor for tensor in own if tensor.is_floating_point())
         return tuple(found)
 
-    @abstractmethod
-    def passes(self, actions: Tensor) -> list[Pass]:
-        """Compiled passes that add up to log π(a | s) of controls [N, T, A]; their tensors are :meth:`tensors`."""
-
     def _fields(self) -> dict[str, Any]:
         return {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
 
@@ -142,24 +135,6 @@ class Gaussian(Emission):
         weight = (-0.5 / self.std.square()).to(self.mean.dtype)
         error = actions.to(self.mean.dtype).unsqueeze(-2) - self.mean
         return (error.square() * weight).sum(-1) - constant.to(self.mean.dtype)
-
-    def passes(self, actions: Tensor) -> list[Pass]:
-        """The density; log σ and 1/σ of a σ that steps share are computed once."""
-        return [self._pass(actions)]
-
-    def _pass(self, actions: Tensor, hurdle: bool = False) -> Pass:
-        callers, size = self.shape[-2:]
-        std, units = self.std.detach().double().numpy(), self.log_scale.detach().numpy() + 0.5 * LOG_2PI
-        by_step = 2 if std.ndim > 2 else 1
-        many, constants = callers * size, np.empty(2 * (callers + 1) * size)
-        inverse, constant = constants[: 2 * many].reshape(2, callers, size)
-        inverse[:], constant[:] = (1.0, units) if by_step > 1 else (1 / std, np.log(std) + units)
-        constants[-2 * size : -size], constants[-size:] = self._bounds()
-        return Pass(NORMAL, callers, size, self.tensors(), int(hurdle), actions, constants, many, by_step, 4 * many)
-
-    def _bounds(self) -> tuple[Any, Any]:
-        """The lower and the upper bound of each dimension, [A] or one for all."""
-        return -np.inf, np.inf
 
     @property
     def mode(self) -> Tensor:
@@ -220,9 +195,6 @@ class Clipped(Gaussian):
         """The sum over dimensions, float64 [..., K]."""
         return self.by_dimension(actions).sum(-1)
 
-    def _bounds(self) -> tuple[Any, Any]:
-        return self.low.detach().numpy(), self.high.detach().numpy()
-
     @property
     def mode(self) -> Tensor:
         """μ within the bounds: the control without noise."""
@@ -266,11 +238,6 @@ class Hurdle(Emission):
         """log p at the value, log (1 - p) and the slab's log-density elsewhere, [..., K]."""
         at = _at_value(actions)
         return self._part(at.unsqueeze(-1)).squeeze(-1) + torch.where(at, 0.0, self.slab.log_density(actions))
-
-    def passes(self, actions: Tensor) -> list[Pass]:
-        """The switch between the parts, and the slab's density where the control is not at the value."""
-        switch = Pass(SWITCHES, self.shape[-2], 1, (self.logit,), self.shape[-1], actions, kept=self.shape[-2])
-        return [switch, self.slab._pass(actions, hurdle=True)]
 
     def _part(self, at: Tensor) -> Tensor:
         """The log-probability of being at the value, or of not being there, [..., K, 1]."""
@@ -317,11 +284,6 @@ class Binary(Emission):
         actions = actions.unsqueeze(-2)
         position = logsigmoid(torch.where(actions > 0.5, self.logits, -self.logits))
         return torch.where((actions == 0) | (actions == 1), position, NEVER)
-
-    def passes(self, actions: Tensor) -> list[Pass]:
-        """The log-probabilities of the positions."""
-        callers, size = self.shape[-2:]
-        return [Pass(SWITCHES, callers, size, (self.logits,), 0, actions, kept=callers * size)]
 
     @property
     def mode(self) -> Tensor:
@@ -371,12 +333,6 @@ class Categorical(Emission):
         index = actions.argmax(-1, keepdim=True) if bool(self.rows) else actions.clamp(0, classes - 1).long()
         meant = one_hot(index.squeeze(-1), classes) if bool(self.rows) else index
         return index, (actions == meant).all(-1, keepdim=True)
-
-    def passes(self, actions: Tensor) -> list[Pass]:
-        """The log-softmax of the action's index, which is below 0 where there is no such action."""
-        (index, possible), (callers, size) = self._index(actions), self.logits.shape[-2:]
-        index = torch.where(possible, index, -1).double()
-        return [Pass(CATEGORIES, callers, size, (self.logits,), 0, index, kept=callers * size)]
 
     def log_density(self, actions: Tensor) -> Tensor:
         """log π(a | s), [..., K]."""
@@ -431,10 +387,6 @@ class Product(Emission):
         """Those of the groups."""
         return tuple(tensor for _, emission in self.groups for tensor in emission.tensors())
 
-    def passes(self, actions: Tensor) -> list[Pass]:
-        """Those of the groups."""
-        return [own for dims, emission in self.groups for own in emission.passes(actions[..., dims])]
-
     @property
     def mode(self) -> Tensor:
         """The most likely control of each group."""
@@ -472,30 +424,6 @@ class Product(Emission):
         """The groups' values [..., K, A_g] in the order of the dimensions."""
         order = torch.tensor([dimension for dimensions, _ in self.groups for dimension in dimensions]).argsort()
         return torch.cat(list(values), dim=-1)[..., order]
-
-
-class Density(Link):
-    """log π(a | s) of K callers, for controls [N, T, A] without a gradient."""
-
-    def __init__(self, emission: Emission, actions: Tensor) -> None:
-        self.emission, self.actions = emission, actions
-        self.inputs, self.shape = emission.tensors(), emission.shape[:-1]
-
-    def formula(self) -> Tensor:
-        """[N, T, K]."""
-        return self.emission.log_density(self.actions)
-
-    def map(self, change: Callable[[Tensor], Tensor]) -> Density:
-        """The density of changed outputs and controls."""
-
-        def changed(tensor: Tensor) -> Tensor:
-            return change(tensor) if tensor.is_floating_point() else tensor
-
-        return Density(self.emission.map(changed), change(self.actions))
-
-    def passes(self) -> list[Pass]:
-        """Those of the emission."""
-        return self.emission.passes(self.actions)
 
 
 TAIL = -30.0

@@ -7,11 +7,29 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
+from torch.nn.functional import logsigmoid, pad
 
-from ddco_pyro.model.emissions import Density, Emission
-from ddco_pyro.model.links import Link, LinkedTables, LogTable, Selection, Termination
-from ddco_pyro.model.tables import NEVER, always_ending
+from ddco_pyro.model.emissions import Emission
+from ddco_pyro.model.tables import NEVER, Tables, always_ending
+
+TERMINATION_BOUND = 12.0
+"""Termination logits lie within ±12 (ψ between 6e-6 and 1 - 6e-6), so no path's probability is ever exactly 0."""
+
+
+def bounded(logits: Tensor) -> Tensor:
+    """Termination logits within ±``TERMINATION_BOUND``, by a scaled tanh."""
+    return TERMINATION_BOUND * torch.tanh(logits / TERMINATION_BOUND)
+
+
+def log_selection(logits: Tensor, control: int) -> Tensor:
+    """Log-softmax over the last dimension, after ``control`` (0 or 1) impossible choices."""
+    return pad(logits.log_softmax(-1), (control, 0), value=NEVER)
+
+
+def log_termination(logits: Tensor) -> Tensor:
+    """(log(1 - ψ), log ψ) [..., 2] of logits, which are bounded first."""
+    within = bounded(logits)
+    return logsigmoid(torch.stack([-within, within], dim=-1))
 
 
 @dataclass(frozen=True)
@@ -39,19 +57,11 @@ class CallerOutputs:
         return self.logits.shape[:-1]
 
     @property
-    def selection(self) -> Tensor | None:
-        """log η [N, T, K, 1 + k]; None without options."""
-        link = self.selection_link
-        return None if link is None else link.table
-
-    @property
-    def selection_link(self) -> Link | None:
-        """log η, not computed."""
-        if not self.options:
-            return None
-        if self.logits is not None:
-            return Selection(self.logits, 1 + self.options - self.logits.shape[-1])
-        return LogTable(pad(torch.zeros(*self.shape, 1), (0, self.options), value=NEVER))
+    def selection(self) -> Tensor:
+        """log η [N, T, K, 1 + k] of callers with options below them."""
+        if self.logits is None:
+            return pad(torch.zeros(*self.shape, 1), (0, self.options), value=NEVER)
+        return log_selection(self.logits, 1 + self.options - self.logits.shape[-1])
 
     def map(self, change: Callable[[Tensor], Tensor]) -> CallerOutputs:
         """The outputs of changed tensors."""
@@ -62,14 +72,12 @@ class CallerOutputs:
             None if self.numbers is None else change(self.numbers),
         )
 
-    def density_link(self, actions: Tensor) -> Link:
-        """log π(a | s) of each caller, [N, T, K], not computed; -inf for a caller that emits no control."""
-        if self.emission is None:
-            assert self.logits is not None  # a caller emits something
-            return LogTable(self.logits.new_tensor(NEVER).expand(self.logits.shape[:-1]), log=True)
-        if actions.requires_grad:
-            return LogTable(self.emission.log_density(actions), log=True)
-        return Density(self.emission, actions)
+    def log_density(self, actions: Tensor) -> Tensor:
+        """log π(a | s) of each caller, [N, T, K]; -inf for a caller that emits no control."""
+        if self.emission is not None:
+            return self.emission.log_density(actions)
+        assert self.logits is not None  # a caller emits something
+        return self.logits.new_tensor(NEVER).expand(self.shape)
 
 
 @dataclass(frozen=True)
@@ -92,19 +100,14 @@ class Outputs:
     @property
     def termination(self) -> tuple[Tensor, ...]:
         """(log(1 - ψ), log ψ) of each level, [N, T, k, 2]."""
-        return tuple(link.table for link in self._termination_links())
-
-    def _termination_links(self) -> tuple[Link, ...]:
         levels = zip(self.callers, self.termination_logits, strict=False)  # the meta-policy has none
-        return tuple(
-            LogTable(always_ending(level.shape)) if logit is None else Termination(logit) for level, logit in levels
-        )
+        return tuple(always_ending(level.shape) if logit is None else log_termination(logit) for level, logit in levels)
 
-    def tables(self, actions: Tensor | None = None) -> LinkedTables:
+    def tables(self, actions: Tensor | None = None) -> Tables:
         """The tables for controls [N, T, A] in scaled units; without them, of selections and terminations alone."""
-        selection = (caller.selection_link for caller in self.callers)
-        control = () if actions is None else tuple(caller.density_link(actions) for caller in self.callers)
-        return LinkedTables(tuple(link for link in selection if link is not None), self._termination_links(), control)
+        selection = tuple(caller.selection for caller in self.callers if caller.options)
+        control = () if actions is None else tuple(caller.log_density(actions) for caller in self.callers)
+        return Tables(selection, self.termination, control)
 
     def tensors(self) -> list[Tensor]:
         """All outputs of the networks, each [N, T, ...]."""

@@ -12,15 +12,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 NEVER = -torch.inf
 """Log-probability of an impossible event: a true zero, not a small number."""
-
-Group = Literal["selection", "termination", "control"]
 
 
 @dataclass(frozen=True)
@@ -46,21 +44,17 @@ class Tables:
     @property
     def depth(self) -> int:
         """The number D of option levels; 0 is a flat policy."""
-        return len(self.parts("selection"))
+        return len(self.selection)
 
     @property
     def sizes(self) -> tuple[int, ...]:
         """C_d = 1 + k_d of each level, lowest first."""
-        return tuple(part.shape[-1] for part in self.parts("selection"))
+        return tuple(table.shape[-1] for table in self.selection)
 
     @property
     def steps(self) -> int:
         """T, padding included."""
-        return int((self.parts("selection") or self.parts("control"))[-1].shape[1])
-
-    def parts(self, group: Group) -> tuple[Any, ...]:
-        """The tables of a group, or what they are computed from, in the tables' shapes."""
-        return tuple(getattr(self, group))
+        return int((self.selection or self.control)[-1].shape[1])
 
     @classmethod
     def of(cls, depth: int, leaves: Sequence[Tensor | None]) -> Tables:

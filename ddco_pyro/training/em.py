@@ -26,9 +26,8 @@ from torch.nn.functional import softplus
 
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Caller, Hierarchy
-from ddco_pyro.model.links import TERMINATION_BOUND, bounded
 from ddco_pyro.model.networks.perceptrons import Mlp, StackedLinear
-from ddco_pyro.model.outputs import CallerOutputs, Outputs
+from ddco_pyro.model.outputs import TERMINATION_BOUND, CallerOutputs, Outputs, bounded
 from ddco_pyro.model.tables import Tables
 from ddco_pyro.spec import RidgeSpec
 
@@ -380,14 +379,15 @@ class Expectation:
             top = CallerOutputs(levels[-1].count, uniform, None)
         outputs = Outputs((*(callers[f"{name}.policy"] for name in named), top), tuple(logits))
         tables = outputs.tables(piece.actions)
-        probes = tables.probe()
         value = self._score(tables, piece, rows)
-        leaves = [*said.values(), *stds.values(), *probes.leaves()]
-        gradients = iter(torch.autograd.grad(value, [leaf for leaf in leaves if leaf is not None], allow_unused=True))
-        of = {name: next(gradients) for name in said}
-        of_std = {name: next(gradients) for name in stds}
-        depth = len(levels)
-        chosen, ended, acted = (tuple(next(gradients) for _ in range(size)) for size in (depth, depth, depth + 1))
+        every_leaf = *said.values(), *stds.values(), *tables.leaves()
+        wanted = [leaf for leaf in every_leaf if leaf is not None and leaf.requires_grad]
+        found = dict(zip(map(id, wanted), torch.autograd.grad(value, wanted, allow_unused=True), strict=True))
+        of, of_std = ({name: found[id(leaf)] for name, leaf in leaves.items()} for leaves in (said, stds))
+        chosen, ended, acted = (
+            tuple(found.get(id(table)) for table in group)
+            for group in (tables.selection, tables.termination, tables.control)
+        )
         every = [*(f"{name}.policy" for name in named), *([] if self._discovering else ["meta_policy"])]
         choosing = [name for name in every if callers[name].options]
         selection = dict(zip(choosing, chosen, strict=False))
@@ -408,13 +408,13 @@ class Expectation:
                 groups.extend(emitted)
             sums[name].add_gradient(xs[self._networks[name].reads].x, of[name], of_std.get(name))
             learned[name] = groups
-        for place, prefix in enumerate(named):
+        for prefix, end in zip(named, ended, strict=True):
             name = f"{prefix}.termination"
-            if name in sums and of[name] is not None:
+            if name in sums and of[name] is not None and end is not None:
                 within = bounded(said[name].detach())
                 slope = 1 - (within / TERMINATION_BOUND).square()
                 ending = within.sigmoid()
-                weight = ended[place].sum(-1, keepdim=True) * ending * (1 - ending) * slope.square()
+                weight = end.sum(-1, keepdim=True) * ending * (1 - ending) * slope.square()
                 sums[name].add_gradient(xs[self._networks[name].reads].x, of[name], None)
                 learned[name] = [Information(slice(0, 1), weight)]
         for reads, x in xs.items():
