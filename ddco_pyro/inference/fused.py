@@ -90,12 +90,17 @@ def posteriors(tables: Tables, lengths: Tensor, marginals: bool = False) -> Elim
     :param marginals: whether those of the choices are wanted, too.
     """
     with torch.no_grad():
-        alive = torch.arange(tables.steps) < lengths[:, None]
+        number, steps = len(lengths), tables.steps
+        alive = torch.arange(steps) < lengths[:, None]
         if not tables.depth:
             value = logspace.log_likelihood(complete(tables, lengths))
             return Elimination(value, Tables((), (), (alive.double().unsqueeze(-1),)), ())
-        structure, (number, steps) = Structure.of(tables.sizes), alive.shape
-        rows, shift = _probabilities(tables, structure, alive)
+        structure, rows = Structure.of(tables.sizes), logarithms(tables)
+        shift = torch.zeros(number, dtype=torch.float64)
+        controls = 1 + sum(tables.sizes) - tables.depth
+        for scaled in (rows[..., structure.columns - controls : structure.columns], rows[..., structure.columns :]):
+            shift += _scale(scaled, alive)
+        rows.exp_()
         columns = structure.columns + (sum(tables.sizes) if marginals else 0)
         found = torch.zeros(number, steps, columns, dtype=torch.float64)
         given = lengths.numpy(), rows.flatten(0, 1).numpy(), found.flatten(0, 1).numpy()
@@ -116,8 +121,12 @@ def posteriors(tables: Tables, lengths: Tensor, marginals: bool = False) -> Elim
 def logarithms(tables: Tables) -> Tensor:
     """The tables of all levels side by side, in the columns of :class:`~ddco_pyro.inference.kernel.Structure`."""
     evidence = tables.joint_evidence()
-    each = [*_side_by_side(tables), *([] if evidence is None else [evidence])]
-    return torch.cat([table.detach().flatten(2).double() for table in each], -1)
+    each = [*_side_by_side(tables), *([] if evidence is None else [evidence.flatten(2)])]
+    sizes = [table.shape[2:].numel() for table in each]
+    rows = torch.empty(*each[0].shape[:2], sum(sizes), dtype=torch.float64)
+    for place, table in zip(rows.split(sizes, -1), each, strict=True):
+        place.unflatten(2, table.shape[2:]).copy_(table.detach())
+    return rows
 
 
 def _side_by_side(tables: Tables) -> list[Tensor]:
@@ -125,20 +134,13 @@ def _side_by_side(tables: Tables) -> list[Tensor]:
     return [*tables.selection, *tables.termination, meta_policy, *levels]
 
 
-def _probabilities(tables: Tables, structure: Structure, alive: Tensor) -> tuple[Tensor, Tensor]:
-    """Rows of probabilities; and the logarithms, [N], that the controls and choices of each trajectory are scaled by.
-
-    A step is scaled by its largest entry, where that is finite.
-    """
-    rows, shift = logarithms(tables), torch.zeros(len(alive), dtype=torch.float64)
-    first = structure.columns - tables.control[-1].shape[-1] - sum(tables.sizes) + tables.depth
-    for scaled in (rows[..., first : structure.columns], rows[..., structure.columns :]):
-        if scaled.shape[-1]:
-            top = scaled.amax(-1, keepdim=True)
-            top = torch.where(top.isfinite(), top, 0.0)
-            shift += torch.where(alive, top.squeeze(-1), 0.0).sum(1)
-            scaled -= top
-    return rows.exp_(), shift
+def _scale(logarithms: Tensor, alive: Tensor) -> Tensor | float:
+    """Scale steps so that the largest entry is 0, where it is finite; the sum of the scales of each trajectory, [N]."""
+    if not logarithms.shape[-1]:
+        return 0.0
+    top = logarithms.amax(-1, keepdim=True).nan_to_num_(0.0, 0.0, 0.0)
+    logarithms -= top
+    return (top.squeeze(-1) * alive).sum(1)
 
 
 def _split(tables: Tables, rows: Tensor, marginals: bool) -> tuple[Tables, tuple[Tensor, ...]]:

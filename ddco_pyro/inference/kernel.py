@@ -34,6 +34,9 @@ IMPOSSIBLE = -1
 TOLERANCE = 1e-9
 """Allowed error of Σ_s α_t(s) β_t(s) = 1. Rounding changes the sum by less than 1e-12 over 10 000 steps."""
 
+ROUNDED = 1e-7
+"""Products of the masses of steps above it are multiplied on, since the logarithm of each takes longer."""
+
 SMALL, LARGE = 1e-300, 1e300
 """Mass of a step, and backward messages, beyond which a trajectory is done in log space."""
 
@@ -112,7 +115,7 @@ def on_threads(run: Callable[[int, int], object], lengths: Array) -> None:
         list(pool.map(run, bounds[:-1], bounds[1:]))
 
 
-inner = numba.njit(error_model="numpy", fastmath={"contract"})
+inner = numba.njit(error_model="numpy", fastmath={"contract"}, inline="always")
 entry = numba.njit(error_model="numpy", fastmath={"contract"}, nogil=True, cache=True)
 
 SUM, LOG_SUM, LARGEST = range(3)
@@ -264,13 +267,16 @@ def eliminate(
     """
     for n in range(first, last):
         _begin(SUM, messages)
-        found, good = 0.0, True
+        found, product, good = 0.0, 1.0, True
         for t in range(lengths[n]):
             row = n * steps + t
             _predict(SUM, t, row, rows, messages, spread, callers, actors)
             total = _act(SUM, t, row, rows, columns, messages, spread, actors)
             good = good and total >= SMALL
-            found += math.log(total)
+            product *= total
+            if not product > ROUNDED:  # logarithms are slow; NaN is not larger
+                found += math.log(product)
+                product = 1.0
             scales[t] = 1.0 / total
             for s in range(len(actors)):
                 messages[t + 1, s] *= scales[t]
@@ -283,7 +289,7 @@ def eliminate(
             _adjoint_predict(t, row, rows, messages, spread, back, posterior, callers, actors)
         for i in range(len(back)):  # an overflow at t = 0 shows nowhere else
             good = good and back[i] <= LARGE
-        value[n], exact[n] = found, good
+        value[n], exact[n] = found + math.log(product), good
 
 
 @inner

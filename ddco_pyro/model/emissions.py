@@ -126,15 +126,32 @@ class Gaussian(Emission):
 
     def by_dimension(self, actions: Tensor) -> Tensor:
         """log N(a_d; μ_d, σ_d²), [..., K, A]."""
-        error = (actions.unsqueeze(-2) - self.mean) / self.std
-        return -0.5 * (error.square() + LOG_2PI) - self.std.log() - self.log_scale
+        return self._each(actions).unflatten(-1, self.shape[-2:])
 
     def log_density(self, actions: Tensor) -> Tensor:
         """log N(a; μ, σ²), [..., K]."""
-        constant = self.std.log().sum(-1) + 0.5 * LOG_2PI * self.std.shape[-1] + self.log_scale.sum(-1)
-        weight = (-0.5 / self.std.square()).to(self.mean.dtype)
-        error = actions.to(self.mean.dtype).unsqueeze(-2) - self.mean
-        return (error.square() * weight).sum(-1) - constant.to(self.mean.dtype)
+        callers, size = self.shape[-2:]
+        return self._each(actions) @ torch.eye(callers, dtype=self.mean.dtype).repeat_interleave(size, 0)
+
+    def _each(self, actions: Tensor) -> Tensor:
+        """:meth:`by_dimension`, [..., K·A]: products with zeros and ones take a fifth of the time of broadcasting."""
+        return self._scored(self._errors(actions))
+
+    def _scored(self, errors: Tensor) -> Tensor:
+        return -0.5 * errors.square() - self._wide(self.std.log() + self.log_scale + 0.5 * LOG_2PI)
+
+    def _errors(self, actions: Tensor) -> Tensor:
+        """(a_d - μ_d) / σ_d, [..., K·A]."""
+        return (self._repeated(actions) - self.mean.flatten(-2)) * self._wide(1 / self.std)
+
+    def _repeated(self, actions: Tensor) -> Tensor:
+        """[..., A] for each caller, [..., K·A]."""
+        callers, size = self.shape[-2:]
+        return actions.to(self.mean.dtype) @ torch.eye(size, dtype=self.mean.dtype).repeat(1, callers)
+
+    def _wide(self, values: Tensor) -> Tensor:
+        """[A], [K, A] or [..., K, A] as [..., K·A]."""
+        return values.expand(*values.shape[:-2], *self.shape[-2:]).flatten(-2).to(self.mean.dtype)
 
     @property
     def mode(self) -> Tensor:
@@ -179,21 +196,14 @@ class Clipped(Gaussian):
     low: Tensor
     high: Tensor
 
-    def by_dimension(self, actions: Tensor) -> Tensor:
-        """log N(a_d; μ_d, σ_d²) within the bounds, log Φ of what lies beyond on a bound, float64 [..., K, A]."""
-        actions, mean, std = actions.double().unsqueeze(-2), self.mean.double(), self.std.double()
-        inside = -0.5 * (((actions - mean) / std).square() + LOG_2PI) - std.log() - self.log_scale
-        below, above = actions <= self.low, actions >= self.high
-        if not bool((below | above).any()):
-            return inside
-        at = (below | above).expand(inside.shape).nonzero(as_tuple=True)  # Φ is computed on bounds alone
-        low, high, mean, std = (values.expand(inside.shape)[at] for values in (self.low, self.high, mean, std))
-        beyond = torch.where(below.expand(inside.shape)[at], low - mean, mean - high) / std
-        return inside.index_put(at, log_ndtr(beyond))
-
-    def log_density(self, actions: Tensor) -> Tensor:
-        """The sum over dimensions, float64 [..., K]."""
-        return self.by_dimension(actions).sum(-1)
+    def _each(self, actions: Tensor) -> Tensor:
+        """log N(a_d; μ_d, σ_d²) within the bounds, log Φ of what lies beyond on a bound, [..., K·A]."""
+        side = self._repeated((actions <= self.low).float() - (actions >= self.high).float()).flatten()
+        on = side.nonzero().squeeze(1)  # log Φ is computed on bounds alone
+        errors = self._errors(actions.clamp(self.low, self.high))
+        mass = log_ndtr(errors.flatten().index_select(0, on) * side[on]).to(errors.dtype)
+        each = self._scored(errors)
+        return each.flatten().index_copy(0, on, mass).reshape(each.shape)
 
     @property
     def mode(self) -> Tensor:
@@ -427,13 +437,19 @@ class Product(Emission):
 
 
 TAIL = -30.0
-"""Below, log Φ is computed by its asymptotic series: torch's own loses its gradient to rounding from -1e8 on."""
+"""Below, log Φ is computed by its asymptotic series: erfc ends at -37."""
 
 
 def log_ndtr(values: Tensor) -> Tensor:
-    """log Φ(x) in float64, with a gradient that is finite however small x is; float32 gives NaN in training."""
+    """log Φ(x) in float64, with a gradient that is finite however small x is.
+
+    torch's own takes ten times as long, gives NaN in float32, and loses its gradient to rounding from -1e8 on.
+    """
     x = values.double()
+    within = (0.5 * torch.erfc(x.clamp(min=TAIL) * -math.sqrt(0.5))).log()
+    if not bool((x < TAIL).any()):
+        return within
     tail = x.clamp(max=TAIL)
     r = tail.square().reciprocal()
     series = -0.5 * tail.square() - (-tail).log() - 0.5 * LOG_2PI + (-r * (1 - 3 * r * (1 - 5 * r))).log1p()
-    return torch.where(x < TAIL, series, torch.special.log_ndtr(x.clamp(min=TAIL)))
+    return torch.where(x < TAIL, series, within)
