@@ -63,9 +63,7 @@ def test_at_first_it_is_the_same_everywhere(network):
     for caller in hierarchy(batch.inputs).callers[:1]:
         torch.testing.assert_close(caller.emission.std, torch.full((*batch.inputs.batch, 2, 2), INITIAL_STD))
         assert caller.emission.mean.std() > 0.01
-        gradient = torch.autograd.grad(
-            caller.log_density(batch.actions).sum(), hierarchy.levels[0].policy.parameters()
-        )
+        gradient = torch.autograd.grad(caller.log_density(batch.actions).sum(), hierarchy.levels[0].policy.parameters())
         assert all((slope != 0).any() for slope in gradient if slope.shape[-1] == 4)
 
 

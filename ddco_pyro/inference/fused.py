@@ -93,8 +93,8 @@ def posteriors(tables: Tables, lengths: Tensor, marginals: bool = False) -> Elim
         number, steps = len(lengths), tables.steps
         alive = torch.arange(steps) < lengths[:, None]
         if not tables.depth:
-            value = logspace.log_likelihood(complete(tables, lengths))
-            return Elimination(value, Tables((), (), (alive.double().unsqueeze(-1),)), ())
+            alone = logspace.log_likelihood(complete(tables, lengths))
+            return Elimination(alone, Tables((), (), (alive.double().unsqueeze(-1),)), ())
         structure, rows = Structure.of(tables.sizes), logarithms(tables)
         shift = torch.zeros(number, dtype=torch.float64)
         controls = 1 + sum(tables.sizes) - tables.depth
@@ -164,7 +164,7 @@ def _repeat_in_log_space(tables: Tables, n: int, length: int, elimination: Elimi
         chain = complete(Tables.of(tables.depth, leaves), torch.tensor([length]))
         value = logspace.log_likelihood(chain)
         assert chain.emission is not None  # log_likelihood has scored it
-        needed = leaves[: 3 * tables.depth + 1]
+        needed = [leaf for leaf in leaves[: 3 * tables.depth + 1] if leaf is not None]  # all of them
         *each, joint = torch.autograd.grad(value.sum(), [*needed, chain.emission], materialize_grads=True)
     elimination.value[n] = value.detach()[0]
     for into, posterior in zip(elimination.tables.leaves(), each, strict=True):

@@ -116,7 +116,9 @@ def on_threads(run: Callable[[int, int], object], lengths: Array) -> None:
 
 
 inner = numba.njit(error_model="numpy", fastmath={"contract"}, inline="always")
-entry = numba.njit(error_model="numpy", fastmath={"contract"}, nogil=True, cache=True)
+entry: Callable[[Callable[..., None]], Callable[..., None]] = numba.njit(  # numba's own type knows no unpacking
+    error_model="numpy", fastmath={"contract"}, nogil=True, cache=True
+)
 
 SUM, LOG_SUM, LARGEST = range(3)
 """Semirings: sums of probabilities; sums, and maxima, of their logarithms."""
