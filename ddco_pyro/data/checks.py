@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal
 
+import h5py
 import numpy as np
 
 from ddco_pyro.data.controls import number
@@ -133,8 +134,8 @@ def reading(shape: tuple[int, ...], dtype: np.dtype[Any] = PICTURES) -> tuple[Li
 
 
 def _no_numbers(dtype: np.dtype[Any]) -> str:
-    kind = "text" if dtype.kind in "STU" else "text or other objects" if dtype.kind == "O" else str(dtype)
-    return f"holds {kind}, not numbers"
+    text = dtype.kind in "STU" or h5py.check_string_dtype(dtype)
+    return f"holds {'text' if text else 'text or other objects' if dtype.kind == 'O' else dtype}, not numbers"
 
 
 def problem_of_controls(shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
