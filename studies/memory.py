@@ -2,8 +2,8 @@
 
     python studies/memory.py
 
-Both differences of every comparison, by the tables that ``needle.yaml``, ``pushing.yaml``,
-``pushing_test.yaml``, ``arena.yaml`` and ``bins.yaml`` keep. ``ddco-pyro study render`` quotes the pages' numbers.
+Both differences of every comparison, by the tables that ``needle.yaml``, ``pushing.yaml``, ``pushing_test.yaml``,
+``arena.yaml`` and ``bins.yaml`` keep. ``ddco-pyro study render`` quotes the numbers of the pages.
 """
 
 from __future__ import annotations
