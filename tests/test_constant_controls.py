@@ -133,11 +133,9 @@ def test_the_controller_emits_them(whole: Fit, reduced: Fit, control: str) -> No
 def test_the_monitor_takes_whole_controls(whole: Fit, reduced: Fit) -> None:
     monitors, control = (whole.monitor(), reduced.monitor()), None
     for observation in observations():
-        beliefs = [
+        for monitor, columns in zip(monitors, (slice(None), FREE), strict=True):
             monitor.step(observation, None if control is None else control[columns])
-            for monitor, columns in zip(monitors, (slice(None), FREE), strict=True)
-        ]
-        torch.testing.assert_close(*(one.levels for one in beliefs), rtol=0, atol=0)
+        torch.testing.assert_close(*(monitor.belief.levels for monitor in monitors), rtol=0, atol=0)
         control = controls(np.random.default_rng(1), 1)[0]
     assert monitors[0].log_likelihood == monitors[1].log_likelihood != 0
 

@@ -134,7 +134,7 @@ def read_all(fit: Fit, metrics: Metrics) -> None:
     if found:
         rollouts.measures_table(found.methods), rollouts.paired_table(found.methods, metrics.model)
         console.successes(metrics)
-    console.log_likelihoods(metrics)
+    console.log_likelihoods(again)
 
 
 @pytest.mark.parametrize("every", [9, pytest.param(1, marks=pytest.mark.slow)])

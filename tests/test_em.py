@@ -418,7 +418,7 @@ def test_ridges_are_raised_where_demonstrations_are_few_for_their_observations(t
     fallen = fitted(bimanual(20), ("training.optimizer.ridge.cross_validated", False))
     held, many = fitted(bimanual(20)), fitted(pick_and_place(30))
     assert fallen.training.raised_ridge is many.training.raised_ridge is None
-    assert words.verdict(fallen).startswith("DDCO fell apart")
+    assert words.verdict(fallen).startswith("Options fell apart")
     assert held.training.raised_ridge >= 30
     assert f"ridge {held.training.raised_ridge:g}" in words.effort(held.training)
     assert held.log_likelihood_per_step.valid > fallen.log_likelihood_per_step.valid + 50

@@ -423,8 +423,8 @@ def test_the_verdict_is_honest(mean, error, held_out, said):
 @pytest.mark.parametrize(
     ("ours", "flat", "first", "concludes"),
     [
-        ((16.5, -9.7), (15.9, 15.4), "DDCO fell apart on held-out demonstrations: −9.70 nats per step there,", False),
-        ((-17.0, -409.0), (-3.0, -3.3), "DDCO fell apart on held-out demonstrations: −409.00 nats", False),
+        ((16.5, -9.7), (15.9, 15.4), "Options fell apart on held-out demonstrations: −9.70 nats per step there,", False),
+        ((-17.0, -409.0), (-3.0, -3.3), "Options fell apart on held-out demonstrations: −409.00 nats", False),
         ((2.0, 1.0), (2.0, 1.4), "DDCO is below flat by 0.40 ± 0.05 nats per step on held-out", True),
         ((2.0, 1.0), (9.0, 0.5), "Flat fell apart on held-out demonstrations: 0.50 nats per step there, 9.00", True),
     ],

@@ -30,13 +30,14 @@ def run_lengths(choices: Iterable[np.ndarray], count: int) -> list[np.ndarray]:
     >>> run_lengths([np.array([1, 1, 2, 1]), np.array([2, 2])], 2)
     [array([], dtype=int64), array([1, 2]), array([1, 2])]
 
-    :param choices: of each demonstration, [T].
+    :param choices: of each demonstration [T], -1 past its end.
     """
     found: list[list[int]] = [[] for _ in range(1 + count)]
     for row in choices:
-        starts = np.flatnonzero(np.diff(row, prepend=-1))
-        for start, length in zip(starts, np.diff(starts, append=len(row)), strict=True):
-            found[row[start]].append(int(length))
+        known = row[row >= 0]
+        starts = np.flatnonzero(np.diff(known, prepend=-1))
+        for start, length in zip(starts, np.diff(starts, append=len(known)), strict=True):
+            found[known[start]].append(int(length))
     return [np.sort(np.array(lengths, int)) for lengths in found]
 
 

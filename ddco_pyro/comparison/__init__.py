@@ -198,7 +198,7 @@ def _check_measure(first: Fit, second: Fit) -> None:
         scored, left = (first, second) if dimension in ours else (second, first)
         raise CompareError(
             f"{first.place} and {second.place} score different things: control dimension {dimension} is in the "
-            f"likelihood of {scored} and not in that of {left}; fit both to the same demonstrations, "
+            f"likelihood of {scored.place} and not in that of {left.place}; fit both to the same demonstrations, "
             "with the same version"
         )
     if different := difference(first.hierarchy.scaling.parts, second.hierarchy.scaling.parts):
