@@ -122,7 +122,7 @@ def test_a_minari_episode_that_is_not_whole(tmp_path: Path) -> None:
             file[f"episode_{index}/infos/one"] = 1.0
         file.create_dataset("episode_1/actions", (9, 2), "f8", chunks=(4, 2))[:4] = 1.0
     with pytest.raises(DemonstrationsError, match=r"episode_1/actions claims 144 bytes, but the file holds 64"):
-        Minari(tmp_path, Storage(), False).recording("demo_1")
+        Minari(tmp_path, Storage(), False, ()).recording("demo_1")
 
 
 def test_a_damaged_file_is_said_by_another_process() -> None:

@@ -25,7 +25,7 @@ from ddco_pyro.report.activity import Activity, LevelActivity, activity, bins
 from ddco_pyro.report.options import row_order, shares, terminations
 from ddco_pyro.simulation.episodes import Episode, paired_difference, summarize
 from ddco_pyro.simulation.film import write_film
-from ddco_pyro.spec import parse_spec
+from ddco_pyro.spec import TrainingSpec, parse_spec
 from ddco_pyro.training.data import demonstrations, parts
 
 LINEAR = {"network": "linear"}
@@ -189,7 +189,7 @@ def test_the_top_of_the_page_is_a_verdict_skills_and_a_few_time_lines(labelled, 
     assert {("learning", True), ("dimensions", True), ("demonstrations", True), ("likelihood", True)} < set(names)
     header = re.search("<header>.*?</header>", page, re.DOTALL)[0]
     fitted = datetime.fromtimestamp((found.folder / "model.safetensors").stat().st_mtime)
-    assert "<h1>demos.hdf5 <small>DDCO, " in header
+    assert "<h1>demos.hdf5 <small>options, " in header
     assert f"{found.folder.name}, fitted {fitted:%Y-%m-%d %H:%M}</small>" in header
     assert f'<p class="verdict">{words.headline(found.metrics)}</p>' in header
     nmi = words.number(found.metrics.agreement.valid[0].nmi)
@@ -423,9 +423,14 @@ def test_the_verdict_is_honest(mean, error, held_out, said):
 @pytest.mark.parametrize(
     ("ours", "flat", "first", "concludes"),
     [
-        ((16.5, -9.7), (15.9, 15.4), "Options fell apart on held-out demonstrations: −9.70 nats per step there,", False),
+        (
+            (16.5, -9.7),
+            (15.9, 15.4),
+            "Options fell apart on held-out demonstrations: −9.70 nats per step there,",
+            False,
+        ),
         ((-17.0, -409.0), (-3.0, -3.3), "Options fell apart on held-out demonstrations: −409.00 nats", False),
-        ((2.0, 1.0), (2.0, 1.4), "DDCO is below flat by 0.40 ± 0.05 nats per step on held-out", True),
+        ((2.0, 1.0), (2.0, 1.4), "Options are below flat by 0.40 ± 0.05 nats per step on held-out", True),
         ((2.0, 1.0), (9.0, 0.5), "Flat fell apart on held-out demonstrations: 0.50 nats per step there, 9.00", True),
     ],
 )
@@ -437,7 +442,8 @@ def test_a_fit_that_fell_apart_comes_first(ours, flat, first, concludes, capsys)
         comparison={"flat": compared(ours[1] - flat[1], 0.05, train=flat[0], valid=flat[1])},
         worth={"memory": {"nats_per_step": 0.5, "standard_error": 0.1}},
     )
-    console.log_likelihoods(metrics)
+    spec = SimpleNamespace(hierarchy=None, control=SimpleNamespace(learned_stds={}))
+    console.log_likelihoods(SimpleNamespace(name="ddco", spec=spec, baselines={}, metrics=metrics))
     for said in (words.verdict(metrics), capsys.readouterr().out):
         assert first in said
         assert ("explain held-out controls better" in said) == concludes
@@ -447,12 +453,12 @@ def test_a_fit_that_fell_apart_comes_first(ours, flat, first, concludes, capsys)
 
 def test_like_warnings_are_one_with_a_list():
     """Of nineteen unused options the ten least used; a finding alone is a sentence of its own."""
-    use = {"selected": 1.0, "demonstrations": 1.0, "duration": 9.0}
+    use = {"selected": 1.0, "demonstrations": 1.0, "duration": 9.0, "segments": 1, "steps": 9, "length": 9.0}
     options = [[use | {"choice": h, "share": 0.0005 * h if h < 20 else 0.2} for h in range(24)]]
     pairs = [[{"options": (20, 21), "divergence": 0.01}]]
     levels = [SimpleNamespace(name="skill", lasts=True)]
     fit = SimpleNamespace(
-        spec=SimpleNamespace(hierarchy=SimpleNamespace(levels=levels)),
+        spec=SimpleNamespace(hierarchy=SimpleNamespace(levels=levels), training=TrainingSpec()),
         names={"skill": []},
         metrics=made_metrics(options=options, divergences=pairs),
     )

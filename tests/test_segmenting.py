@@ -37,7 +37,7 @@ from ddco_pyro.segmenting import LevelLabels, Segmented, Segments, recorded, seg
 from ddco_pyro.segmenting.baselines import BASELINES, segment
 from ddco_pyro.segmenting.formats import Asked
 from ddco_pyro.segmenting.formats.lerobot import Annotated
-from ddco_pyro.spec import ObservationSpec, parse_spec
+from ddco_pyro.spec import ObservationSpec, PathSpec, parse_spec
 from ddco_pyro.training.data import demonstrations
 from ddco_pyro.training.data import parts as split_in_parts
 
@@ -225,9 +225,10 @@ def test_numbers_follow_the_cursor(toy_run, written):
 
 def test_every_control_follows_the_cursor():
     arm = {"arm": np.zeros((4, 20)), "hand": np.arange(12.0).reshape(4, 3)}
-    (numbers,) = (found["n"]["names"] for found in following([Demonstration("a", arm, np.eye(4, 14))], [], 4, "hand"))
+    hand = [PathSpec(key="hand")]
+    (numbers,) = (found["n"]["names"] for found in following([Demonstration("a", arm, np.eye(4, 14))], [], 4, hand))
     assert numbers == [f"hand[{n}]" for n in range(3)] + [f"control[{n}]" for n in range(14)]
-    (numbers,) = (found["n"]["names"] for found in following([Demonstration("a", arm, np.eye(4, 2))], [], 4, None))
+    (numbers,) = (found["n"]["names"] for found in following([Demonstration("a", arm, np.eye(4, 2))], [], 4, []))
     assert numbers == ["control[0]", "control[1]", *(f"arm[{n}]" for n in range(10))]
 
 

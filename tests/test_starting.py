@@ -190,7 +190,7 @@ def test_pictures_alone_are_seen_by_one_network(tmp_path: Path) -> None:
     assert list(fit.baselines) == ["mixture", "flat_equal"]
     assert (
         stds(fit)
-        == "DDCO and mixture have one σ for each option; flat of equal size has a σ that depends on the state."
+        == "Options and mixture have one σ for each option; flat of equal size has a σ that depends on the state."
     )
 
 

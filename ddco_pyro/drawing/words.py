@@ -191,7 +191,7 @@ def caution(metrics: Metrics) -> str:
     flats = {name: metrics.comparison[name].difference for name in FLAT if name in metrics.comparison}
     ours = capital(method(metrics.model))
     lowest = min(flats, key=lambda name: flats[name].nats_per_step, default=None)
-    below = {} if lowest is None else {ours: (method(lowest), flats[lowest])}
+    below = {} if lowest is None else {capital(ours): (method(lowest), flats[lowest])}
     values = {capital(method(name)): _of_parts(one.log_likelihood_per_step) for name, one in metrics.methods.items()}
     return cautions(values, below, len(metrics.valid))
 
@@ -223,8 +223,8 @@ def cautions(
         if _direction(difference, held_out) < 0 or difference.nats_per_step < -FAR:
             by = f"{number(-difference.nats_per_step)} ± {number(difference.standard_error)}"
             said.append(
-                f"{name} is below {flat} by {by} nats per step on held-out demonstrations. Take {flat}, or "
-                "compare numbers of options and their networks by cross-validation (ddco-pyro select)."
+                f"{name} {verb(name, 'are', 'is')} below {flat} by {by} nats per step on held-out demonstrations. "
+                f"Take {flat}, or compare numbers of options and their networks by cross-validation (ddco-pyro select)."
             )
     return " ".join(said)
 

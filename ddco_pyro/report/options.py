@@ -333,10 +333,11 @@ def terminations(level: LevelActivity, gathered: Bins) -> np.ndarray:
 def segmented(fit: Fit, activity: Activity) -> Segmented:
     """The segments in the order of ``demonstrations_by_likelihood``, with its numbers."""
     found = {demo.name: demo for demo in activity.segmented.segments}
+    entries = {one.name: one for one in fit.metrics.demonstrations_by_likelihood}  # held out, where it trains too
     ordered = [
-        replace(found[one.name], log_likelihood=one.log_likelihood_per_step[fit.name], held_out=one.part == "valid")
-        for one in fit.metrics.demonstrations_by_likelihood
-        if one.name in found
+        replace(found[name], log_likelihood=one.log_likelihood_per_step[fit.name], held_out=one.part == "valid")
+        for name, one in entries.items()
+        if name in found
     ]
     return replace(activity.segmented, segments=tuple(ordered))
 
