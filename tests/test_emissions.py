@@ -11,12 +11,12 @@ import torch
 from hierarchies import make_batch, make_hierarchy
 from oracle import brute_force
 from pyro.infer import Predictive
-from scipy import stats
+from scipy import special, stats
 
 from ddco_pyro.inference import enumeration, log_likelihood
 from ddco_pyro.inference.engines import compare_engines
 from ddco_pyro.model.ahmm import Acting, ahmm
-from ddco_pyro.model.emissions import Binary, Categorical, Clipped, Gaussian, Hurdle, Product
+from ddco_pyro.model.emissions import Binary, Categorical, Clipped, Gaussian, Hurdle, Product, log_ndtr
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
 from ddco_pyro.model.tables import complete
 
@@ -300,6 +300,19 @@ def test_gradients_are_finite_differences(kind):
     leaves = [tensor.clone().requires_grad_() for tensor in emission.tensors() if learned(tensor)]
     assert torch.autograd.gradcheck(density, leaves)
     torch.testing.assert_close(emission.by_dimension(actions).sum(-1), emission.log_density(actions))
+
+
+def test_log_of_the_normal_distribution_function():
+    x = np.concatenate([np.linspace(-60, 12, 2001), [-1e9, -1e4, -30.0, 0.0, 40.0]])
+    values = torch.tensor(x, requires_grad=True)
+    found = log_ndtr(values)
+    (slope,) = torch.autograd.grad(found.sum(), values)
+    truth = special.log_ndtr(x)
+    np.testing.assert_allclose(found.detach(), truth, rtol=1e-12, atol=1e-15)
+    near = np.abs(x) < 1e3
+    ratio = np.exp(stats.norm.logpdf(x[near]) - truth[near])
+    np.testing.assert_allclose(slope[near], ratio, rtol=1e-8)
+    np.testing.assert_allclose(slope[~near], -x[~near], rtol=1e-7)  # φ / Φ goes to -x
 
 
 @pytest.mark.parametrize("kind", ["binary", "categorical", "rows"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import torch
 from hierarchies import make_batch, make_hierarchy
 from oracle import brute_force, random_tables
 
+import ddco_pyro
 from ddco_pyro import inference
 from ddco_pyro.errors import BadInput
 from ddco_pyro.inference import log_likelihood, posterior, segment
@@ -123,6 +125,12 @@ def test_threads_change_no_bit(counts, hybrid):
     assert sorted(parts) == [(0, 2), (0, 2), (0, 5), (2, 5), (2, 5)]  # 7604 steps are worth two threads
     for others in found[1:]:
         assert all(torch.equal(one, other) for one, other in zip(found[0], others, strict=True))
+
+
+def test_compiled_code_is_in_one_file():
+    """numba keeps compiled entry points as long as their own file is unchanged."""
+    root = Path(ddco_pyro.__file__).parent
+    assert [path.name for path in root.rglob("*.py") if "import numba" in path.read_text()] == ["kernel.py"]
 
 
 # --- the online filter ------------------------------------------------------------------------------------------------

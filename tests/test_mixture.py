@@ -192,10 +192,10 @@ def test_levels_above_start_from_segments_without_memory_too():
 def test_a_prior_on_durations_says_nothing_of_them():
     tables = [make_hierarchy((2, 2), memoryless=levels).tabulate(make_batch()).termination for levels in ([], [1])]
     prior = DurationSpec.model_validate({"mean": 3.0})
-    whole, lasting = (log_duration_prior(termination, make_batch().lengths, prior).sum() for termination in tables)
-    above = log_duration_prior(tables[1][1:], make_batch().lengths, prior).sum()
-    assert float(lasting) == pytest.approx(float(above))
-    assert float(lasting) != pytest.approx(float(whole))
+    whole, lasting = (log_duration_prior(each, make_batch().lengths, prior).sum().item() for each in tables)
+    above = log_duration_prior(tables[1][1:], make_batch().lengths, prior).sum().item()
+    assert lasting == pytest.approx(above)
+    assert lasting != pytest.approx(whole)
 
 
 @pytest.fixture(scope="module")

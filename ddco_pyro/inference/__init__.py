@@ -36,9 +36,9 @@ segment = checked(paths.segment)
 
 
 def compile_all() -> None:
-    """Compile the passes, or read them from numba's cache, before other processes look for them there.
+    """Compile the recursions, or read them from the cache on disk, before other processes look for them there.
 
-    Compiling takes 10 CPU seconds, once for each installation.
+    Compiling takes 5 CPU seconds, once for each installation.
     """
     half, one = torch.zeros(1, 1, 1, 2).log_softmax(-1), torch.ones(1, dtype=torch.int64)
     tables = Tables((half,), (half,), (half[..., 0], half[..., 1]))

@@ -93,8 +93,8 @@ def posteriors(tables: Tables, lengths: Tensor, marginals: bool = False) -> Elim
         number, steps = len(lengths), tables.steps
         alive = torch.arange(steps) < lengths[:, None]
         if not tables.depth:
-            alone = logspace.log_likelihood(complete(tables, lengths))
-            return Elimination(alone, Tables((), (), (alive.double().unsqueeze(-1),)), ())
+            sums = logspace.log_likelihood(complete(tables, lengths))
+            return Elimination(sums, Tables((), (), (alive.double().unsqueeze(-1),)), ())
         structure, rows = Structure.of(tables.sizes), logarithms(tables)
         shift = torch.zeros(number, dtype=torch.float64)
         controls = 1 + sum(tables.sizes) - tables.depth
@@ -103,13 +103,13 @@ def posteriors(tables: Tables, lengths: Tensor, marginals: bool = False) -> Elim
         rows.exp_()
         columns = structure.columns + (sum(tables.sizes) if marginals else 0)
         found = torch.zeros(number, steps, columns, dtype=torch.float64)
-        given = lengths.numpy(), rows.flatten(0, 1).numpy(), found.flatten(0, 1).numpy()
         value, exact = np.empty(number), np.empty(number, np.bool_)
+        given = lengths.numpy(), rows.flatten(0, 1).numpy(), found.flatten(0, 1).numpy(), value, exact
 
         def some(first: int, last: int) -> None:
-            longest, size = int(lengths[first:last].max()), len(structure.above) + 1
+            longest, size = int(lengths[first:last].max()), structure.entries
             room = np.empty((longest + 1, size)), np.empty((longest, size)), np.empty(longest), np.empty(size)
-            kernel.eliminate(first, last, steps, *given, value, exact, *room, *structure)
+            kernel.eliminate(first, last, steps, *given, *room, structure.columns, *structure.tables)
 
         kernel.on_threads(some, given[0])
         elimination = Elimination(torch.from_numpy(value) + shift, *_split(tables, found, marginals))
@@ -164,7 +164,7 @@ def _repeat_in_log_space(tables: Tables, n: int, length: int, elimination: Elimi
         chain = complete(Tables.of(tables.depth, leaves), torch.tensor([length]))
         value = logspace.log_likelihood(chain)
         assert chain.emission is not None  # log_likelihood has scored it
-        needed = [leaf for leaf in leaves[: 3 * tables.depth + 1] if leaf is not None]  # all of them
+        needed = [leaf for leaf in leaves[: 3 * tables.depth + 1] if leaf is not None]
         *each, joint = torch.autograd.grad(value.sum(), [*needed, chain.emission], materialize_grads=True)
     elimination.value[n] = value.detach()[0]
     for into, posterior in zip(elimination.tables.leaves(), each, strict=True):

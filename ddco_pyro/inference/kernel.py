@@ -94,6 +94,16 @@ class Structure(NamedTuple):
         choices = np.ascontiguousarray(columns + digits + _offsets(sizes)[:-1])
         return cls(columns, np.concatenate(callers), actors, choices, np.concatenate(above))
 
+    @property
+    def entries(self) -> int:
+        """M."""
+        return len(self.above) + 1
+
+    @property
+    def tables(self) -> tuple[Array, Array, Array, Array]:
+        """The arrays, as compiled functions take them."""
+        return self.callers, self.actors, self.choices, self.above
+
 
 def _offsets(sizes: Sequence[int]) -> Array:
     """Where each of consecutive parts begins, and where the last one ends."""

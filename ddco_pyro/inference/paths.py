@@ -93,9 +93,9 @@ def _trace(tables: Tables, lengths: Tensor, semiring: int, uniforms: np.ndarray)
     given = lengths.numpy(), logarithms(tables).flatten(0, 1).numpy(), uniforms, joint, ended, possible
 
     def some(first: int, last: int) -> None:
-        longest, size = int(lengths[first:last].max()), len(structure.above) + 1
+        longest, size = int(lengths[first:last].max()), structure.entries
         room = np.empty((longest + 1, size)), np.empty((longest, size))
-        kernel.trace(first, last, tables.steps, semiring, *given, *room, *structure)
+        kernel.trace(first, last, tables.steps, semiring, *given, *room, structure.columns, *structure.tables)
 
     kernel.on_threads(some, given[0])
     refuse_impossible(torch.from_numpy(possible))
