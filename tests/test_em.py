@@ -21,6 +21,7 @@ from ddco_pyro.data.starting import starting_spec
 from ddco_pyro.drawing import words
 from ddco_pyro.inference import log_likelihood
 from ddco_pyro.model.batch import Batch
+from ddco_pyro.model.emissions import KINDS
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import RidgeSpec, SpecError, parse_spec, with_overrides
 from ddco_pyro.training import em
@@ -36,6 +37,7 @@ LEARNED = {"learn": True, "floor": 0.01}
 CLIPPED = (ControlPart("arm", (0, 1), "clipped", (-0.8, -np.inf), (0.9, 1.0)),)
 MIXED = (ControlPart("arm", (0,), "clipped", (-0.8,), (0.9,)), ControlPart("jaw", (1,), "binary", (0.0,), (1.0,)))
 ACTIONS = (ControlPart("action", (0,), "categorical", values=(0.0, 1.0, 2.0)), ControlPart("b", (1,), "gaussian"))
+STUDENT = (ControlPart("arm", (0, 1), "student"),)
 HURDLE = (ControlPart("stop", (0, 1), "hurdle", (-np.inf, -np.inf), (np.inf, np.inf), exact=(0.0, 0.0)),)
 
 
@@ -52,6 +54,8 @@ def batch_for(parts, trajectories=12, steps=9):
                 actions[..., dim] = (drawn > 0).float()
             elif part.kind == "categorical":
                 actions[..., dim] = (drawn + 1).round().clamp(0, 2)
+            elif part.kind == "student":
+                actions[..., dim] = drawn + actions[..., 0] ** 3
             elif part.kind == "hurdle":
                 actions[..., dim] = torch.where(state[..., 2] > 0.3, 0.0, drawn)
     return Batch(batch.inputs, actions, batch.lengths)
@@ -106,7 +110,7 @@ def penalised(model, batch, ridge, discovering=None):
         at, place = logits, 0
         for part in model.scaling.parts if std is not None else ():
             if part.exact or not part.continuous:
-                last = at + (1 if part.exact else part.size)
+                last = at + (1 if part.exact else KINDS[part.kind].size(part))
                 value = value - 0.5 * ridge.gate * parameter[..., at:last].square().sum()
                 at = last
             for _ in part.dims if part.continuous else ():
@@ -118,6 +122,7 @@ def penalised(model, batch, ridge, discovering=None):
                     if place in (*std.own, *std.shared):
                         value = value - parameter.shape[1] * sigma.log().sum()
                 at, place = at + 1, place + 1
+            place += part.kind == "student"  # ν
         if std is not None and std.of_state:
             value = value - 0.5 * ridge.gate * parameter[..., -len(std.of_state) :].square().sum()
     return value
@@ -133,6 +138,9 @@ CASES = {
     "a switch beside": ((2,), MIXED, {"std": LEARNED}),
     "discrete actions": ((2,), ACTIONS, {"std": LEARNED}),
     "a hurdle": ((2,), HURDLE, {"std": {**LEARNED, "per_option": True}}),
+    "heavy tails": ((2,), STUDENT, {"std": {**LEARNED, "per_option": True}, "kind": "student", "freedom": 3}),
+    "heavy tails, freedom learned": ((2,), STUDENT, {"std": LEARNED, "kind": "student", "freedom": "learn"}),
+    "heavy tails, sigma of the state": ((2,), STUDENT, {"std": {**LEARNED, "per_state": True}, "kind": "student"}),
     "two levels": ((3, 2), CLIPPED, {"std": LEARNED}),
     "hybrid, two levels": ((2, 2), None, {"std": LEARNED, "emits": ("options", "control")}),
     "mixture": ((3,), None, {"std": {**LEARNED, "per_option": True}, "memoryless": (1,)}),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pyro
@@ -16,7 +17,9 @@ from scipy import special, stats
 from ddco_pyro.inference import enumeration, log_likelihood
 from ddco_pyro.inference.engines import compare_engines
 from ddco_pyro.model.ahmm import Acting, ahmm
-from ddco_pyro.model.emissions import Binary, Categorical, Clipped, Gaussian, Hurdle, Product, log_ndtr
+from ddco_pyro.model.emissions import Binary, Categorical, Clipped, Gaussian, Hurdle, Product
+from ddco_pyro.model.emissions.clipped import log_ndtr
+from ddco_pyro.model.emissions.student import Student, student_control
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
 from ddco_pyro.model.tables import complete
 
@@ -249,6 +252,12 @@ KINDS = {
     "gaussian, σ of each step": lambda: Gaussian(numbers(2, 3, 2, 2), std_of_steps(), SCALE.log()),
     "clipped, σ of each step": lambda: clipped(numbers(2, 3, 2, 2), std_of_steps()),
     "hurdle, clipped, σ of each step": lambda: hurdle(numbers(2, 3, 2, 1, seed=2), numbers(2, 3, 2, 2), std_of_steps()),
+    "student": lambda: student(STD, torch.tensor([3.0])),
+    "student, own σ and ν": lambda: student(torch.stack([STD, 2 * STD]), torch.tensor([[3.0], [7.0]])),
+    "student, σ of each step": lambda: student(std_of_steps(), torch.tensor([3.0])),
+    "student beside": lambda: Product(
+        (((2, 0), student(STD, torch.tensor([3.0]))), ((1,), Binary(numbers(2, 3, 2, 1, seed=1))))
+    ),
     "binary": lambda: Binary(numbers(2, 3, 2, 2)),
     "categorical": lambda: Categorical(numbers(2, 3, 2, 4), torch.tensor(False)),
     "rows": lambda: Categorical(numbers(2, 3, 2, 4), torch.tensor(True)),
@@ -259,6 +268,10 @@ KINDS = {
     "hurdles": lambda: Product((((1,), one_hurdle(5)), ((0,), one_hurdle(6)))),
     "product": lambda: Product((((2, 0), clipped(numbers(2, 3, 2, 2))), ((1,), Binary(numbers(2, 3, 2, 1, seed=1))))),
 }
+
+
+def student(std, freedom):
+    return Student(numbers(2, 3, 2, 2), std, SCALE.log(), freedom.double())
 
 
 def std_of_steps():
@@ -282,6 +295,7 @@ def actions_of(kind):
         "binary": switches,
         "categorical": index.unsqueeze(-1).double(),
         "rows": torch.nn.functional.one_hot(index, 4).double(),
+        "student beside": torch.stack([reals[..., 1], switches[..., 0], reals[..., 0]], dim=-1),
         "product": torch.stack([reals[..., 1], switches[..., 0], reals[..., 0]], dim=-1),
     }.get(kind, reals if "clipped" in kind else numbers(2, 3, 2, seed=4))
 
@@ -300,6 +314,53 @@ def test_gradients_are_finite_differences(kind):
     leaves = [tensor.clone().requires_grad_() for tensor in emission.tensors() if learned(tensor)]
     assert torch.autograd.gradcheck(density, leaves)
     torch.testing.assert_close(emission.by_dimension(actions).sum(-1), emission.log_density(actions))
+
+
+@pytest.mark.parametrize("kind", ["student", "student, own σ and ν"])
+def test_a_student_is_that_of_scipy(kind):
+    emission, actions = KINDS[kind](), actions_of(kind)
+    scales, nu = emission.std.expand(2, 2) * SCALE, emission.freedom.expand(2, 1)
+    found = emission.log_density(actions)
+    for n, t, k in itertools.product(range(2), range(3), range(2)):
+        truth = stats.multivariate_t(emission.mean[n, t, k] * SCALE, np.diag(scales[k] ** 2), df=float(nu[k, 0]))
+        assert float(found[n, t, k]) == pytest.approx(truth.logpdf(actions[n, t] * SCALE), abs=1e-12)
+
+
+def test_draws_of_a_student_have_its_radius_and_its_controller():
+    """(a - μ)² / σ² over A dimensions is A times an F variate; the export's numpy draws the same."""
+    emission = Student(numbers(1, 2), STD, SCALE.log(), torch.tensor([3.0]).double())
+    noise = torch.randn(4000, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    drawn = emission.draw(noise)[:, 0]
+    radius = ((drawn - emission.mean) / STD).square().sum(-1) / 2
+    assert stats.kstest(radius, stats.f(2, 3).cdf).pvalue > 0.01
+    part = {"scale": [1.0, 1.0], "shift": [0.0, 0.0], "ends": [[], []]}
+    parameters = np.append(STD, 3.0)
+    for own, z in zip(drawn[:200], noise.numpy(), strict=False):
+        np.testing.assert_allclose(student_control(part, emission.mean[0].numpy(), parameters, z), own, rtol=1e-10)
+
+
+def test_what_a_student_expects_to_learn_of_its_freedom_is_the_variance_of_its_slope():
+    nu = torch.tensor([3.5], dtype=torch.float64)
+    emission = Student(torch.zeros(1, 2, dtype=torch.float64), torch.ones(2), torch.zeros(2), nu)
+    drawn = emission.draw(torch.randn(20_000, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)))
+    each = nu.detach().expand(len(drawn), 1, 1).requires_grad_()  # a copy for each control
+    (slopes,) = torch.autograd.grad(replace(emission, freedom=each).log_density(drawn[:, 0]).sum(), each)
+    *_, own = emission.information(torch.ones(1, dtype=torch.float64), drawn[0])
+    assert float((slopes * nu).var()) == pytest.approx(float(own.weight), rel=0.05)
+
+
+def test_the_divergence_of_students_is_at_least_that_of_draws():
+    emission = student(torch.stack([STD, 2 * STD]), torch.tensor([[3.0], [7.0]]))
+    noise = torch.randn(4000, 2, 3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    total = 0.0
+    for i in range(2):
+        drawn = torch.stack([emission.draw(one)[..., i, :] for one in noise])
+        scores = torch.stack([emission.log_density(one) for one in drawn])
+        total = total + 0.5 * (scores[..., i] - scores[..., 1 - i]).mean(0)
+    bound = emission.divergence(0, 1)
+    assert (bound > total - 0.05).all()
+    same = Student(torch.zeros(2, 2), STD, SCALE.log(), torch.tensor([3.0]))
+    assert float(same.divergence(0, 1)) == 0
 
 
 def test_log_of_the_normal_distribution_function():

@@ -14,6 +14,7 @@ from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.controls import control_dimensions, control_parts, described
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.exporting import TOLERANCE, export, runner
+from ddco_pyro.model.emissions import Hurdle
 from ddco_pyro.spec import ControlSpec, load_spec, with_overrides
 
 
@@ -50,10 +51,15 @@ def decided(demos, **control):
 
 def test_dimensions_that_rest_at_once_share_a_probability():
     (together,) = decided(no_ops())
-    assert (together.kind, together.dims, together.exact, together.size) == ("hurdle", (0, 1, 2), (0.0, 0.0, 0.0), 4)
+    assert (together.kind, together.dims, together.exact, Hurdle.size(together)) == (
+        "hurdle",
+        (0, 1, 2),
+        (0.0, 0.0, 0.0),
+        4,
+    )
     assert described([together]) == ["control dimensions 0-2: hurdle (exactly 0 in 49.6 % of the steps)"]
     apart = decided(no_ops(at_once=False))
-    assert [(part.kind, part.dims, part.size) for part in apart] == [("hurdle", (d,), 2) for d in range(3)]
+    assert [(part.kind, part.dims, Hurdle.size(part)) for part in apart] == [("hurdle", (d,), 2) for d in range(3)]
 
 
 def test_beside_its_value_a_hurdle_is_clipped_where_it_has_bounds():

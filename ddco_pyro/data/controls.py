@@ -6,11 +6,11 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
-from ddco_pyro.spec import ControlSpec, PartSpec, SpecError
+from ddco_pyro.spec import DISCRETE, ControlSpec, Kind, PartSpec, SpecError
 
 OFTEN = 0.01
 """A dimension often equals an extreme if more than this share of the steps does."""
@@ -386,7 +386,8 @@ def notes(dimensions: Iterable[ControlDimension]) -> list[str]:
 
 # --- kinds of distribution --------------------------------------------------------------------------------------------
 
-KINDS = ("gaussian", "clipped", "hurdle", "binary", "categorical")
+KINDS = tuple(kind for kind in get_args(Kind) if kind != "auto")
+BOUNDED = ("clipped", "hurdle")
 
 
 @dataclass(frozen=True)
@@ -416,17 +417,12 @@ class ControlPart:
     @property
     def continuous(self) -> bool:
         """Whether the distribution has a σ."""
-        return self.kind in ("gaussian", "clipped", "hurdle")
+        return self.kind not in DISCRETE
 
     @property
     def bounded(self) -> bool:
         """Whether the part is continuous with a finite bound."""
         return self.continuous and any(map(math.isfinite, (*self.low, *self.high)))
-
-    @property
-    def size(self) -> int:
-        """Number of network outputs for the part."""
-        return len(self.values) or len(self.dims) + bool(self.exact)
 
     def as_data(self) -> dict[str, Any]:
         """The part as plain data."""
@@ -468,7 +464,8 @@ def measure(parts: Sequence[ControlPart]) -> dict[str, list[Any]]:
             ends = [part.low[place], part.high[place]] if part.low else []
             about = [end if math.isfinite(end) else None for end in ends] or list(part.values)
             exact = [part.exact[place], list(part.dims)] if part.exact else []
-            dimensions[str(dimension)] = [part.kind, *about, *exact]
+            kind = "gaussian" if part.continuous and not about else part.kind  # any density of the whole line
+            dimensions[str(dimension)] = [kind, *about, *exact]
     return dimensions
 
 
@@ -487,7 +484,7 @@ def _measured(measured: Sequence[Any] | None) -> str:
         return "no part of the likelihood"
     kind, *about = measured
     ends = " and ".join("none" if end is None else number(end) for end in about[:2])
-    text = f"{kind} with bounds {ends}" if kind in ("clipped", "hurdle") else str(kind)
+    text = f"{kind} with bounds {ends}" if kind in BOUNDED else str(kind)
     return f"{text} at {number(about[2])}, of {listed(about[3])}" if kind == "hurdle" else text
 
 
@@ -551,7 +548,7 @@ def _parts(
         exact = {dim.number: _exact(dim, place, spec) for dim in alike if each == "hurdle"}
         for own in _resting_together(alike, exact) if exact else [alike]:
             low, high = (), ()
-            if each != "gaussian":
+            if each in (*BOUNDED, *DISCRETE):
                 ends = [_ends(dim, each, place, spec, exact.get(dim.number)) for dim in own]
                 low, high = zip(*ends, strict=True)
             why = "; ".join(dict.fromkeys(decided[dim.number][1] for dim in own))
@@ -585,7 +582,7 @@ def _found(dimension: ControlDimension, alone: bool) -> tuple[str, str]:
 
 def _declared(dimension: ControlDimension, kind: str) -> tuple[str, str]:
     """A kind that the spec declares, with a warning where an atom makes the density unbounded."""
-    if not dimension.atom or kind not in ("gaussian", "clipped"):
+    if not dimension.atom or kind in ("hurdle", *DISCRETE):
         return kind, "as declared"
     return kind, f"as declared; {dimension.atom}, and options gain by collecting these steps, without any skill"
 

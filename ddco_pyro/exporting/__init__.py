@@ -5,10 +5,11 @@ from __future__ import annotations
 import io
 import json
 import logging
-import shutil
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from inspect import getsource
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from ddco_pyro.exporting.program import StepProgram
 from ddco_pyro.exporting.recording import MOST, record, tolerance
 from ddco_pyro.exporting.runner import TOLERANCE
 from ddco_pyro.fitting.fitted import Fit
+from ddco_pyro.model.emissions import CONTROLS, KINDS
 from ddco_pyro.model.seeding import HOST
 
 __all__ = ["TOLERANCE", "Exported", "export", "write_numpy"]
@@ -79,9 +81,19 @@ def write_numpy(fit: Fit, folder: Path) -> bool:
     about["names"] = fit.names
     if about["numpy"]:
         np.savez(folder / "weights.npz", **weights)  # type: ignore[arg-type]
-    shutil.copyfile(runner.__file__, folder / "runner.py")
+    (folder / "runner.py").write_text(runner_source(), encoding="utf-8")
     (folder / "controller.json").write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
     return bool(about["numpy"])
+
+
+def runner_source() -> str:
+    """The runner as a file that stands by itself: with the functions of all kinds of control."""
+    functions = dict.fromkeys(chain.from_iterable((*emission.helpers, emission.control) for emission in KINDS.values()))
+    names = ", ".join(f'"{kind}": {control.__name__}' for kind, control in CONTROLS.items())
+    sources = [*(getsource(function) for function in functions), f"CONTROLS = {{{names}}}\n"]
+    library = "from ddco_pyro.model.emissions import CONTROLS\n\n"
+    whole = getsource(runner).replace(library, "").replace("import json\n", "import json\nimport math\n")
+    return whole.replace("# kinds of control\n", "\n\n".join(sources))
 
 
 def _write(fit: Fit, folder: Path, onnx: bool) -> list[str]:

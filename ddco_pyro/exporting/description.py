@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from ddco_pyro.exporting.program import StepProgram
+from ddco_pyro.model.emissions import KINDS
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.outputs import TERMINATION_BOUND
 from ddco_pyro.spec import STEP, RolloutSpec
@@ -61,15 +62,15 @@ def describe(hierarchy: Hierarchy, control: RolloutSpec, program: StepProgram) -
 def _part(hierarchy: Hierarchy, number: int) -> dict[str, Any]:
     """The description of one part of the control.
 
-    ``std`` is the σ of each level's callers, lowest first; callers that emit no control have none. A σ that depends on
-    the state is floor + softplus(y + start). For each such dimension ``per_state`` holds its place in the part, the
-    place of y among a caller's numbers, floor and start.
+    ``std`` has σ and other parameters of each level's callers, lowest first; callers that emit no control have none. A
+    σ that depends on the state is floor + softplus(y + start). For each such dimension ``per_state`` holds its place
+    in the part, the place of y among a caller's numbers, floor and start.
     """
     scaling = hierarchy.scaling
     part, places = scaling.parts[number], list(scaling.groups[number])
     before, callers = scaling.parts[:number], hierarchy.callers()
-    first = sum(len(other.dims) for other in before if other.continuous)
-    own = slice(first, first + len(places))
+    kind, first = KINDS[part.kind], sum(scaling.counts[:number])
+    own = slice(first, first + scaling.counts[number])
     each = zip(callers, (*(level.count for level in hierarchy.option_levels()), 1), strict=True)
     std = [
         [] if one.std is None else one.std(torch.zeros(k, len(one.std.of_state)))[..., own].tolist() for one, k in each
@@ -80,13 +81,13 @@ def _part(hierarchy: Hierarchy, number: int) -> dict[str, Any]:
         for number, at in enumerate(given.of_state)
         if first <= at < first + len(places)
     ]
-    decides = [len(scaling.varying) + sum(bool(other.exact) for other in before)] if part.exact else []
+    extra = len(scaling.varying) + sum(KINDS[other.kind].further_noise for other in before)
     ends = ([None if math.isinf(end) else end for end in values] for values in (part.low, part.high))
     return {
         "kind": part.kind,
         "dims": list(part.dims),
-        "places": places + decides,
-        "size": part.size,
+        "places": [*places, *range(extra, extra + kind.further_noise)],
+        "size": kind.size(part),
         "values": list(part.values),
         "ends": list(ends),
         "shift": scaling.shift[places].tolist(),

@@ -1,4 +1,4 @@
-"""Run an exported controller with numpy alone. An export holds this file as it stands.
+"""Run an exported controller with numpy alone. An export holds this file.
 
     from runner import Runner
 
@@ -16,7 +16,6 @@ from the original. A user's networks may need ``Runner(".", networks="torch")`` 
 from __future__ import annotations
 
 import json
-import math
 import sys
 import time
 from collections.abc import Callable, Mapping
@@ -24,6 +23,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from ddco_pyro.model.emissions import CONTROLS
 
 TOLERANCE = 1e-6
 """Difference from the original that is always allowed. The unit of a control is the largest of 1, its spread, and its
@@ -168,7 +169,7 @@ class Runner:
         control = np.array(self.about["constant"])  # dimensions that never varied in the demonstrations stay so
         for part in self.about["parts"]:
             own, z = numbers[first : first + part["size"]], None if noise is None else noise[part["places"]]
-            control[part["dims"]] = KINDS[part["kind"]](part, own, _std(part, level, actor, numbers), z)
+            control[part["dims"]] = CONTROLS[part["kind"]](part, own, _std(part, level, actor, numbers), z)
             first += part["size"]
         return control
 
@@ -185,53 +186,7 @@ def _std(part: Part, level: int, actor: int, numbers: np.ndarray) -> np.ndarray:
     return std
 
 
-def _continuous(part: Part, mean: np.ndarray, std: np.ndarray, z: np.ndarray | None) -> np.ndarray:
-    """A mean, or a draw around it, within the bounds there are, in the control's own units."""
-    value, scale, shift = mean if z is None else mean + std * z, np.array(part["scale"]), np.array(part["shift"])
-    control: np.ndarray = value * scale + shift
-    for ends, side in zip(part["ends"], (-1, 1), strict=True):
-        for place, end in enumerate(ends):
-            if end is not None and side * np.float32(value[place]) >= side * np.float32(
-                (end - shift[place]) / scale[place]
-            ):
-                control[place] = end
-    return control
-
-
-def _hurdle(part: Part, numbers: np.ndarray, std: np.ndarray, z: np.ndarray | None) -> np.ndarray:
-    """The exact value, at which scaled units are 0, or a continuous control; the last of ``z`` decides."""
-    exactly = numbers[0] >= 0 if z is None else _phi(z[-1]) < 1 / (1 + np.exp(-numbers[0]))
-    return np.array(part["shift"]) if exactly else _continuous(part, numbers[1:], std, None if z is None else z[:-1])
-
-
-def _binary(part: Part, logits: np.ndarray, _: np.ndarray, z: np.ndarray | None) -> np.ndarray:
-    """The position of each switch."""
-    on = logits > 0 if z is None else np.array([_phi(value) for value in z]) < 1 / (1 + np.exp(-logits))
-    low, high = (np.array(ends) for ends in part["ends"])
-    return np.where(on, high, low)
-
-
-def _categorical(part: Part, logits: np.ndarray, _: np.ndarray, z: np.ndarray | None) -> np.ndarray:
-    """A discrete action, as its value or as a row."""
-    index = int(logits.argmax())
-    if z is not None:
-        total = np.exp(logits - logits.max()).cumsum()
-        index = min(int((total <= _phi(z[0]) * total[-1]).sum()), len(total) - 1)
-    return np.array([part["values"][index]]) if part["values"] else np.eye(len(logits))[index]
-
-
-def _phi(z: float) -> float:
-    """The standard normal distribution function."""
-    return 0.5 * math.erfc(-z / math.sqrt(2))
-
-
-KINDS: dict[str, Callable[[Part, np.ndarray, np.ndarray, np.ndarray | None], np.ndarray]] = {
-    "gaussian": _continuous,
-    "clipped": _continuous,
-    "hurdle": _hurdle,
-    "binary": _binary,
-    "categorical": _categorical,
-}
+# kinds of control
 
 
 def _turned(value: np.ndarray, spec: Mapping[str, Any]) -> np.ndarray:

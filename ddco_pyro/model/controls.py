@@ -12,7 +12,7 @@ from torch.nn.functional import softplus
 
 from ddco_pyro.data.controls import ControlPart, number, same
 from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
-from ddco_pyro.model.emissions import Binary, Categorical, Clipped, Emission, Gaussian, Hurdle, Product
+from ddco_pyro.model.emissions import KINDS, Emission, Parameter, Product
 from ddco_pyro.spec import ControlSpec, LearnedStd
 
 INITIAL_STD = 0.5
@@ -29,6 +29,7 @@ class ControlScaling(nn.Module):
     :param size: A.
     :param constant: the constant dimensions and their values, in the control's own units.
     :param parts: the kinds of the other dimensions.
+    :ivar counts: how many parameters each part has (:class:`ControlStd`).
     """
 
     shift: Tensor
@@ -44,6 +45,9 @@ class ControlScaling(nn.Module):
     ) -> None:
         super().__init__()
         self.parts = parts
+        self.counts = [
+            len(part.dims) * part.continuous + len(KINDS[part.kind].further_parameters(spec, part)) for part in parts
+        ]
         varying = [dimension for dimension in range(size) if dimension not in constant]
         self.groups = [tuple(varying.index(dimension) for dimension in part.dims) for part in parts]
         shift, scale, standardized = _declared(spec, varying, parts)
@@ -69,7 +73,7 @@ class ControlScaling(nn.Module):
     @property
     def numbers(self) -> int:
         """How many numbers a network gives for a caller's control, without those of a σ (:class:`ControlStd`)."""
-        return sum(part.size for part in self.parts)
+        return sum(KINDS[part.kind].size(part) for part in self.parts)
 
     @property
     def continuous(self) -> list[int]:
@@ -117,18 +121,14 @@ class ControlScaling(nn.Module):
         """
         scaled = self.scaled(actions)
         for dims, part in zip(self.groups, self.parts, strict=True):
-            if not part.continuous:
-                own = scaled[:, list(dims)]
-                allowed = ~np.isnan(own) if part.values else (own == 0) | (own == 1)
-                if part.kind == "categorical" and not part.values:
-                    allowed &= own.sum(1, keepdims=True) == 1
-                if not allowed.all():
-                    step, place = np.argwhere(~allowed)[0]
-                    value = actions[step, part.dims[place]]
-                    return (
-                        f"{name}: control dimension {part.dims[place]} is {number(value)} at step "
-                        f"{step}, which {part.name} ({part.kind}) cannot be"
-                    )
+            allowed = KINDS[part.kind].possible(part, scaled[:, list(dims)])
+            if not allowed.all():
+                step, place = np.argwhere(~allowed)[0]
+                value = actions[step, part.dims[place]]
+                return (
+                    f"{name}: control dimension {part.dims[place]} is {number(value)} at step "
+                    f"{step}, which {part.name} ({part.kind}) cannot be"
+                )
         return ""
 
     def emitted(self, scaled: Tensor) -> Tensor:
@@ -155,24 +155,16 @@ class ControlScaling(nn.Module):
     def emission(self, numbers: Tensor, std: Tensor) -> Emission:
         """The emission of a network's numbers [..., K, size].
 
-        :param std: σ of the continuous dimensions, part after part, [C], [K, C] or [..., K, C].
+        :param std: the parameters of the parts, one part after the other, [C], [K, C] or [..., K, C].
         """
         groups: list[tuple[tuple[int, ...], Emission]] = []
-        sizes, at = [part.size for part in self.parts], 0
+        sizes, at, ends = [KINDS[part.kind].size(part) for part in self.parts], 0, self.ends()
         each = numbers.split(sizes, dim=-1) if len(sizes) > 1 else (numbers,)  # a split's gradient is a copy
         for dims, part, own in zip(self.groups, self.parts, each, strict=True):
-            if part.continuous:
-                deviation, at = std[..., at : at + len(dims)], at + len(dims)
-                mean = own[..., 1:] if part.exact else own
-                slab = Gaussian(mean, deviation, self.scale[list(dims)].log())
-                if part.bounded:
-                    low, high = (end[list(dims)] for end in self.ends())
-                    slab = Clipped(mean, deviation, slab.log_scale, low, high)
-                groups.append((dims, Hurdle(own[..., :1], slab) if part.exact else slab))
-            elif part.kind == "binary":
-                groups.append((dims, Binary(own)))
-            else:
-                groups.append((dims, Categorical(own, torch.tensor(not part.values))))
+            low, high, units = (of[list(dims)] for of in (*ends, self.scale.log()))
+            emission = KINDS[part.kind].of(part, own, std[..., at:], units, (low, high))
+            groups.append((dims, emission))
+            at += emission.parameters
         in_order = [dimension for dims, _ in groups for dimension in dims] == list(range(len(self.varying)))
         return groups[0][1] if len(groups) == 1 and in_order else Product(tuple(groups))
 
@@ -186,7 +178,7 @@ def _declared(
     for part in parts:
         for place, dimension in enumerate(part.dims):
             at = varying.index(dimension)
-            if part.kind == "binary":
+            if part.low and not part.continuous:
                 shift[at], scale[at] = part.low[place], part.high[place] - part.low[place]
             elif part.continuous:
                 shift[at] = part.exact[place] if part.exact else 0.0
@@ -199,7 +191,10 @@ def _declared(
 
 
 class ControlStd(nn.Module):
-    """The standard deviations σ of the continuous control dimensions, in scaled units: fixed, or learned above a floor.
+    """The parameters of a caller's control that no network gives: fixed, or learned above a floor.
+
+    They are the standard deviations σ of continuous dimensions, in scaled units, and what a kind has beside
+    (:meth:`~ddco_pyro.model.emissions.Emission.further_parameters`), one part after the other.
 
     The options of a level share a σ unless the spec says ``per_option``: with its own σ an option can collect the steps
     where a Gaussian control hardly varies, as on a bound, whatever the skill (docs/decisions.md). With ``per_state``
@@ -214,16 +209,21 @@ class ControlStd(nn.Module):
 
     def __init__(self, spec: ControlSpec, scaling: ControlScaling, copies: int) -> None:
         super().__init__()
-        stds = [_std_of(spec, dimension) for part in scaling.parts if part.continuous for dimension in part.dims]
-        fixed = [0.0 if isinstance(std, LearnedStd) else float(std) for std in stds]
-        learned = [place for place, std in enumerate(stds) if isinstance(std, LearnedStd)]
-        self.own = [place for place in learned if getattr(stds[place], "per_option", False)]
-        self.of_state = [place for place in learned if getattr(stds[place], "per_state", False)]
+        stds: dict[int, LearnedStd] = {}
+        each: list[Parameter] = []
+        for part in scaling.parts:
+            for std in (_std_of(spec, dimension) for dimension in part.dims if part.continuous):
+                if isinstance(std, LearnedStd):
+                    stds[len(each)] = std
+                each.append(Parameter(None, std.floor, INITIAL_STD) if isinstance(std, LearnedStd) else Parameter(std))
+            each += KINDS[part.kind].further_parameters(spec, part)
+        self.own = [place for place, std in stds.items() if std.per_option]
+        self.of_state = [place for place, std in stds.items() if std.per_state]
+        learned = [place for place, parameter in enumerate(each) if parameter.fixed is None]
         self.shared = [place for place in learned if place not in (*self.own, *self.of_state)]
-        floors = [std.floor if isinstance(std, LearnedStd) else 0.0 for std in stds]
-        self.register_buffer("fixed", torch.tensor(fixed), persistent=False)
-        self.register_buffer("floor", torch.tensor(floors), persistent=False)
-        start = [math.log(math.expm1(max(INITIAL_STD - floor, 1e-3))) for floor in floors]
+        self.register_buffer("fixed", torch.tensor([float(one.fixed or 0.0) for one in each]), persistent=False)
+        self.register_buffer("floor", torch.tensor([one.floor for one in each]), persistent=False)
+        start = [math.log(math.expm1(max(one.start - one.floor, 1e-3))) for one in each]
         self.register_buffer("start", torch.tensor(start), persistent=False)
         if self.shared:
             self.raw = nn.Parameter(torch.tensor([start[place] for place in self.shared]))

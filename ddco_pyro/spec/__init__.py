@@ -7,11 +7,13 @@ from ddco_pyro.spec.base import SpecError
 from ddco_pyro.spec.model import BaselineSpec, HierarchySpec, LevelSpec
 from ddco_pyro.spec.networks import Activation, ConvolutionLayer, NetworkSpec, PolicySpec, Pool, network_spec
 from ddco_pyro.spec.settings import (
+    DISCRETE,
     STEP,
     AugmentSpec,
     ControlSpec,
     DemonstrationsSpec,
     InferenceSpec,
+    Kind,
     LearnedStd,
     ObservationSpec,
     OptionExecution,
@@ -26,6 +28,7 @@ from ddco_pyro.spec.training import DurationSpec, LabelsSpec, OptimizerSpec, Rid
 from ddco_pyro.spec.yaml import dump_spec, load_spec, spec_schema, user_code
 
 __all__ = [
+    "DISCRETE",
     "STEP",
     "Activation",
     "AugmentSpec",
@@ -36,6 +39,7 @@ __all__ = [
     "DurationSpec",
     "HierarchySpec",
     "InferenceSpec",
+    "Kind",
     "LabelsSpec",
     "LearnedStd",
     "LevelSpec",

@@ -183,7 +183,16 @@ Scale = Annotated[
     ),
 ]
 
-Kind = Literal["auto", "gaussian", "clipped", "hurdle", "binary", "categorical"]
+Kind = Literal["auto", "gaussian", "student", "clipped", "hurdle", "binary", "categorical"]
+"""The kinds of distribution. Each has a class of its name in a module of its name in ``model/emissions``."""
+DISCRETE = ("binary", "categorical")
+"""The kinds without a σ."""
+
+
+Freedom = Annotated[
+    Annotated[float, Field(ge=1, le=500)] | Literal["learn"],
+    nested((), lambda value: value, "a number from 1 to 500, or learn", ("learn",)),
+]
 
 
 class PartSpec(Model):
@@ -204,17 +213,22 @@ class PartSpec(Model):
     demonstrations often reach."""
     value: float | None = None
     """For ``hurdle``: the value that each dimension often has exactly; null: the commonest value inside the range."""
+    freedom: Freedom | None = None
+    """As ``control.freedom``; null: the same."""
 
 
 class ControlSpec(Model):
     """The distribution of the control."""
 
     kind: Kind = "auto"
-    """``gaussian``: unbounded; ``clipped``: a Gaussian censored at bounds; ``hurdle``: one exact value with some
-    probability, else Gaussian or clipped; ``binary``: two values; ``categorical``: discrete actions, as integers or
-    one-hot rows; ``auto``: chosen for each dimension from the demonstrations and shown by ``check``."""
+    """``gaussian``: unbounded; ``student``: heavy tails, which all dimensions of a step share; ``clipped``: a Gaussian
+    censored at bounds; ``hurdle``: one exact value with some probability, else Gaussian or clipped; ``binary``: two
+    values; ``categorical``: discrete actions, as integers or one-hot rows; ``auto``: chosen for each dimension from the
+    demonstrations and shown by ``check``, never ``student``."""
     std: Std = 0.1
     """Standard deviation σ in scaled units, or ``{learn: true, floor: ...}``."""
+    freedom: Freedom = 4.0
+    """For ``student``: degrees of freedom ν, from 1 (heaviest tails) to 500, or ``learn``."""
     scale: Scale = "standardize"
     """``standardize`` (by the training demonstrations), ``none``, or a list with a positive divisor for each control
     dimension."""
@@ -229,6 +243,8 @@ class ControlSpec(Model):
 
     @model_validator(mode="after")
     def _disjoint(self) -> ControlSpec:
+        if self.freedom != 4.0 and "student" not in (self.kind, *(part.kind for part in self.parts)):
+            raise invalid(("freedom", "is for kind: student"))
         dimensions: dict[int, str] = {}
         for number, part in enumerate(self.parts):
             if part.name in [other.name for other in self.parts[:number]]:
@@ -242,12 +258,14 @@ class ControlSpec(Model):
                 problem = f"has {len(part.scale)} numbers, but the part has {len(part.dims)} dimensions"
                 raise invalid((f"parts.{number}.scale", problem))
             for setting in ("scale", "std"):
-                if part.kind in ("binary", "categorical") and getattr(part, setting) is not None:
+                if part.kind in DISCRETE and getattr(part, setting) is not None:
                     raise invalid((f"parts.{number}.{setting}", f"does not apply to kind: {part.kind}; leave it out"))
             if part.bounds is not None and part.kind not in ("clipped", "hurdle"):
                 raise invalid((f"parts.{number}.bounds", "are for kind: clipped or hurdle"))
             if part.bounds is not None and part.bounds[0] >= part.bounds[1]:
                 raise invalid((f"parts.{number}.bounds", "must be a lower and a higher number"))
+            if part.freedom is not None and part.kind != "student":
+                raise invalid((f"parts.{number}.freedom", "is for kind: student"))
             if part.value is not None and part.kind != "hurdle":
                 raise invalid((f"parts.{number}.value", "is for kind: hurdle"))
             if part.value is not None and part.bounds and not part.bounds[0] < part.value < part.bounds[1]:

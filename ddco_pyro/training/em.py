@@ -25,6 +25,7 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from ddco_pyro.model.batch import Batch
+from ddco_pyro.model.emissions import Emission, Information
 from ddco_pyro.model.hierarchy import Caller, Hierarchy
 from ddco_pyro.model.networks.perceptrons import Mlp, StackedLinear
 from ddco_pyro.model.outputs import TERMINATION_BOUND, CallerOutputs, Outputs, bounded
@@ -40,7 +41,9 @@ FARTHEST = 8.0
 HALVINGS = 10
 """How often a step that lowers the penalised log-likelihood is halved before it is given up."""
 ABOVE_FLOOR = 1e-4
-"""A learned σ stays so far above its floor."""
+"""A learned parameter stays so far above its floor."""
+LARGEST_PARAMETER = 500.0
+"""The largest value of a learned parameter that is no σ."""
 TOLERANCE = 1e-5
 """EM has converged where a step gains less, in nats per step of the demonstrations."""
 ROUGHLY = 1e-3
@@ -96,57 +99,20 @@ class Features:
         return rows[:, self._first] * rows[:, self._second]
 
 
-@dataclass(frozen=True)
-class Information:
-    """The information that the posterior expects of some outputs of a network.
-
-    :param columns: the outputs.
-    :param weight: h of each output [N, T, K, n]. Or a weight of all outputs, [N, T, K]: h is the weight times 1/σ² for
-        means, and times diag(p) - pp^T for logits of probabilities p.
-    :param probabilities: p, [N, T, K, n].
-    :param std: the places of σ of these means; a σ that depends on the state is in ``weight`` instead.
-    """
-
-    columns: slice
-    weight: Tensor
-    probabilities: Tensor | None = None
-    std: tuple[int, ...] = ()
-
-    def weights(self) -> Tensor:
-        """h as columns, [N·T, W]; of probabilities those of each pair of outputs, the lower triangle."""
-        if self.probabilities is None:
-            return self.weight.flatten(0, 1).flatten(1)
-        p = self.probabilities.flatten(0, 1)
-        i, j = torch.tril_indices(p.shape[-1], p.shape[-1])
-        first, second = p.index_select(-1, i), p.index_select(-1, j)
-        return (self.weight.flatten(0, 1).unsqueeze(-1) * first * ((i == j).double() - second)).flatten(1)
-
-    def matrices(self, moments: Tensor) -> Tensor:
-        """Σ_t h_t x_t x_t^T from the moments [W, F, F] of :meth:`weights`.
-
-        [K, F, F] for a weight of all outputs, [K, n, F, F] for one of each, [K, nF, nF] of logits.
-        """
-        if self.probabilities is None:
-            return moments.unflatten(0, self.weight.shape[2:])
-        (copies, outputs), features = self.probabilities.shape[2:], moments.shape[-1]
-        i, j = torch.tril_indices(outputs, outputs)
-        whole = moments.new_empty(copies, outputs, outputs, features, features)
-        whole[:, i, j] = whole[:, j, i] = moments.unflatten(0, (copies, -1))
-        return whole.transpose(2, 3).reshape(copies, outputs * features, outputs * features)
-
-
 @dataclass
 class Sums:
     """Sums over all steps for one network: the gradient of W, [K, F, n], and the information of groups of outputs.
 
-    :ivar groups: by their first output; of the last piece.
+    :ivar groups: by their first output and the one after their last; of the last piece.
     :ivar information: the matrix of each group.
+    :ivar counts: how many controls each group stands for, [K].
     """
 
     gradient: Tensor | float = 0.0
     std: Tensor | float = 0.0
-    groups: dict[int, Information] = field(default_factory=dict)
-    information: dict[int, Tensor] = field(default_factory=dict)
+    groups: dict[tuple[int, int], Information] = field(default_factory=dict)
+    information: dict[tuple[int, int], Tensor] = field(default_factory=dict)
+    counts: dict[tuple[int, int], Tensor] = field(default_factory=dict)
 
     def add_gradient(self, x: Tensor, gradient: Tensor, std: Tensor | None) -> None:
         """Add that of a piece: features x [N, T, F], gradients of outputs [N, T, K, n] and of σ."""
@@ -156,8 +122,11 @@ class Sums:
 
     def add_information(self, group: Information, moments: Tensor) -> None:
         """Add that of a piece from the moments of its weights."""
-        place, found = group.columns.start, group.matrices(moments)
-        self.information[place] = found + self.information[place] if place in self.information else found
+        place = group.columns.start, group.columns.stop
+        self.information[place] = self.information.get(place, 0.0) + group.matrices(moments)
+        self.counts[place] = self.counts.get(place, 0.0) + (group.weight if group.count is None else group.count).sum(
+            (0, 1)
+        )
         self.groups[place] = group
 
 
@@ -206,6 +175,24 @@ class Std:
         mean = torch.where(together, square.sum(0) / count.sum(), square / count.unsqueeze(1))
         mean = torch.where(count.unsqueeze(1) > 0, mean, known).clamp(min=0)
         value[:, at] = mean.sqrt().maximum(self.module.floor[at].double() + ABOVE_FLOOR)
+        return value
+
+    def scored(self, value: Tensor, gradient: Tensor, information: Tensor, places: Sequence[int]) -> Tensor:
+        """A table with a Fisher scoring step of the logarithms of the parameters at these places.
+
+        :param gradient: with respect to all parameters, [K, C].
+        :param information: of the logarithm, [K].
+        """
+        value = value.clone()
+        for place in places:
+            slope, weight = gradient[:, place] * value[:, place], information
+            if place in self.module.shared:
+                slope, weight = (total.sum().expand(len(value)) for total in (slope, weight))
+            elif place not in self.module.own:
+                continue
+            factor = (slope / weight.clamp(min=BIAS)).clamp(-math.log(2), math.log(2)).exp()
+            least = self.module.floor[place].double() + ABOVE_FLOOR
+            value[:, place] = (value[:, place] * factor).clamp(max=LARGEST_PARAMETER).maximum(least)
         return value
 
     def store(self) -> None:
@@ -282,7 +269,7 @@ class Expectation:
         Where the last step lowered the penalised log-likelihood, that step is halved first.
         """
         value, sums = self._expect(batch)
-        penalised = value + self._penalty()
+        penalised = value + self._penalty(sums)
         stretch = min(GROWTH * self.stretch, FARTHEST)
         for _ in range(HALVINGS):
             if self._before is None or penalised >= self.value - 1e-9 * abs(self.value):
@@ -290,12 +277,12 @@ class Expectation:
             now, stretch = self._state(), 1.0
             self._restore({name: 0.5 * (old + now[name]) for name, old in self._before.items()})
             value, sums = self._expect(batch)
-            penalised = value + self._penalty()
+            penalised = value + self._penalty(sums)
         else:
             assert self._before is not None
             self._restore(self._before)
             value, sums = self._expect(batch)
-            penalised = value + self._penalty()
+            penalised = value + self._penalty(sums)
         gain = (penalised - self.value) / batch.steps
         self.gain, self._last = max(gain, self._last), gain
         self.value, self._before = penalised, self._state()
@@ -327,7 +314,7 @@ class Expectation:
             longer = (old * (std.value / old) ** self.stretch).maximum(std.module.floor.double() + ABOVE_FLOOR)
             std.value = torch.where(std.value == old, old, longer)
 
-    def _penalty(self) -> float:
+    def _penalty(self, sums: Mapping[str, Sums]) -> float:
         """The log-density of the prior that the ridges stand for, up to a constant, of what is trained."""
         total = 0.0
         for name, network in self._networks.items():
@@ -335,12 +322,12 @@ class Expectation:
                 continue
             weight = network.weight
             each = _penalties(weight, network.ridge)
-            for part in _layout(self._callers[name], self.model) if name in self._stds else ():
-                std = self._stds[name]
-                if part.std and not set(part.std) & set(std.module.of_state):
-                    sigma = std.value[:, list(part.std)]
-                    each[:, part.means] = _penalties(weight[..., part.means], self._ridge.policy) / sigma.square()
-                    learned = [place for place in part.std if place in (*std.module.own, *std.module.shared)]
+            for group in sums[name].groups.values():
+                if group.std and group.columns.stop > group.columns.start:
+                    std, places = self._stds[name], list(group.std)
+                    sigma = std.value[:, places]
+                    each[:, group.columns] = _penalties(weight[..., group.columns], self._ridge.policy) / sigma.square()
+                    learned = [place for place in places if place in (*std.module.own, *std.module.shared)]
                     total -= self._prior_count(weight) * float(std.value[:, learned].log().sum())
             total -= 0.5 * float(each.sum())
         return total
@@ -402,10 +389,9 @@ class Expectation:
                 groups.append(Information(columns, choices.sum(-1).double(), probabilities))
             acting = acted[place]
             if caller.std is not None and acting is not None:
-                emitted = _emitted(
-                    caller, self.model, said[name].detach(), self._stds[name].value, acting, piece.actions
-                )
-                groups.extend(emitted)
+                emission = callers[name].emission
+                assert emission is not None  # it has parameters
+                groups.extend(_emitted(caller, emission.map(Tensor.detach), said[name].detach(), acting, piece.actions))
             sums[name].add_gradient(xs[self._networks[name].reads].x, of[name], of_std.get(name))
             learned[name] = groups
         for prefix, end in zip(named, ended, strict=True):
@@ -438,15 +424,20 @@ class Expectation:
             for place, information in own.information.items():
                 group, columns = own.groups[place], own.groups[place].columns
                 gradient, weight = own.gradient[..., columns], network.weight[..., columns]
-                if group.std:
+                if group.std and not gradient.shape[-1]:
+                    assert std is not None
+                    assert value is not None
+                    assert isinstance(own.std, Tensor)
+                    value = std.scored(value, own.std, information[:, -1, -1], group.std)
+                elif group.std:
                     assert std is not None
                     scale = std.value[:, list(group.std)].unsqueeze(1)  # [K, 1, n]
                     ridge = _ridges(weight.shape[1], self._ridge.policy)
                     solved = torch.linalg.solve(
                         information + ridge.diag(), scale.square() * gradient - ridge.unsqueeze(-1) * weight
                     )
-                    count = information[:, -1, -1]  # of the bias
-                    square = self._squares(std, own.std, group, information, gradient, weight, solved)
+                    count = own.counts[place]
+                    square = self._squares(std, own.std, group, information, count, gradient, weight, solved)
                     assert value is not None
                     value = std.updated(value, square, count + self._prior_count(weight), group.std)
                 else:
@@ -457,15 +448,15 @@ class Expectation:
                 std.value = value
 
     def _squares(
-        self, std: Std, of_std: Tensor | float, group: Information, information: Tensor, gradient: Tensor,
-        weight: Tensor, change: Tensor,
+        self, std: Std, of_std: Tensor | float, group: Information, information: Tensor, count: Tensor,
+        gradient: Tensor, weight: Tensor, change: Tensor,
     ) -> Tensor:  # fmt: skip
         """Σ w E[(a - W'^T x)²] + Σ_f ρ_f W'_f² of each copy and dimension, [K, n], from the gradient in σ (Fisher's
         identity).
         """
         assert isinstance(of_std, Tensor)
         sigma = std.value[:, list(group.std)]
-        before = sigma.square() * (information[:, -1, -1:] + sigma * of_std[:, list(group.std)])
+        before = sigma.square() * (count.unsqueeze(1) + sigma * of_std[:, list(group.std)])
         moved = (change * (information @ change)).sum(1) - 2 * sigma.square() * (change * gradient).sum(1)
         return before + moved + _penalties(weight + change, self._ridge.policy)
 
@@ -496,56 +487,25 @@ def _damped(information: Tensor, gradient: Tensor, weight: Tensor, ridge: float)
     return step * (LARGEST / most.clamp(min=LARGEST))
 
 
-@dataclass(frozen=True)
-class _Part:
-    """Where a part of the control stands in the outputs of a caller's network, and in σ."""
-
-    logits: slice
-    means: slice
-    std: tuple[int, ...]
-    dims: tuple[int, ...]
-    kind: str
-
-
-def _layout(caller: Caller, model: Hierarchy) -> Iterator[_Part]:
-    at, deviation = caller.sizes[0], 0
-    for dims, part in zip(model.scaling.groups, model.scaling.parts, strict=True):
-        first = at + 1 if part.continuous and part.exact else at
-        last = at + part.size
-        if part.continuous:
-            places = tuple(range(deviation, deviation + len(dims)))
-            deviation += len(dims)
-            yield _Part(slice(at, first), slice(first, last), places, dims, "continuous")
-        else:
-            yield _Part(slice(at, last), slice(last, last), (), dims, part.kind)
-        at = last
-
-
 def _emitted(
-    caller: Caller, model: Hierarchy, said: Tensor, std: Tensor, acting: Tensor, actions: Tensor
+    caller: Caller, emission: Emission, said: Tensor, acting: Tensor, actions: Tensor
 ) -> Iterator[Information]:
-    """What the posterior expects to learn of a caller's numbers, given how likely it acts, [N, T, K]."""
-    acting, seen = acting.double(), caller.std.of_state if caller.std is not None else []
+    """What the posterior expects to learn of a caller's numbers, given how likely it acts, [N, T, K].
+
+    :param said: all numbers of the caller.
+    """
+    assert caller.std is not None
+    seen = caller.std.of_state
     last = said.shape[-1] - len(seen)
-    for part in _layout(caller, model):
-        if part.kind == "continuous":
-            weight = acting
-            if part.logits.stop > part.logits.start:  # a hurdle
-                at = (actions[..., list(part.dims)] == 0).all(-1, keepdim=True)
-                p = said[..., part.logits].sigmoid()
-                yield Information(part.logits, acting.unsqueeze(-1) * p * (1 - p))
-                weight = acting * ~at
-            if set(part.std) & set(seen):
-                columns = [last + seen.index(place) for place in part.std]
-                raw = said[..., columns] + caller.std.start[list(part.std)]  # type: ignore[union-attr]
-                sigma = caller.std.floor[list(part.std)] + softplus(raw)  # type: ignore[union-attr]
-                yield Information(part.means, weight.unsqueeze(-1) / sigma.square())
-                slope = raw.sigmoid() / sigma
-                yield Information(slice(columns[0], columns[-1] + 1), 2 * weight.unsqueeze(-1) * slope.square())
-            else:
-                yield Information(part.means, weight, std=part.std)
-        elif part.kind == "binary":
-            p = said[..., part.logits].sigmoid()
-            yield Information(part.logits, acting.unsqueeze(-1) * p * (1 - p))
+    for own in emission.information(acting.double(), actions):
+        group = own.moved(caller.sizes[0], 0)
+        if set(group.std) & set(seen):  # a number of the network stands for each σ
+            columns = [last + seen.index(place) for place in group.std]
+            raw = said[..., columns] + caller.std.start[list(group.std)]
+            sigma = caller.std.floor[list(group.std)] + softplus(raw)
+            yield Information(group.columns, group.weight.unsqueeze(-1) / sigma.square())
+            weight = group.weight if group.count is None else group.count
+            slope = raw.sigmoid() / sigma
+            yield Information(slice(columns[0], columns[-1] + 1), 2 * weight.unsqueeze(-1) * slope.square())
         else:
-            yield Information(part.logits, acting, said[..., part.logits].softmax(-1))
+            yield group

@@ -1,1 +1,584 @@
-../../ddco_pyro/exporting/runner.py
+"""Run an exported controller with numpy alone. An export holds this file.
+
+    from runner import Runner
+
+    controller = Runner(".")
+    controller.reset(seed=0)
+    control = controller.act({"state": state})    # [A], in the control's own units
+    controller.choices, controller.terminations   # active options, lowest level first, and their ψ
+    controller.active                             # their names, by level
+
+``python runner.py [FOLDER] [numpy|torch|onnx]`` replays the episodes in ``check.npz`` and prints the largest difference
+from the original. A user's networks may need ``Runner(".", networks="torch")`` and torch, or
+``Runner(".", networks="onnx")`` and onnxruntime.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+TOLERANCE = 1e-6
+"""Difference from the original that is always allowed. The unit of a control is the largest of 1, its spread, and its
+distance from its centre. ``check.npz`` holds this controller's tolerance, which grows with its rounding error."""
+
+
+Outputs = dict[str, np.ndarray]
+"""``selection_d`` log-probabilities [K, 1 + k], ``termination_d`` ψ [k], ``control_d`` the numbers of the control
+[K, size] (scaled means, logits of switches and of discrete actions, then y of every σ that depends on the state); d
+counts levels from 0, and the last d is the meta-policy."""
+
+State = list[np.ndarray]
+"""The states of recurrent networks, each [1, ...]."""
+
+Networks = Callable[[np.ndarray, int, Mapping[str, np.ndarray], State], tuple[Outputs, State]]
+"""Features [F], step, images by key and the state to :data:`Outputs` and the next state."""
+
+
+class Runner:
+    """An exported controller: :meth:`reset`, then :meth:`act` with each observation.
+
+    :param networks: ``numpy``, ``torch`` (the ``torch.export`` program) or ``onnx``, to evaluate the networks.
+    """
+
+    def __init__(self, folder: str | Path, networks: str = "numpy") -> None:
+        folder = Path(folder)
+        self.about: dict[str, Any] = json.loads((folder / "controller.json").read_text(encoding="utf-8"))
+        if networks not in FORMS:
+            raise ValueError(f"networks={networks!r}: it has to be one of {', '.join(FORMS)}")
+        self._networks = FORMS[networks](folder, self.about)
+        self.reset()
+
+    def reset(self, seed: int = 0) -> None:
+        """Begin an episode. Equal seeds and observations give equal controls."""
+        self.seed, self.time = seed, 0
+        self.choices: tuple[int, ...] = ()
+        self.terminations: tuple[float, ...] = ()
+        self.outputs: Outputs = {}
+        self._last: dict[str, np.ndarray] | None = None
+        self._pictures: dict[str, list[np.ndarray]] = {}
+        self._marginal: np.ndarray | None = None
+        self._state = [np.array(part["values"], part["kind"]).reshape(part["shape"]) for part in self.about["state"]]
+
+    @property
+    def active(self) -> dict[str, str]:
+        """The name of the active choice of each level."""
+        levels = zip(self.about["names"].items(), self.choices, strict=False)
+        return {level: own[choice] for (level, own), choice in levels}
+
+    def act(self, observation: Mapping[str, Any]) -> np.ndarray:
+        """The control [A], in the control's own units.
+
+        :raises ValueError: an observation is missing, has an unseen shape or is not finite.
+        """
+        built_in = self.about["step"]
+        if built_in:
+            observation = {**observation, built_in["key"]: np.array([self.time / built_in["longest"]])}
+        now = {spec["key"]: _checked(observation, spec) for spec in self.about["observations"]}
+        features = self._features(now, self._last or now)
+        images = {
+            spec["key"]: self._recent(now[spec["key"]], spec) for spec in self.about["observations"] if spec["image"]
+        }
+        self.outputs, self._state = self._networks(features, self.time, images, self._state)
+        outputs = self.outputs
+        generator = np.random.default_rng([self.seed, self.time])
+        choose = self._largest_marginal if self.about["options"] == "marginal" else self._choose
+        self.choices = choose(outputs, generator)
+        self.terminations = tuple(
+            float(outputs[f"termination_{level}"][choice - 1]) if choice else 1.0
+            for level, choice in enumerate(self.choices)
+        )
+        self._last, self.time = now, self.time + 1
+        return self._control(outputs, generator)
+
+    def _recent(self, picture: np.ndarray, spec: Mapping[str, Any]) -> np.ndarray:
+        """The picture as networks see it, stacked behind earlier ones where networks see several."""
+        cut = _picture(picture, spec)
+        before = self._pictures.get(spec["key"], [cut] * spec.get("frames", 1))
+        self._pictures[spec["key"]] = seen = [*before[1:], cut]
+        return np.concatenate(seen, axis=-1)
+
+    def _features(self, now: Mapping[str, np.ndarray], before: Mapping[str, np.ndarray]) -> np.ndarray:
+        parts = [np.zeros(0)]
+        for spec in self.about["observations"]:
+            if not spec["image"]:
+                value = now[spec["key"]].astype(np.float64).ravel()
+                parts.append(value)
+                if spec["differences"]:
+                    parts.append(value - before[spec["key"]].astype(np.float64).ravel())
+        return np.concatenate(parts)
+
+    def _choose(self, outputs: Outputs, generator: np.random.Generator) -> tuple[int, ...]:
+        """Terminations go bottom-up, selections top-down; at the first step everything is selected."""
+        depth, terminated = len(self.about["levels"]), [True] * len(self.about["levels"])
+        if self.choices:
+            below = True
+            for level, choice in enumerate(self.choices):
+                psi = float(outputs[f"termination_{level}"][choice - 1]) if choice else 1.0
+                ends = self._pick(np.array([1 - psi, psi] if below else [1.0, 0.0]), generator)
+                terminated[level] = below = bool(ends)
+        choices, caller = [0] * depth, 0
+        for level in reversed(range(depth)):
+            table = outputs[f"selection_{level + 1}"]
+            if level < depth - 1 and caller == 0:
+                probabilities = np.eye(table.shape[-1])[0]  # below control there is nothing left to choose
+            else:
+                probabilities = np.exp(table[caller - 1 if level < depth - 1 else 0].astype(np.float64))
+            if not terminated[level]:
+                probabilities = np.eye(len(probabilities))[self.choices[level]]
+            caller = choices[level] = self._pick(probabilities, generator)
+        return tuple(choices)
+
+    def _largest_marginal(self, outputs: Outputs, _: np.random.Generator) -> tuple[int, ...]:
+        """The choices with the largest p(h_t | s_0, ..., s_t); ``_marginal`` has that of all, [C_D, ..., C_1]."""
+        depth, kept = len(self.about["levels"]), []
+        ended = np.ones(()) if self._marginal is None else self._marginal
+        for level in range(depth if self._marginal is not None else 0):
+            psi = np.append(1.0, outputs[f"termination_{level}"])  # control lasts a step
+            kept.append(ended * (1 - psi))
+            ended = (ended * psi).sum(-1)
+        for level in reversed(range(depth)):
+            selection = np.exp(outputs[f"selection_{level + 1}"].astype(np.float64))
+            if level < depth - 1:  # below control there is nothing left to choose
+                selection = np.vstack([np.eye(selection.shape[1])[0], selection])
+            ended = ended[..., None] * (selection if level < depth - 1 else selection[0])
+            ended = ended + (kept[level] if kept else 0.0)
+        self._marginal = ended
+        return tuple(int(place) for place in reversed(np.unravel_index(ended.argmax(), ended.shape)))
+
+    def _pick(self, probabilities: np.ndarray, generator: np.random.Generator) -> int:
+        if self.about["options"] == "most_likely":
+            return int(probabilities.argmax())
+        total = np.cumsum(probabilities)
+        return int((total <= generator.random() * total[-1]).sum())
+
+    def _control(self, outputs: Outputs, generator: np.random.Generator) -> np.ndarray:
+        """The most likely control, or a sample, of the lowest level with an option, else of the meta-policy."""
+        level, actor = next(((d, h - 1) for d, h in enumerate(self.choices) if h > 0), (len(self.choices), 0))
+        numbers, first = outputs[f"control_{level}"][actor].astype(np.float64), 0
+        sampled = self.about["control"] == "sample"
+        noise = generator.standard_normal(sum(len(part["places"]) for part in self.about["parts"])) if sampled else None
+        control = np.array(self.about["constant"])  # dimensions that never varied in the demonstrations stay so
+        for part in self.about["parts"]:
+            own, z = numbers[first : first + part["size"]], None if noise is None else noise[part["places"]]
+            control[part["dims"]] = CONTROLS[part["kind"]](part, own, _std(part, level, actor, numbers), z)
+            first += part["size"]
+        return control
+
+
+Part = Mapping[str, Any]
+
+
+def _std(part: Part, level: int, actor: int, numbers: np.ndarray) -> np.ndarray:
+    """σ of a part's dimensions for a caller, in scaled units; empty where it has none."""
+    each = np.array(part["std"][level]) if part["std"] else np.zeros(0)
+    std = each[actor] if each.ndim == 2 else each
+    for place, number, floor, start in part["per_state"]:
+        std[place] = floor + np.logaddexp(0, numbers[number] + start)
+    return std
+
+
+def continuous_control(part: Part, mean: np.ndarray, std: np.ndarray, z: np.ndarray | None) -> np.ndarray:
+    """A mean, or a draw around it, within the bounds there are, in the control's own units."""
+    value, scale, shift = mean if z is None else mean + std * z, np.array(part["scale"]), np.array(part["shift"])
+    control: np.ndarray = value * scale + shift
+    for ends, side in zip(part["ends"], (-1, 1), strict=True):
+        for place, end in enumerate(ends):
+            if end is not None and side * np.float32(value[place]) >= side * np.float32(
+                (end - shift[place]) / scale[place]
+            ):
+                control[place] = end
+    return control
+
+
+def phi(z: float) -> float:
+    """The standard normal distribution function."""
+    return 0.5 * math.erfc(-z / math.sqrt(2))
+
+
+def gamma_quantile(shape: float, share: float) -> float:
+    """The number below which a Gamma variate of this shape and rate 1 is with this probability."""
+
+    def below(x: float) -> float:
+        term = total = math.exp(shape * math.log(x) - x - math.lgamma(shape + 1))
+        step = shape
+        while term > 1e-17 * total:
+            step += 1
+            term *= x / step
+            total += term
+        return total
+
+    low, high = -700.0, math.log(shape + 60 + 20 * math.sqrt(shape))  # logarithms
+    for _ in range(100):
+        middle = (low + high) / 2
+        low, high = (middle, high) if below(math.exp(middle)) < share else (low, middle)
+    return math.exp(high)
+
+
+def student_control(part: Part, mean: np.ndarray, std: np.ndarray, z: np.ndarray | None) -> np.ndarray:
+    """A mean, or a draw around it, in the control's own units; the last of ``z`` decides the scale, ν is after σ."""
+    if z is None:
+        return continuous_control(part, mean, std[:-1], None)
+    stretch = math.sqrt(std[-1] / (2 * gamma_quantile(std[-1] / 2, phi(z[-1]))))
+    return continuous_control(part, mean, std[:-1] * stretch, z[:-1])
+
+
+def hurdle_control(part: Part, numbers: np.ndarray, std: np.ndarray, z: np.ndarray | None) -> np.ndarray:
+    """The exact value, at which scaled units are 0, or a continuous control; the last of ``z`` decides."""
+    exactly = numbers[0] >= 0 if z is None else phi(z[-1]) < 1 / (1 + np.exp(-numbers[0]))
+    return (
+        np.array(part["shift"])
+        if exactly
+        else continuous_control(part, numbers[1:], std, None if z is None else z[:-1])
+    )
+
+
+def binary_control(part: Part, logits: np.ndarray, _: np.ndarray, z: np.ndarray | None) -> np.ndarray:
+    """The position of each switch."""
+    on = logits > 0 if z is None else np.array([phi(value) for value in z]) < 1 / (1 + np.exp(-logits))
+    low, high = (np.array(ends) for ends in part["ends"])
+    return np.where(on, high, low)
+
+
+def categorical_control(part: Part, logits: np.ndarray, _: np.ndarray, z: np.ndarray | None) -> np.ndarray:
+    """A discrete action, as its value or as a row."""
+    index = int(logits.argmax())
+    if z is not None:
+        total = np.exp(logits - logits.max()).cumsum()
+        index = min(int((total <= phi(z[0]) * total[-1]).sum()), len(total) - 1)
+    return np.array([part["values"][index]]) if part["values"] else np.eye(len(logits))[index]
+
+
+CONTROLS = {"gaussian": continuous_control, "student": student_control, "clipped": continuous_control, "hurdle": hurdle_control, "binary": binary_control, "categorical": categorical_control}
+
+
+def _picture(picture: np.ndarray, spec: Mapping[str, Any]) -> np.ndarray:
+    """A picture [H, W, C] after the cropping, scaling and conversion to grey that its ``spec`` asks for."""
+    if "crop" in spec:
+        top, left, height, width = spec["crop"]
+        picture = picture[top : top + height, left : left + width]
+    if "resize" in spec and picture.shape[:2] != tuple(spec["resize"]):
+        picture = _resized(picture, *spec["resize"])
+    if spec.get("grey"):
+        red, green, blue = np.moveaxis(picture.astype(np.uint32), -1, 0)
+        picture = ((299 * red + 587 * green + 114 * blue + 500) // 1000).astype(np.uint8)[..., None]
+    return picture
+
+
+def _resized(picture: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Scaled by the mean over areas.
+
+    :raises ImportError: there is no cv2.
+    """
+    try:
+        import cv2
+    except ImportError as error:
+        raise ImportError(
+            "pictures are scaled with cv2, which is missing: pip install opencv-python-headless"
+        ) from error
+    scaled = cv2.resize(np.ascontiguousarray(picture), (width, height), interpolation=cv2.INTER_AREA)
+    return np.asarray(scaled, np.uint8).reshape(height, width, -1)
+
+
+def _checked(observation: Mapping[str, Any], spec: Mapping[str, Any]) -> np.ndarray:
+    key, shape = spec["key"], tuple(spec["shape"])
+    if key not in observation:
+        raise ValueError(f"the observation has no {key!r} (it has: {', '.join(sorted(observation))})")
+    data = np.asarray(observation[key])
+    if data.shape != shape:
+        raise ValueError(f"observation {key!r} has shape {data.shape}, the demonstrations had {shape}")
+    if data.dtype.kind not in "fiub" or (spec["image"] and data.dtype != np.uint8):
+        raise ValueError(f"observation {key!r} is {data.dtype}, it has to be {'uint8' if spec['image'] else 'numbers'}")
+    if not np.isfinite(data).all():
+        raise ValueError(f"observation {key!r} is not finite")
+    return data
+
+
+class NumpyNetworks:
+    """Every network of the hierarchy, from ``weights.npz``."""
+
+    def __init__(self, folder: Path, about: Mapping[str, Any]) -> None:
+        if not about["numpy"]:
+            raise ValueError('it has networks that numpy cannot evaluate: use Runner(..., networks="torch") or "onnx"')
+        with np.load(folder / "weights.npz", allow_pickle=False) as file:
+            self._weights = {name: file[name] for name in file.files}
+        self._about = about
+        self._after: State = []
+
+    def __call__(
+        self, features: np.ndarray, step: int, images: Mapping[str, np.ndarray], state: State
+    ) -> tuple[Outputs, State]:
+        """The outputs of every network for one observation, and the next state."""
+        weights, depth = self._weights, len(self._about["levels"])
+        if "places" in weights:
+            features = np.clip(features[weights["places"]], weights["low"], weights["high"])
+        vector = ((features - weights["mean"]) / weights["deviation"]).astype(np.float32)
+        sizes = self._about["features"]
+        ends = np.cumsum([0, *sizes.values()])
+        self._seen = {key: vector[first:end] for key, first, end in zip(sizes, ends, ends[1:], strict=False)}
+        self._images, self._step = images, step
+        self._before, self._after = iter(state), []
+        outputs: Outputs = {}
+        whole = self._evaluate(self._about["trunk"], "trunk") if self._about["trunk"] else None
+        for level, caller in enumerate(self._about["callers"]):
+            self._features = whole
+            if level < depth and self._about["trunks"][level]:
+                self._features = self._evaluate(self._about["trunks"][level], f"trunk_{level}")
+            out = self._evaluate(caller["network"], f"caller_{level}")
+            logits, mean = out[:, : caller["logits"]], out[:, caller["logits"] :]
+            if caller["choices"]:
+                outputs[f"selection_{level}"] = _selection(logits, caller)
+            if mean.shape[1]:
+                outputs[f"control_{level}"] = mean
+            if level < depth:
+                outputs[f"termination_{level}"] = self._termination(level, len(out))
+        return outputs, self._after
+
+    def _termination(self, level: int, options: int) -> np.ndarray:
+        """ψ [k] of a level, whose options end after every step where no network says when."""
+        network, bound = self._about["terminations"][level], np.float32(self._about["termination_bound"])
+        if network is None:
+            return np.ones(options)
+        raw = self._evaluate(network, f"end_{level}")[:, 0]
+        psi: np.ndarray = 1 / (1 + np.exp(-(bound * np.tanh(raw / bound)).astype(np.float64)))
+        return psi
+
+    def _evaluate(self, node: Mapping[str, Any], name: str) -> np.ndarray:
+        """Features of a part of a network for each of K copies, [K, features]; ``name`` begins its arrays' names."""
+        values: np.ndarray = getattr(self, f"_{node['kind']}")(node, name)
+        return values
+
+    def _vectors(self, node: Mapping[str, Any], _: str) -> np.ndarray:
+        vector = np.concatenate([np.zeros(0, np.float32), *(self._seen[key] for key in node["keys"])])
+        return np.broadcast_to(vector, (node["copies"], len(vector)))
+
+    def _trunk(self, _: Mapping[str, Any], __: str) -> np.ndarray:
+        assert self._features is not None  # what reads a trunk comes after it
+        return self._features
+
+    def _joined(self, node: Mapping[str, Any], name: str) -> np.ndarray:
+        return np.concatenate([self._evaluate(of, f"{name}.{number}") for number, of in enumerate(node["of"])], axis=1)
+
+    def _shared(self, node: Mapping[str, Any], name: str) -> np.ndarray:
+        values = self._evaluate(node["of"], f"{name}.of")
+        return np.broadcast_to(values, (node["copies"], values.shape[1]))
+
+    def _perceptrons(self, node: Mapping[str, Any], name: str) -> np.ndarray:
+        """K perceptrons, those of this step; an activation follows the hidden layers."""
+        values = self._evaluate(node["of"], f"{name}.of")[:, None]
+        first = min(self._step, node["steps"] - 1) * node["copies"]
+        own = slice(first, first + node["copies"])
+        for layer in range(node["layers"]):
+            values = values @ self._weights[f"{name}.{layer}.weight"][own] + self._weights[f"{name}.{layer}.bias"][own]
+            if layer < node["hidden"]:
+                values = ACTIVATIONS[node["activation"]](values)
+        return values[:, 0]
+
+    def _lstm(self, node: Mapping[str, Any], name: str) -> np.ndarray:
+        """K LSTMs. Networks are evaluated in the order of their states."""
+        values = self._evaluate(node["of"], f"{name}.of")[:, None]
+        goes_on = np.float32(not node["horizon"] or self._step % node["horizon"] != 0)
+        for layer in range(node["layers"]):
+            weight, bias, recurrent = (
+                self._weights[f"{name}.{layer}.{part}"] for part in ("inputs.weight", "inputs.bias", "recurrent")
+            )
+            h, c = (goes_on * next(self._before).transpose(1, 0, 2) for _ in "hc")
+            take, keep, new, give = np.split(values @ weight + bias + h @ recurrent, 4, axis=2)
+            c = _sigmoid(keep) * c + _sigmoid(take) * np.tanh(new)
+            values = _sigmoid(give) * np.tanh(c)
+            self._after += [state.transpose(1, 0, 2) for state in (values, c)]
+        return values[:, 0]
+
+    def _convolutions(self, node: Mapping[str, Any], name: str) -> np.ndarray:
+        """Convolutions of a picture, each with an activation, and a pooling of the last maps."""
+        maps = self._images[node["key"]].astype(np.float32).transpose(2, 0, 1)[None] / 255
+        if node["standardize"]:
+            maps = (maps - maps.mean()) / np.sqrt(np.maximum(maps.var(), 1 / maps.size))
+        for number, layer in enumerate(node["layers"]):
+            weight, bias = self._weights[f"{name}.{number}.weight"], self._weights[f"{name}.{number}.bias"]
+            maps = _convolved(np.broadcast_to(maps, (node["copies"], *maps.shape[1:])), weight, bias, layer)
+            maps = ACTIVATIONS[node["activation"]](maps)
+        return POOLS[node["pool"]](maps, node["pooled"]).reshape(node["copies"], -1)
+
+
+def _sigmoid(x: np.ndarray) -> np.ndarray:
+    return 0.5 * (1 + np.tanh(0.5 * x))
+
+
+def _convolved(maps: np.ndarray, weight: np.ndarray, bias: np.ndarray, layer: Mapping[str, Any]) -> np.ndarray:
+    """[K, C, H, W] to [K, filters, H', W']; filters [K · filters, C, size, size]."""
+    size, pad, stride = weight.shape[-1], (layer["padding"],) * 2, layer["stride"]
+    padded = np.pad(maps, ((0, 0), (0, 0), pad, pad))
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (size, size), axis=(2, 3))[:, :, ::stride, ::stride]
+    own = weight.reshape(len(maps), -1, *weight.shape[1:])
+    convolved = np.einsum("kchwij,kfcij->kfhw", windows, own, optimize=True)
+    return np.asarray(convolved + bias.reshape(len(maps), -1, 1, 1))
+
+
+ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "relu": lambda x: np.maximum(x, 0),
+    "leaky_relu": lambda x: np.where(x > 0, x, np.float32(0.01) * x),
+    "elu": lambda x: np.where(x > 0, x, np.expm1(np.minimum(x, 0))),
+    "tanh": np.tanh,
+}
+
+
+def _means(maps: np.ndarray, pooled: int) -> np.ndarray:
+    """Means over ``pooled`` × ``pooled`` fields, [K, filters, pooled, pooled]."""
+    rows, columns = (_fields(length, pooled) for length in maps.shape[2:])
+    return np.stack([np.stack([maps[:, :, a:b, c:d].mean((2, 3)) for c, d in columns], -1) for a, b in rows], -2)
+
+
+def _expected_places(maps: np.ndarray, _: int) -> np.ndarray:
+    """The expected (row, column), each from -1 to 1, under the softmax of each map, [K, filters, 2]."""
+    weights = np.exp(maps - maps.max((2, 3), keepdims=True))
+    weights /= weights.sum((2, 3), keepdims=True)
+    rows, columns = (np.linspace(-1, 1, length, dtype=np.float32) for length in maps.shape[2:])
+    return np.stack([weights.sum(3) @ rows, weights.sum(2) @ columns], -1)
+
+
+POOLS: dict[str, Callable[[np.ndarray, int], np.ndarray]] = {
+    "mean": _means,
+    "flatten": lambda maps, _: maps,
+    "spatial_softmax": _expected_places,
+}
+
+
+def _fields(length: int, number: int) -> list[tuple[int, int]]:
+    return [(i * length // number, -((i + 1) * length // -number)) for i in range(number)]
+
+
+def _selection(logits: np.ndarray, caller: Mapping[str, Any]) -> np.ndarray:
+    """Log-probabilities of control and of each option; -inf for what this caller does not emit."""
+    if not caller["logits"]:
+        return np.array([[0.0] + [-np.inf] * caller["choices"]] * len(logits))
+    shifted = logits - logits.max(1, keepdims=True)
+    log_probabilities = shifted - np.log(np.exp(shifted).sum(1, keepdims=True))
+    return log_probabilities if caller["hybrid"] else np.insert(log_probabilities, 0, -np.inf, axis=1)
+
+
+class TorchNetworks:
+    """Every network of the hierarchy, from ``controller.pt2``."""
+
+    def __init__(self, folder: Path, about: Mapping[str, Any]) -> None:
+        import torch
+
+        self._torch = torch
+        self._program = torch.export.load(folder / "controller.pt2").module()
+        self._outputs = about["outputs"]
+
+    def __call__(
+        self, features: np.ndarray, step: int, images: Mapping[str, np.ndarray], state: State
+    ) -> tuple[Outputs, State]:
+        """The outputs of every network for one observation, and the next state."""
+        given = (features, np.array([step], np.int64), *images.values(), *state)
+        threads = self._torch.get_num_threads()
+        self._torch.set_num_threads(1)  # networks are small: more threads only wait for one another
+        try:
+            with self._torch.no_grad():
+                values = self._program(*(self._torch.tensor(array) for array in given))
+        finally:
+            self._torch.set_num_threads(threads)
+        return _divided(self._outputs, [tensor.numpy() for tensor in values])
+
+
+class OnnxNetworks:
+    """Every network of the hierarchy, from ``controller.onnx``."""
+
+    def __init__(self, folder: Path, about: Mapping[str, Any]) -> None:
+        import onnxruntime
+
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = 1
+        self._session = onnxruntime.InferenceSession(str(folder / "controller.onnx"), options)
+        self._inputs = {argument.name for argument in self._session.get_inputs()}
+        self._outputs = about["outputs"]
+
+    def __call__(
+        self, features: np.ndarray, step: int, images: Mapping[str, np.ndarray], state: State
+    ) -> tuple[Outputs, State]:
+        """The outputs of every network for one observation, and the next state."""
+        given = {"features": features, "step": np.array([step], np.int64)}
+        given |= {f"image_{number}": image for number, image in enumerate(images.values())}
+        given |= {f"state_{number}": array for number, array in enumerate(state)}
+        values = self._session.run(None, {name: array for name, array in given.items() if name in self._inputs})
+        return _divided(self._outputs, values)
+
+
+def _divided(names: list[str], values: list[np.ndarray]) -> tuple[Outputs, State]:
+    """A program's values: first its outputs, then the next state."""
+    return dict(zip(names, values, strict=False)), list(values[len(names) :])
+
+
+FORMS: dict[str, Callable[[Path, Mapping[str, Any]], Networks]] = {
+    "numpy": NumpyNetworks,
+    "torch": TorchNetworks,
+    "onnx": OnnxNetworks,
+}
+
+
+def replay(controller: Runner, episodes: Mapping[str, np.ndarray]) -> tuple[float, float]:
+    """Act on recorded observations again: the largest difference, and the median seconds of a step.
+
+    The control is compared with the original's; every caller's mean control and selection probabilities, and every
+    option's ψ, with what the original's networks say of the whole episode at once. The difference is infinite where
+    another option is active or a number is NaN.
+    """
+    largest, seconds = 0.0, []
+    for number, seed in enumerate(episodes["seeds"]):
+        controller.reset(int(seed))
+        observations = seen(episodes, number)
+        for step in range(len(episodes[f"controls_{number}"])):
+            observation = {key: rows[step] for key, rows in observations.items()}
+            start = time.perf_counter()
+            control = controller.act(observation)
+            seconds.append(time.perf_counter() - start)
+            if list(controller.choices) != episodes[f"choices_{number}"][step].tolist():
+                largest = np.inf
+            for name, value in {**controller.outputs, "controls": control}.items():
+                largest = max(largest, difference(controller.about, name, value, episodes[f"{name}_{number}"][step]))
+    return largest, float(np.median(seconds))
+
+
+def seen(episodes: Mapping[str, np.ndarray], number: int) -> dict[str, np.ndarray]:
+    """The observations of a recorded episode by key, each [T, ...]."""
+    prefix = f"observation_{number}_"
+    return {key.removeprefix(prefix): rows for key, rows in episodes.items() if key.startswith(prefix)}
+
+
+def difference(about: Mapping[str, Any], name: str, value: np.ndarray, original: np.ndarray) -> float:
+    """The largest difference of an output from the original's, in the units of :data:`TOLERANCE`; infinite for NaN."""
+    if name.startswith("selection"):
+        value, original = np.exp(value), np.exp(original)
+    unit = np.ones(original.shape)
+    if name.startswith("control_"):
+        unit = np.maximum(1.0, np.abs(original))
+    if name == "controls":
+        varying = about["varying"]
+        distance = np.abs(original[..., varying] - np.array(about["shift"]))
+        unit[..., varying] = np.maximum(np.maximum(1.0, about["scale"]), distance)
+    difference = float((np.abs(value - original) / unit).max())
+    return difference if np.isfinite(difference) else np.inf
+
+
+def main() -> None:
+    """Replay the recorded episodes."""
+    folder = Path(sys.argv[1] if len(sys.argv) > 1 else ".")
+    networks = sys.argv[2] if len(sys.argv) > 2 else "numpy"
+    with np.load(folder / "check.npz", allow_pickle=False) as file:
+        episodes = {name: file[name] for name in file.files}
+    largest, seconds = replay(Runner(folder, networks), episodes)
+    allowed = float(episodes["tolerance"])
+    print(f"largest difference: {largest:.1e} of {allowed:.1e} that are allowed; a step takes {1e3 * seconds:.3f} ms")
+    sys.exit(0 if largest < allowed else 1)
+
+
+if __name__ == "__main__":
+    main()

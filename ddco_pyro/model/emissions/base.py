@@ -1,0 +1,230 @@
+"""Emissions: how the numbers that networks give a caller become a distribution of the control (paper §4.2).
+
+The callers of a level share one emission object. Each kind of distribution is a class in a file of its own; the package
+has them by name. Controls are in scaled units; log-densities are in the control's own units.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, ClassVar, NamedTuple, Protocol, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ddco_pyro.data.controls import ControlPart
+from ddco_pyro.spec import ControlSpec
+
+LOG_2PI = math.log(2 * math.pi)
+
+Part = Mapping[str, Any]
+"""A part of the control as an export describes it."""
+
+
+def phi(z: float) -> float:
+    """The standard normal distribution function."""
+    return 0.5 * math.erfc(-z / math.sqrt(2))
+
+
+class Steps(Protocol):
+    """What the Pyro program scores or draws a control with at each step."""
+
+    @property
+    def shape(self) -> torch.Size:
+        """[..., K, A]."""
+        ...
+
+    def log_density(self, actions: Tensor) -> Tensor:
+        """log π(a | s) of each caller for controls [..., A], [..., K]."""
+        ...
+
+    def steps(self) -> Sequence[Any]:
+        """One emission [N, K, A] for each of T steps, from [N, T, K, A]; unbound once."""
+        ...
+
+
+@dataclass(frozen=True)
+class Information:
+    """The information that the posterior expects of some numbers of a network, for an M-step.
+
+    :param columns: the numbers; none for a parameter that is no σ, whose information is the weight.
+    :param weight: h of each output [N, T, K, n]. Or a weight of all outputs, [N, T, K]: h is the weight times 1/σ² for
+        means, and times diag(p) - pp^T for logits of probabilities p.
+    :param probabilities: p, [N, T, K, n].
+    :param std: the places of σ of these means, or of the parameter, among the parameters of the control.
+    :param count: how many controls the weight stands for, [N, T, K]; None where it is their number.
+    """
+
+    columns: slice
+    weight: Tensor
+    probabilities: Tensor | None = None
+    std: tuple[int, ...] = ()
+    count: Tensor | None = None
+
+    def moved(self, numbers: int, parameters: int) -> Information:
+        """The same information where so many numbers and parameters come before."""
+        columns = slice(self.columns.start + numbers, self.columns.stop + numbers)
+        return replace(self, columns=columns, std=tuple(place + parameters for place in self.std))
+
+    def weights(self) -> Tensor:
+        """h as columns, [N·T, W]; of probabilities those of each pair of outputs, the lower triangle."""
+        if self.probabilities is None:
+            return self.weight.flatten(0, 1).flatten(1)
+        p = self.probabilities.flatten(0, 1)
+        i, j = torch.tril_indices(p.shape[-1], p.shape[-1])
+        first, second = p.index_select(-1, i), p.index_select(-1, j)
+        return (self.weight.flatten(0, 1).unsqueeze(-1) * first * ((i == j).double() - second)).flatten(1)
+
+    def matrices(self, moments: Tensor) -> Tensor:
+        """Σ_t h_t x_t x_t^T from the moments [W, F, F] of :meth:`weights`.
+
+        [K, F, F] for a weight of all outputs, [K, n, F, F] for one of each, [K, nF, nF] of logits.
+        """
+        if self.probabilities is None:
+            return moments.unflatten(0, self.weight.shape[2:])
+        (copies, outputs), features = self.probabilities.shape[2:], moments.shape[-1]
+        i, j = torch.tril_indices(outputs, outputs)
+        whole = moments.new_empty(copies, outputs, outputs, features, features)
+        whole[:, i, j] = whole[:, j, i] = moments.unflatten(0, (copies, -1))
+        return whole.transpose(2, 3).reshape(copies, outputs * features, outputs * features)
+
+
+class Parameter(NamedTuple):
+    """A parameter of a caller's distribution that no network gives: a σ, or another positive number.
+
+    :param fixed: the value; None for a learned one.
+    :param floor: the lower bound of a learned one; it begins at ``start``.
+    """
+
+    fixed: float | None
+    floor: float = 0.0
+    start: float = 0.0
+
+
+class Emission(ABC):
+    """The distributions of the controls of K callers, [..., K, A].
+
+    A kind is a dataclass of tensors [..., K, ...], of tensors that are the same at all steps, and of other emissions.
+    The first field is a tensor [..., K, ...].
+
+    :cvar further_noise: normal numbers that a draw takes beside one for each dimension.
+    :cvar control: the control of one caller, [A] in its own units, by numpy alone: of a part, the caller's numbers, its
+        parameters, and standard normal numbers, None for the mode. An export has its source.
+    :cvar helpers: the functions that :attr:`control` calls.
+    """
+
+    further_noise: ClassVar[int] = 0
+    helpers: ClassVar[tuple[Callable[..., Any], ...]] = ()
+    control: ClassVar[Any]
+
+    @classmethod
+    def of(
+        cls, part: ControlPart, numbers: Tensor, parameters: Tensor, log_scale: Tensor, ends: tuple[Tensor, Tensor]
+    ) -> Emission:
+        """The distribution of a part of the control.
+
+        :param numbers: of the callers' network, [..., K, size].
+        :param parameters: σ of a continuous part, then :meth:`further_parameters`, then those of other parts; [n],
+            [K, n] or [..., K, n].
+        :param log_scale: logarithms of the units, [A].
+        :param ends: the lower and the upper bounds in scaled units, [A].
+        """
+        raise NotImplementedError
+
+    @classmethod
+    def size(cls, part: ControlPart) -> int:
+        """How many numbers a network gives a caller: A, unless a kind says otherwise."""
+        return len(part.dims)
+
+    @classmethod
+    def further_parameters(cls, spec: ControlSpec, part: ControlPart) -> list[Parameter]:
+        """The parameters beside σ."""
+        return []
+
+    @classmethod
+    def possible(cls, part: ControlPart, scaled: np.ndarray) -> np.ndarray:
+        """Which controls [T, A] have a probability above 0, [T, A] or [T, 1]."""
+        return np.ones((len(scaled), 1), dtype=bool)
+
+    @property
+    def shape(self) -> torch.Size:
+        """[..., K, A]: that of the first field, unless a kind says otherwise."""
+        first: Tensor = next(iter(self._fields().values()))
+        return first.shape
+
+    @property
+    def noise(self) -> int:
+        """How many standard normal numbers a control is drawn from."""
+        return self.shape[-1] + self.further_noise
+
+    @property
+    def numbers(self) -> int:
+        """How many numbers of a network the distribution has: those of the first field, by default."""
+        return next(iter(self._fields().values())).shape[-1]  # type: ignore[no-any-return]
+
+    @property
+    def parameters(self) -> int:
+        """How many parameters the distribution has."""
+        return 0
+
+    @abstractmethod
+    def by_dimension(self, actions: Tensor) -> Tensor:
+        """log π(a_d | s) of each caller and dimension of controls [..., A], [..., K, A]."""
+
+    def log_density(self, actions: Tensor) -> Tensor:
+        """log π(a | s) [..., K]: dimensions are independent given the caller, unless a kind says otherwise."""
+        return self.by_dimension(actions).sum(-1)
+
+    @property
+    @abstractmethod
+    def mode(self) -> Tensor:
+        """The most likely control of each caller, [..., K, A]."""
+
+    @abstractmethod
+    def draw(self, noise: Tensor) -> Tensor:
+        """The controls [..., K, A] that standard normal numbers [..., noise] stand for."""
+
+    @abstractmethod
+    def divergence(self, i: int) -> Tensor:
+        """Mean of KL(π_i ‖ π_j) and KL(π_j ‖ π_i) of caller i and each caller j, float64 [..., K] nats."""
+
+    @abstractmethod
+    def information(self, acting: Tensor, actions: Tensor) -> Iterator[Information]:
+        """What the posterior expects to learn of numbers and parameters from controls [N, T, A], for an M-step.
+
+        :param acting: the posterior probability that a caller acts, float64 [N, T, K].
+        """
+
+    def steps(self) -> list[Self]:
+        """One emission for each step: tensors with as many dimensions as the first field differ from step to step."""
+        each = self._fields()
+        dimensions = next(iter(each.values())).dim()
+        by_step = {
+            name: value.unbind(1) if isinstance(value, Tensor) else value.steps()
+            for name, value in each.items()
+            if isinstance(value, Emission) or value.dim() == dimensions
+        }
+        return [replace(self, **dict(zip(by_step, now, strict=True))) for now in zip(*by_step.values(), strict=True)]  # type: ignore[type-var]
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> Self:
+        """The emission of changed tensors."""
+        changed = {
+            name: change(value) if isinstance(value, Tensor) else value.map(change)
+            for name, value in self._fields().items()
+        }
+        return replace(self, **changed)  # type: ignore[type-var]
+
+    def tensors(self) -> tuple[Tensor, ...]:
+        """The floating-point tensors, those of other emissions included."""
+        found: list[Tensor] = []
+        for value in self._fields().values():
+            own = (value,) if isinstance(value, Tensor) else value.tensors()
+            found.extend(tensor for tensor in own if tensor.is_floating_point())
+        return tuple(found)
+
+    def _fields(self) -> dict[str, Any]:
+        return {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]

@@ -1,0 +1,110 @@
+"""A free continuous control."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ddco_pyro.data.controls import ControlPart
+from ddco_pyro.model.emissions.base import LOG_2PI, Emission, Information, Part
+
+
+def continuous_control(part: Part, mean: np.ndarray, std: np.ndarray, z: np.ndarray | None) -> np.ndarray:
+    """A mean, or a draw around it, within the bounds there are, in the control's own units."""
+    value, scale, shift = mean if z is None else mean + std * z, np.array(part["scale"]), np.array(part["shift"])
+    control: np.ndarray = value * scale + shift
+    for ends, side in zip(part["ends"], (-1, 1), strict=True):
+        for place, end in enumerate(ends):
+            if end is not None and side * np.float32(value[place]) >= side * np.float32(
+                (end - shift[place]) / scale[place]
+            ):
+                control[place] = end
+    return control
+
+
+@dataclass(frozen=True)
+class Gaussian(Emission):
+    """A free continuous control, a ~ N(μ, σ²), with independent dimensions (§4.2).
+
+    :param mean: μ, [..., K, A].
+    :param std: σ, [A]; [K, A] for a σ of each caller; [..., K, A] for a σ that depends on the state.
+    :param log_scale: logarithms of the control's units, [A].
+    """
+
+    mean: Tensor
+    std: Tensor
+    log_scale: Tensor
+    control: ClassVar = staticmethod(continuous_control)
+
+    @classmethod
+    def of(
+        cls, part: ControlPart, numbers: Tensor, parameters: Tensor, log_scale: Tensor, ends: tuple[Tensor, Tensor]
+    ) -> Emission:
+        """The normal distribution with these means."""
+        return Gaussian(numbers, parameters[..., : len(part.dims)], log_scale)
+
+    @property
+    def parameters(self) -> int:
+        """A."""
+        return self.mean.shape[-1]
+
+    def by_dimension(self, actions: Tensor) -> Tensor:
+        """log N(a_d; μ_d, σ_d²), [..., K, A]."""
+        return self._each(actions).unflatten(-1, self.shape[-2:])
+
+    def log_density(self, actions: Tensor) -> Tensor:
+        """log N(a; μ, σ²), [..., K]."""
+        callers, size = self.shape[-2:]
+        return self._each(actions) @ torch.eye(callers, dtype=self.mean.dtype).repeat_interleave(size, 0)
+
+    def _each(self, actions: Tensor) -> Tensor:
+        """:meth:`by_dimension`, [..., K·A]: products with zeros and ones take a fifth of the time of broadcasting."""
+        return self._scored(self._errors(actions))
+
+    def _scored(self, errors: Tensor) -> Tensor:
+        return -0.5 * errors.square() - self._wide(self.std.log() + self.log_scale + 0.5 * LOG_2PI)
+
+    def _errors(self, actions: Tensor) -> Tensor:
+        """(a_d - μ_d) / σ_d, [..., K·A]."""
+        return (self._repeated(actions) - self.mean.flatten(-2)) * self._wide(1 / self.std)
+
+    def _repeated(self, actions: Tensor) -> Tensor:
+        """[..., A] for each caller, [..., K·A]."""
+        callers, size = self.shape[-2:]
+        return actions.to(self.mean.dtype) @ torch.eye(size, dtype=self.mean.dtype).repeat(1, callers)
+
+    def _wide(self, values: Tensor) -> Tensor:
+        """[A], [K, A] or [..., K, A] as [..., K·A]."""
+        return values.expand(*values.shape[:-2], *self.shape[-2:]).flatten(-2).to(self.mean.dtype)
+
+    def information(self, acting: Tensor, actions: Tensor) -> Iterator[Information]:
+        """That of a normal; of a clipped one the M-step takes censored moments, by Fisher's identity."""
+        yield Information(slice(0, self.numbers), acting, std=tuple(range(self.mean.shape[-1])))
+
+    @property
+    def mode(self) -> Tensor:
+        """μ."""
+        return self.mean
+
+    def draw(self, noise: Tensor) -> Tensor:
+        """μ + σ·z."""
+        return self.mean + self.std * noise.unsqueeze(-2)
+
+    def divergence(self, i: int) -> Tensor:
+        """½ Σ (μ_i - μ_j)² / σ² where callers share σ."""
+        to, back = self.relative_entropies(i)
+        return 0.5 * (to + back)
+
+    def relative_entropies(self, i: int) -> tuple[Tensor, Tensor]:
+        """KL(π_i ‖ π_j) and KL(π_j ‖ π_i) of caller i and each caller j, float64 [..., K] nats."""
+        mean = self.mean.double()
+        variance = self.std.double().square().expand(*self.std.shape[:-2], *self.shape[-2:])  # steps may share it
+        square, ratio = (mean - mean[..., i : i + 1, :]).square(), variance / variance[..., i : i + 1, :]
+        to = (square / variance).sum(-1) + (1 / ratio + ratio.log() - 1).sum(-1)
+        back = (square / variance[..., i : i + 1, :]).sum(-1) + (ratio - ratio.log() - 1).sum(-1)
+        return 0.5 * to, 0.5 * back
