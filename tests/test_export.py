@@ -101,6 +101,12 @@ assert not {"torch", "onnxruntime", "pyro", "ddco_pyro"} .difference({needed}) &
 """
 
 
+def test_a_policy_for_lerobot_has_the_runner_of_exports():
+    """After a change: ``python -c 'from ddco_pyro.exporting import runner_source; print(runner_source(), end="")'``."""
+    package = Path(__file__).parents[1] / "lerobot_policy_ddco/lerobot_policy_ddco"
+    assert (package / "runner.py").read_text() == module.runner_source()
+
+
 def test_the_runner_is_one_file_in_which_nothing_is_missing(exported):
     folder, _ = exported
     linter = [sys.executable, "-m", "ruff", "check", "--isolated", "--select", "F,E402", folder / "runner.py"]

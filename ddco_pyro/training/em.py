@@ -429,7 +429,8 @@ class Expectation:
                     assert value is not None
                     assert isinstance(own.std, Tensor)
                     value = std.scored(value, own.std, information[:, -1, -1], group.std)
-                elif group.std:
+                    continue
+                if group.std:
                     assert std is not None
                     scale = std.value[:, list(group.std)].unsqueeze(1)  # [K, 1, n]
                     ridge = _ridges(weight.shape[1], self._ridge.policy)
