@@ -109,10 +109,10 @@ class Runner:
         parts = [np.zeros(0)]
         for spec in self.about["observations"]:
             if not spec["image"]:
-                value = now[spec["key"]].astype(np.float64).ravel()
+                value = _turned(now[spec["key"]], spec)
                 parts.append(value)
                 if spec["differences"]:
-                    parts.append(value - before[spec["key"]].astype(np.float64).ravel())
+                    parts.append(value - _turned(before[spec["key"]], spec))
         return np.concatenate(parts)
 
     def _choose(self, outputs: Outputs, generator: np.random.Generator) -> tuple[int, ...]:
@@ -257,6 +257,15 @@ def categorical_control(part: Part, logits: np.ndarray, _: np.ndarray, z: np.nda
 
 
 CONTROLS = {"gaussian": continuous_control, "student": student_control, "clipped": continuous_control, "hurdle": hurdle_control, "binary": binary_control, "categorical": categorical_control}
+
+
+def _turned(value: np.ndarray, spec: Mapping[str, Any]) -> np.ndarray:
+    """The numbers of an observation, with sines and cosines of angles, and products of quaternions, behind the rest."""
+    value, angles, quaternions = value.astype(np.float64).ravel(), spec["angles"], spec["quaternions"]
+    four = [value[first : first + 4] for first in quaternions]
+    products = [np.outer(q, q)[np.triu_indices(4)] for q in four]
+    rest = np.delete(value, [*angles, *(first + place for first in quaternions for place in range(4))])
+    return np.concatenate([rest, np.sin(value[angles]), np.cos(value[angles]), *products])
 
 
 def _picture(picture: np.ndarray, spec: Mapping[str, Any]) -> np.ndarray:
