@@ -27,7 +27,7 @@ warnings.filterwarnings("ignore", message="IProgress")  # progress needs no widg
 
 from ddco_pyro import load_spec
 from ddco_pyro.cli.console import Progress
-from ddco_pyro.drawing import words
+from ddco_pyro.evaluation import verdicts
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.report import write_report
 from ddco_pyro.report.options import use_table
@@ -78,7 +78,7 @@ Markdown(use_table(needle).markdown())
 # ## Does the hierarchy explain what it has not seen?
 
 # %%
-Markdown(words.verdict(needle.metrics))
+Markdown(verdicts.verdict(needle.metrics))
 
 # %%
 Image(figures / "likelihood.png")

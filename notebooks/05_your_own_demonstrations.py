@@ -30,7 +30,7 @@ warnings.filterwarnings("ignore", message="IProgress")  # progress needs no widg
 from ddco_pyro import Demonstrations, load_spec
 from ddco_pyro.cli.console import Progress
 from ddco_pyro.data.planted import pick_and_place
-from ddco_pyro.drawing import words
+from ddco_pyro.evaluation import verdicts
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.report import write_report
 
@@ -77,7 +77,7 @@ spec = load_spec(RUNS / "mine.yaml", [one for one in SMALLER if not one.startswi
 with Progress() as progress:
     mine = fit(spec, None, RUNS / "mine", progress)
 write_report(mine, demos)
-Markdown(words.verdict(mine.metrics))
+Markdown(verdicts.verdict(mine.metrics))
 
 # %% [markdown]
 # The options over time, beside the phases that the expert itself says it is in (the model has not seen them):

@@ -29,6 +29,7 @@ from ddco_pyro.cli import console
 from ddco_pyro.cli.app import app
 from ddco_pyro.drawing import words
 from ddco_pyro.events import DemonstrationsDone, EpochEnded, TrainingBegan, TrainingEnded
+from ddco_pyro.names import method
 from ddco_pyro.spec import dump_spec, load_spec
 
 ROOT = Path(__file__).parents[1]
@@ -112,7 +113,7 @@ def test_fit_writes_a_run_and_its_report(run):
     for name, row in {"ddco": loaded.metrics, **loaded.metrics.comparison}.items():
         values = row.log_likelihood_per_step
         valid, train = (words.number(getattr(values, part), 3) for part in ("valid", "train"))
-        assert re.search(rf"^ *{words.method(name)} +│ +{valid} +│ +{train}", ended.out, re.MULTILINE)
+        assert re.search(rf"^ *{method(name)} +│ +{valid} +│ +{train}", ended.out, re.MULTILINE)
 
 
 def test_rollout_and_its_report(run):
@@ -123,7 +124,7 @@ def test_rollout_and_its_report(run):
     assert list(methods) == ["open_loop", "supervisor", "flat", "ddco"]
     for name, one in methods.items():
         successes = one.measures["success"].successes
-        assert re.search(rf"^ *{words.method(name)} +│ +{successes} of 1 \(", ended.out, re.MULTILINE)
+        assert re.search(rf"^ *{method(name)} +│ +{successes} of 1 \(", ended.out, re.MULTILINE)
     assert len(list((folder / "videos").glob("*.mp4"))) == 4
     again = call("rollout", folder, "--episodes", 1, "--video", "--jobs", 1, "--resume")
     assert (again.status, again.out, again.err) == (0, ended.out, "")  # nothing is rolled out, so no progress is shown

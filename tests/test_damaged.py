@@ -21,7 +21,7 @@ import ddco_pyro
 from ddco_pyro.cli import console
 from ddco_pyro.data.files import Damaged
 from ddco_pyro.data.tensors import read_tensors, write_tensors
-from ddco_pyro.drawing import words
+from ddco_pyro.evaluation import verdicts
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.metrics import Metrics
@@ -124,7 +124,7 @@ def test_weights_that_are_not_finite(run: Path, monkeypatch: pytest.MonkeyPatch)
 
 def read_all(fit: Fit, metrics: Metrics) -> None:
     """Everything that is read from ``metrics.json``, short of drawing it."""
-    words.verdict(metrics), words.success(metrics)
+    verdicts.verdict(metrics), verdicts.success(metrics)
     again = replace(fit, metrics=metrics)
     training.degeneracies(again), header(fit, metrics), training.particulars(again)
     agreement.section(again, fit.demonstrations)

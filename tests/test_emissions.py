@@ -360,7 +360,7 @@ def test_the_divergence_of_students_is_at_least_that_of_draws():
     bound = emission.divergence(0)[..., 1]
     assert (bound > total - 0.05).all()
     same = Student(torch.zeros(2, 2), STD, SCALE.log(), torch.tensor([3.0]))
-    assert float(same.divergence(0, 1)) == 0
+    assert float(same.divergence(0)[..., 1]) == 0
 
 
 def test_log_of_the_normal_distribution_function():

@@ -16,8 +16,9 @@ from selecting import Told, spec_at
 import ddco_pyro
 from ddco_pyro.comparison import compare
 from ddco_pyro.comparison.page import write
-from ddco_pyro.drawing import words
+from ddco_pyro.evaluation import effort
 from ddco_pyro.fitting.fit import fit
+from ddco_pyro.names import method
 from ddco_pyro.selection import Workers, select
 from ddco_pyro.spec import dump_spec, with_overrides
 from ddco_pyro.training.data import demonstrations
@@ -128,7 +129,7 @@ def test_stages_that_needed_more_are_named_on_the_console(fitted):
     said = " ".join(ended.out.split())
     for name, training in run.metrics.trainings.items():
         assert not training.converged
-        assert re.search(rf" {words.method(name)} │[^┃]*│ 27, not converged ", said)
+        assert re.search(rf" {method(name)} │[^┃]*│ 27, not converged ", said)
         for stage in training.stages:
             rise = f"{stage.rising:.2f} nats per step over the last {stage.epochs})"
             assert f"stage {stage.stage} after {stage.epochs} epochs (tuning log-likelihood up by {rise}" in said
@@ -141,7 +142,7 @@ def test_where_nothing_rises_nothing_is_said(toy_spec):
     still = {"training.epochs": 4, "training.optimizer.lr": 1e-9, "compare_with": []}
     metrics = fit(with_overrides(toy_spec, still)).metrics
     assert metrics.training.converged
-    assert words.unconverged(metrics) == []
+    assert effort.unconverged(metrics) == []
 
 
 def test_a_comparison_marks_them(fitted, tmp_path):

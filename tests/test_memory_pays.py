@@ -30,8 +30,9 @@ from scipy import stats
 import ddco_pyro
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.simulation.episodes import paired_difference, play, rate, run_episode
+from ddco_pyro.simulation.episodes import play, run_episode
 from ddco_pyro.spec import parse_spec
+from ddco_pyro.statistics import paired_difference, rate
 
 SPEC = """
 task: memory_tasks:{task}

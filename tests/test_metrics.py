@@ -10,7 +10,7 @@ import pytest
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import json_text
-from ddco_pyro.drawing import words
+from ddco_pyro.evaluation import verdicts
 from ddco_pyro.metrics import Metrics
 from ddco_pyro.report import write_report
 from ddco_pyro.spec import parse_spec
@@ -77,7 +77,7 @@ def test_a_single_held_out_demonstration_has_no_error_and_every_file_is_json(tmp
     read = strictly((tmp_path / "run" / "metrics.json").read_text())
     for metrics in (run.metrics, again.metrics, Metrics.model_validate(read)):
         assert metrics.comparison["flat"].difference.standard_error is None
-    assert "(error unknown) (1 held-out demonstration" in words.verdict(run.metrics)
+    assert "(error unknown) (1 held-out demonstration" in verdicts.verdict(run.metrics)
     page = write_report(run, run.demonstrations).read_text()
     assert "± –" in page
 

@@ -17,6 +17,7 @@ from toy_task import SPEC
 import ddco_pyro
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.drawing import words
+from ddco_pyro.evaluation import verdicts
 from ddco_pyro.evaluation.worth import mean_run, worth
 from ddco_pyro.inference import log_likelihood, posterior
 from ddco_pyro.inference.engines import compare_engines
@@ -242,7 +243,7 @@ def test_the_worth_of_a_hierarchy_has_two_parts():
 def test_the_verdict_is_about_options_that_last(memory, error, said):
     parts = {"memory": memory, "experts": 2.0, "total": 2.0 + memory}
     found = {name: {"nats_per_step": value, "standard_error": error} for name, value in parts.items()}
-    text = words.worth(Worth(**found, flat="flat", steps_in_a_row=[{"options": 3.0, "mixture": 4.0}]), "DDCO", 10)
+    text = verdicts.worth(Worth(**found, flat="flat", steps_in_a_row=[{"options": 3.0, "mixture": 4.0}]), "DDCO", 10)
     assert text.startswith(f"Of {words.signed(2.0 + memory)} nats per step over flat, +2.00 ± {words.number(error)} ")
     assert said in text
     assert text.endswith("Options stay active no longer (3 steps) than the mixture keeps to one policy (4 steps).")
@@ -260,7 +261,7 @@ def test_a_run_says_what_lasting_is_worth(run):
     assert found.memory.nats_per_step == pytest.approx((ours - mixture) / sum(held_out.lengths))
     (path,) = run.segment(held_out)
     assert found.steps_in_a_row[0].options == pytest.approx(mean_run(path))
-    assert words.worth(found, "options", len(held_out)) in words.verdict(run.metrics)
+    assert verdicts.worth(found, "options", len(held_out)) in verdicts.verdict(run.metrics)
 
 
 def test_its_segments_are_runs_of_one_expert():

@@ -18,11 +18,11 @@ import ddco_pyro
 from ddco_pyro.cli import console
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.inspection import inspect
-from ddco_pyro.drawing.words import label_name
 from ddco_pyro.errors import BadInput
 from ddco_pyro.exporting import write_numpy
 from ddco_pyro.fitting.names import accepted, matched
 from ddco_pyro.metrics import NamedByLabel
+from ddco_pyro.names import label_name
 from ddco_pyro.spec import parse_spec
 
 SPEC = {

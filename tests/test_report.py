@@ -16,6 +16,7 @@ from ddco_pyro.cli import console
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.drawing import words
 from ddco_pyro.drawing.shown import movement, position_key
+from ddco_pyro.evaluation import verdicts
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.fitted import load
 from ddco_pyro.metrics import Metrics
@@ -23,9 +24,10 @@ from ddco_pyro.report import rollouts as rolling
 from ddco_pyro.report import training, trajectories, write_report
 from ddco_pyro.report.activity import Activity, LevelActivity, activity, bins
 from ddco_pyro.report.options import row_order, shares, terminations
-from ddco_pyro.simulation.episodes import Episode, paired_difference, summarize
+from ddco_pyro.simulation.episodes import Episode, summarize
 from ddco_pyro.simulation.film import write_film
 from ddco_pyro.spec import TrainingSpec, parse_spec
+from ddco_pyro.statistics import paired_difference
 from ddco_pyro.training.data import demonstrations, parts
 
 LINEAR = {"network": "linear"}
@@ -191,7 +193,7 @@ def test_the_top_of_the_page_is_a_verdict_skills_and_a_few_time_lines(labelled, 
     fitted = datetime.fromtimestamp((found.folder / "model.safetensors").stat().st_mtime)
     assert "<h1>demos.hdf5 <small>options, " in header
     assert f"{found.folder.name}, fitted {fitted:%Y-%m-%d %H:%M}</small>" in header
-    assert f'<p class="verdict">{words.headline(found.metrics)}</p>' in header
+    assert f'<p class="verdict">{verdicts.headline(found.metrics)}</p>' in header
     nmi = words.number(found.metrics.agreement.valid[0].nmi)
     assert f"<dt>Labels “phase”</dt><dd>NMI {nmi}, accuracy " in header
     assert '<div class="tracks" style="max-height:336px">' in page  # six of 56 pixels
@@ -417,7 +419,7 @@ def test_movement_by_hand():
     ],
 )
 def test_the_verdict_is_honest(mean, error, held_out, said):
-    assert said in words.verdict(made_metrics(held_out, comparison={"flat": compared(mean, error)}))
+    assert said in verdicts.verdict(made_metrics(held_out, comparison={"flat": compared(mean, error)}))
 
 
 @pytest.mark.parametrize(
@@ -444,11 +446,11 @@ def test_a_fit_that_fell_apart_comes_first(ours, flat, first, concludes, capsys)
     )
     spec = SimpleNamespace(hierarchy=None, control=SimpleNamespace(learned_stds={}))
     console.log_likelihoods(SimpleNamespace(name="ddco", spec=spec, baselines={}, metrics=metrics))
-    for said in (words.verdict(metrics), capsys.readouterr().out):
+    for said in (verdicts.verdict(metrics), capsys.readouterr().out):
         assert first in said
         assert ("explain held-out controls better" in said) == concludes
         assert "Take " in said
-    assert words.verdict(metrics).startswith(first)
+    assert verdicts.verdict(metrics).startswith(first)
 
 
 def test_like_warnings_are_one_with_a_list():

@@ -11,6 +11,7 @@ from random_demonstrations import of_states
 from sklearn.metrics import normalized_mutual_info_score
 
 from ddco_pyro.drawing import words
+from ddco_pyro.evaluation import effort
 from ddco_pyro.events import EpochEnded, RestartDiverged, RestartStopped
 from ddco_pyro.inference import segment
 from ddco_pyro.metrics import Training
@@ -254,7 +255,7 @@ def test_a_restart_that_diverges_ends_there_and_is_not_the_best(with_diverging):
     reasons = {event.restart: event.why for event in told if isinstance(event, RestartDiverged)}
     assert sorted(reasons) == ended
     assert all(f"epoch {passes + 1}: the log-likelihood of demo_" in why for why in reasons.values())
-    assert f"; diverged: {', '.join(map(str, ended))}" in words.restarts(Training.model_validate(trainer.summary))
+    assert f"; diverged: {', '.join(map(str, ended))}" in effort.restarts(Training.model_validate(trainer.summary))
     made = training.train(trainer.data, Restart(Progress(best)))
     if passes == 1:  # those that diverge in the first rung are worse than all others there
         assert ended == [number for number in range(6) if starts[number]]
@@ -301,7 +302,7 @@ def test_each_restart_begins_from_the_next_kind(demos, tmp_path):
     assert stages == [["joint"], ["cuts-1", "joint"], ["vq-1", "mixture", "joint"], ["joint"]]
     each = trainer.summary["restarts"]["each"]
     assert [one["initialize"] for one in each] == [*kinds, "random"]
-    said = words.restarts(Training.model_validate(trainer.summary))
+    said = effort.restarts(Training.model_validate(trainer.summary))
     assert "(0 from random, 1 from cuts, 2 from mixture, 3 from random; stopped early" in said
     best, batch = trainer.summary["restarts"]["best"], trainer.data.train
     for number, one in enumerate(each):

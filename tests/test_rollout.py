@@ -14,8 +14,9 @@ from toy_task import task
 
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.simulation.episodes import paired_difference, play, rate, run_episode, run_episodes, summarize
+from ddco_pyro.simulation.episodes import play, run_episode, run_episodes, summarize
 from ddco_pyro.spec import RolloutSpec, parse_spec
+from ddco_pyro.statistics import paired_difference, rate
 
 
 class Noted:

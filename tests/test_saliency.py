@@ -12,7 +12,7 @@ import ddco_pyro
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.saliency import Looking, Saliency
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.drawing.colours import HEIGHT, with_heat
+from ddco_pyro.drawing.colours import HEIGHT, all_with_heat, with_heat
 from ddco_pyro.evaluation.branch_use import branch_use
 from ddco_pyro.report import write_report
 from ddco_pyro.spec import parse_spec
@@ -78,7 +78,7 @@ def test_a_controller_that_is_looked_at_acts_as_it_does():
     for observation in episode(1):
         np.testing.assert_array_equal(looking.act(observation), alone.act(observation))
         assert looking.choices == alone.choices
-    assert [frame.shape for frame in looking.frames] == [(HEIGHT, HEIGHT * 4 // 3, 3)] * STEPS
+    assert [all_with_heat(looks).shape for looks in looking.looks] == [(HEIGHT, HEIGHT * 4 // 3, 3)] * STEPS
 
 
 def test_colours_are_where_the_values_are():

@@ -19,6 +19,7 @@ from scipy import stats
 import ddco_pyro
 from ddco_pyro.data.demonstrations import DemonstrationsError
 from ddco_pyro.drawing import words
+from ddco_pyro.evaluation import verdicts
 from ddco_pyro.metrics import Rollouts, Seeds
 from ddco_pyro.spec import load_spec, with_overrides
 
@@ -107,9 +108,9 @@ def over_three(memory, errors):
 )
 def test_the_verdict_is_over_training_seeds(memory, said):
     found = over_three(memory, [0.0, None, 0.0])
-    assert said in words.over_seeds(found, "DDCO", 10)
+    assert said in verdicts.over_seeds(found, "DDCO", 10)
     first = said.removeprefix("So ").replace("It is", "it is")
-    assert words.headline(made_metrics(10, seeds=found)).startswith(f"Over 3 training seeds {first}")
+    assert verdicts.headline(made_metrics(10, seeds=found)).startswith(f"Over 3 training seeds {first}")
 
 
 @pytest.mark.parametrize(
@@ -121,7 +122,7 @@ def test_the_verdict_is_over_training_seeds(memory, said):
 )
 def test_where_seeds_give_the_same_fit_held_out_demonstrations_decide(error, said):
     """EM reaches one optimum from any seed; an interval without width is no evidence."""
-    text = words.over_seeds(over_three([0.019, 0.0191, 0.0192], [error] * 3), "DDCO", 10)
+    text = verdicts.over_seeds(over_three([0.019, 0.0191, 0.0192], [error] * 3), "DDCO", 10)
     assert said in text
     low, high = stats.t.interval(0.95, 9, 0.0191, error)  # ten held-out demonstrations
     assert f"{low:.2f} to {high:.2f}".replace("-", "−") in text
@@ -145,7 +146,7 @@ def test_rollouts_have_the_same_two_parts_and_the_same_seeds(written, tmp_path):
     assert found["seeds"]["worth"]["experts"] == pytest.approx(experts)
     own = found["worth"]
     assert (own["memory"]["only_ours"] - own["memory"]["only_theirs"]) / 6 == pytest.approx(memory[0])
-    assert words.success_worth(Rollouts.model_validate(found), "options") in ended.out
+    assert verdicts.success_worth(Rollouts.model_validate(found), "options") in ended.out
     page = (run / "report.html").read_text()
     assert 'id="worth"' in page
     assert "Points of success, 3 training seeds" in page
@@ -237,6 +238,6 @@ def test_runs_are_compared_by_what_the_fits_without_one_say(run):
     compared = ddco_pyro.compare([run.folder, run.folder / "baselines" / "flat"])
     each = {row.name: row.each for row in compared.rows}
     assert each[str(run.folder)] == pytest.approx([row.log_likelihood for row in run.metrics.valid])
-    assert "each is held out from a fit without it" in words.verdict(run.metrics)
-    said = words.division(run.metrics.demonstrations)
+    assert "each is held out from a fit without it" in verdicts.verdict(run.metrics)
+    said = verdicts.division(run.metrics.demonstrations)
     assert said == "4 for training, 0 for tuning, each held out from a fit without it"

@@ -12,13 +12,13 @@ from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
 from ddco_pyro.acting.window import Window
-from ddco_pyro.drawing.words import option_name
 from ddco_pyro.errors import BadInput, check_whole
 from ddco_pyro.inference.logspace import arrive
 from ddco_pyro.model.ahmm import Acting, Tabulated, choose
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import States
 from ddco_pyro.model.tables import Step, complete
+from ddco_pyro.names import option_name
 from ddco_pyro.spec import OptionExecution, RolloutSpec
 
 ControlExecution = Literal["mean", "sample"]

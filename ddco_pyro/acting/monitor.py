@@ -12,13 +12,13 @@ from torch import Tensor
 
 from ddco_pyro.acting.controller import fitted
 from ddco_pyro.acting.window import ObservationError, Window, numbers, refuse_large
-from ddco_pyro.drawing.words import choice_names
 from ddco_pyro.errors import BadInput, nearest
 from ddco_pyro.inference.filtering import Belief, Filter
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import States
 from ddco_pyro.model.outputs import Outputs
 from ddco_pyro.model.tables import complete
+from ddco_pyro.names import choice_names
 
 Lengths = Mapping[str, Sequence[np.ndarray]]
 """How many steps each choice of a level remains active: for each level, an array of lengths for each choice."""

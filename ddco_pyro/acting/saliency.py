@@ -10,7 +10,6 @@ import torch
 
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.window import Window
-from ddco_pyro.drawing.colours import with_heat
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs, States
 
@@ -69,7 +68,7 @@ class Saliency:
 
 
 class Looking:
-    """A controller whose ``frames`` show its saliency maps over the pictures, uint8 [H, W, 3] for each step."""
+    """A controller whose ``looks`` are the saliency maps of each step of an episode."""
 
     def __init__(self, controller: Controller) -> None:
         self._controller, self._saliency = controller, Saliency(controller.hierarchy)
@@ -78,14 +77,12 @@ class Looking:
         """Begin an episode."""
         self._controller.reset(seed)
         self._saliency.reset()
-        self.frames: list[np.ndarray] = []
+        self.looks: list[dict[str, Look]] = []
 
     def act(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
         """The controller's control [A]."""
         control = self._controller.act(observation)
-
-        looks = self._saliency.step(observation, self.choices)
-        self.frames.append(np.hstack([with_heat(*look) for look in looks.values()]))
+        self.looks.append(self._saliency.step(observation, self.choices))
         return control
 
     @property

@@ -18,6 +18,7 @@ from ddco_pyro.data.hdf5 import printable
 from ddco_pyro.drawing import words
 from ddco_pyro.drawing.page import Table
 from ddco_pyro.errors import command
+from ddco_pyro.evaluation import effort, verdicts
 from ddco_pyro.events import (
     BaselineSegmented,
     CandidateGivenUp,
@@ -37,6 +38,7 @@ from ddco_pyro.events import (
     TrainingEnded,
     UpdatesDone,
 )
+from ddco_pyro.names import label_name, method, numbered_name, option_name
 
 if TYPE_CHECKING:
     from ddco_pyro.data.inspection import Field, Inspection
@@ -98,7 +100,7 @@ class Progress:
                 self._advance("segmenting by baselines", total, note=baseline)
             case TrainingBegan(model, epochs):
                 name, _, further = model.partition(" ")
-                self._begin(f"training {words.method(name)} {further}".rstrip(), epochs)
+                self._begin(f"training {method(name)} {further}".rstrip(), epochs)
             case EpochEnded():
                 self._advance(note=f"{event.stage}: training {event.train:.3f}, tuning {event.tune:.3f} nats/step")
             case UpdatesDone(done, loss):
@@ -122,8 +124,8 @@ class Progress:
                 self._advance(by=folds)
             case SeedFitted(total):
                 self._advance("fitting with other training seeds", total)
-            case EpisodeEnded(method, total):
-                self._advance("rolling out", total, note=words.method(method))
+            case EpisodeEnded(policy, total):
+                self._advance("rolling out", total, note=method(policy))
             case StudyBegan(total, kept):
                 self._begin(f"study{f' ({kept} of {total} kept)' if kept else ''}", total - kept)
             case CellDone(cell, failed):
@@ -225,8 +227,8 @@ def labels(spec: Spec, used: Labels | None, known: Mapping[str, Sequence[str]]) 
     """
     own = spec.training.labels
     if used is not None and own is not None:
-        names = (words.label_name(own.source, value, known.get(own.source, ()), own.level) for value in used.values)
-        each = ", ".join(f"{name} is {words.option_name(option)}" for option, name in enumerate(names, start=1))
+        names = (label_name(own.source, value, known.get(own.source, ()), own.level) for value in used.values)
+        each = ", ".join(f"{name} is {option_name(option)}" for option, name in enumerate(names, start=1))
         say(f"labels/{own.source}, level {own.level!r}: {each}; used of {len(used.demonstrations)} demonstrations")
 
 
@@ -245,16 +247,16 @@ def log_likelihoods(fit: Fit) -> None:
 
     metrics = fit.metrics
     show(table(metrics, 3, "log-likelihood, nats per step (higher is better)"))
-    if caution := words.caution(metrics):
+    if caution := verdicts.caution(metrics):
         say(caution)
     if metrics.worth:
-        ours, rate = words.method(metrics.model), metrics.control_frequency
-        said = words.worth(metrics.worth, ours, len(metrics.valid), words.sound(metrics), rate)
+        ours, rate = method(metrics.model), metrics.control_frequency
+        said = verdicts.worth(metrics.worth, ours, len(metrics.valid), verdicts.sound(metrics), rate)
         say(said if metrics.seeds else f"{said} {ONE_FIT}")
     if differ := stds(fit):
         say(differ)
     for name, training in metrics.trainings.items():
-        if restarts := words.restarts(training):
+        if restarts := effort.restarts(training):
             say(f"{name}: {restarts}")
 
 
@@ -263,16 +265,16 @@ def seeds(metrics: Metrics) -> None:
     found = metrics.seeds
     if found is None:
         return
-    rows = [[words.method(name), *words.spread(values)] for name, values in found.held_out.items()]
+    rows = [[method(name), *words.spread(values)] for name, values in found.held_out.items()]
     title = f"held-out nats per step over training seeds {words.listed(map(str, found.training_seeds))}"
     show(Table(["Method", "mean", "95 % interval", "range"], rows, title=title))
-    say(words.over_seeds(found, words.method(metrics.model), len(metrics.valid), words.sound(metrics)))
+    say(verdicts.over_seeds(found, method(metrics.model), len(metrics.valid), verdicts.sound(metrics)))
 
 
 def merged(pair: Pair, before: Fit, after: Fit) -> None:
     """The merged options and the change of held-out log-likelihood."""
     names = list(before.names.values())[pair.level]
-    first, second = (words.numbered_name(option, names).removeprefix("option ") for option in pair.options)
+    first, second = (numbered_name(option, names).removeprefix("option ") for option in pair.options)
     apart = "" if pair.divergence is None else f" ({pair.divergence:.2f} nats/step apart)"
     values = [words.number(fit.metrics.log_likelihood_per_step.valid) for fit in (before, after)]
     say(f"Merged options {first} and {second}{apart}: held-out {values[0]} → {values[1]} nats/step.")
@@ -282,7 +284,7 @@ def warnings(fit: Fit) -> None:
     """Warnings of too short a training and of a degenerate solution, each with the usual remedy."""
     from ddco_pyro.report.training import degeneracies
 
-    for what, advice in (*words.unconverged(fit.metrics), *degeneracies(fit)):
+    for what, advice in (*effort.unconverged(fit.metrics), *degeneracies(fit)):
         say(f"warning: {what} {advice}")
 
 
@@ -301,7 +303,7 @@ def names(fit: Fit) -> None:
     if written:
         say(f"names: {fit.run_folder / 'names.yaml'}: {', '.join(written)}")
     for level, pairs in each.items():
-        proposed = {name: one for name, one in pairs if one and name == words.option_name(one.option)}
+        proposed = {name: one for name, one in pairs if one and name == option_name(one.option)}
         if proposed:
             said = [f"{name} as {one.name} {words.number(one.agreement)}" for name, one in proposed.items()]
             taken = ",".join(proposed[name].name if name in proposed else name for name, _ in pairs)
@@ -318,7 +320,7 @@ def successes(metrics: Metrics) -> None:
 
     assert metrics.rollouts is not None  # it has been rolled out
     show(measures_table(metrics.rollouts.methods, title=f"{metrics.rollouts.episodes} episodes each"))
-    if said := words.success_worth(metrics.rollouts, words.method(metrics.model)):
+    if said := verdicts.success_worth(metrics.rollouts, method(metrics.model)):
         say(said)
 
 

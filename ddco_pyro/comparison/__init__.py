@@ -21,7 +21,7 @@ from ddco_pyro.evaluation.agreement import UNMATCHED
 from ddco_pyro.evaluation.worth import paired
 from ddco_pyro.fitting.fitted import Fit, load
 from ddco_pyro.metrics import Training, read_successes
-from ddco_pyro.simulation.episodes import paired_difference, rate
+from ddco_pyro.statistics import paired_difference, rate
 from ddco_pyro.training.data import parts
 
 __all__ = ["CompareError", "Comparison", "Row", "compare"]

@@ -15,13 +15,14 @@ from ddco_pyro.data.files import json_text, write_text
 from ddco_pyro.drawing import words
 from ddco_pyro.drawing.figures import Interval, Panel, interval_plot, save, style
 from ddco_pyro.drawing.page import Block, Cell, Page, Picture, Section, Table, Text, note
+from ddco_pyro.evaluation import effort, verdicts
 from ddco_pyro.evaluation.agreement import UNMATCHED
 from ddco_pyro.evaluation.worth import paired, worth
 from ddco_pyro.metrics import Difference, Rate
+from ddco_pyro.names import FLAT, HIERARCHY, MIXTURE, method
 from ddco_pyro.report.likelihood import SHOWN
 from ddco_pyro.segmenting.agreement import measure_names
 from ddco_pyro.segmenting.page import anchor
-from ddco_pyro.training.networks import HIERARCHY
 
 FILES = ("compare.png", "compare.json", "compare.md", "compare.html")
 """The files of a comparison."""
@@ -73,8 +74,8 @@ def run_table(compared: Comparison) -> Table:
         numbers = [words.number(value, 1) for value in (row.total, row.se, row.difference, row.dse)]
         if row.rank == 0:
             numbers[2:] = ["0", "0"]
-        first = [str(row.rank), row.name, words.method(row.model), str(row.parameters)]
-        rows.append([*first, *numbers, words.number(row.per_step, 3), words.effort(row.training)])
+        first = [str(row.rank), row.name, method(row.model), str(row.parameters)]
+        rows.append([*first, *numbers, words.number(row.per_step, 3), effort.effort(row.training)])
     return Table(head, rows, {0, 1, 2})
 
 
@@ -120,8 +121,8 @@ def verdict(compared: Comparison) -> str:
         row.name: Difference(nats_per_step=row.difference / steps, standard_error=row.dse and row.dse / steps)
         for row in others
     }
-    rising = words.rising(row.name for row in compared.rows if not row.training.converged)
-    said = [_caution(compared), words.explains(best.name, differences, len(compared.trajectories)), _worth(compared)]
+    rising = effort.rising(row.name for row in compared.rows if not row.training.converged)
+    said = [_caution(compared), verdicts.explains(best.name, differences, len(compared.trajectories)), _worth(compared)]
     return f"{' '.join(filter(None, said))}{rising}"
 
 
@@ -129,14 +130,14 @@ def _caution(compared: Comparison) -> str:
     """The runs that fell apart, those with options below the best flat one, and what to do; empty where there are
     none.
     """
-    rows, flat = compared.rows, next((row for row in compared.rows if row.model in words.FLAT), None)
+    rows, flat = compared.rows, next((row for row in compared.rows if row.model in FLAT), None)
     steps = np.array(compared.steps, dtype=float)
     below = {
         row.name: (flat.name, paired(np.array(row.each), np.array(flat.each), steps))
         for row in rows
         if flat and row.model == HIERARCHY
     }
-    return words.cautions({row.name: (row.in_training, row.per_step) for row in rows}, below, len(steps))
+    return verdicts.cautions({row.name: (row.in_training, row.per_step) for row in rows}, below, len(steps))
 
 
 def _worth(compared: Comparison) -> str:
@@ -145,9 +146,9 @@ def _worth(compared: Comparison) -> str:
     alone = {row.model: np.array(row.each) for row in compared.rows if models.count(row.model) == 1}
     found = worth(HIERARCHY, alone, compared.steps)
     sound = not any(
-        words.apart(row.in_training, row.per_step) for row in compared.rows if row.model in (HIERARCHY, words.MIXTURE)
+        verdicts.apart(row.in_training, row.per_step) for row in compared.rows if row.model in (HIERARCHY, MIXTURE)
     )
-    return words.worth(found, words.method(HIERARCHY), len(compared.trajectories), sound) if found else ""
+    return verdicts.worth(found, method(HIERARCHY), len(compared.trajectories), sound) if found else ""
 
 
 def _links(compared: Comparison, folder: Path) -> dict[str, str]:

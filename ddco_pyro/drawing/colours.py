@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ddco_pyro.drawing.words import option_name
+from ddco_pyro.names import option_name
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -69,6 +69,11 @@ def add_legend(
     longest = max((len(handle.get_label()) for handle in handles), default=0)  # type: ignore[arg-type]
     columns = max(1, min(len(handles), ROW // (longest + 4)))
     figure.legend(handles=handles, loc=place, ncols=columns, handlelength=1)  # type: ignore[call-overload]
+
+
+def all_with_heat(looks: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    """Pictures and the values of their pixels side by side, as :func:`with_heat` draws each."""
+    return np.hstack([with_heat(*look) for look in looks.values()])
 
 
 def with_heat(picture: np.ndarray, values: np.ndarray) -> np.ndarray:

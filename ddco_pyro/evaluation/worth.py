@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from ddco_pyro.drawing.words import FLAT, MIXTURE
 from ddco_pyro.metrics import Difference, SuccessWorth, Worth
-from ddco_pyro.simulation.episodes import paired_difference
+from ddco_pyro.names import FLAT, MIXTURE
+from ddco_pyro.statistics import paired_difference
 
 
 def paired(ours: np.ndarray, theirs: np.ndarray, lengths: np.ndarray) -> Difference:
@@ -39,7 +39,7 @@ def worth(ours: str, values: Mapping[str, np.ndarray], lengths: Sequence[int]) -
 
 
 def success_worth(ours: str, successes: Mapping[str, Sequence[float]]) -> SuccessWorth | None:
-    """The same parts for success in rollouts (:func:`ddco_pyro.simulation.episodes.paired_difference`).
+    """The same parts for success in rollouts (:func:`ddco_pyro.statistics.paired_difference`).
 
     :param successes: success (1) or not (0) of each episode, by method.
     """

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.drawing.words import MIXTURE
 from ddco_pyro.errors import Failed
 from ddco_pyro.evaluation.agreement import agreement, confusion
 from ddco_pyro.evaluation.branch_use import branch_use
@@ -39,6 +38,7 @@ from ddco_pyro.metrics import (
 )
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.outputs import Outputs
+from ddco_pyro.names import MIXTURE
 from ddco_pyro.training.labels import choices, used
 
 

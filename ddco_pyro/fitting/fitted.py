@@ -16,7 +16,6 @@ from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.monitor import Monitor, run_lengths
 from ddco_pyro.data.checks import unknown
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.drawing.words import choice_names
 from ddco_pyro.errors import BadInput, path_of
 from ddco_pyro.evaluation.inferred import Inferred, Segmentation, infer, started
 from ddco_pyro.fitting.digest import record, recorded
@@ -26,6 +25,7 @@ from ddco_pyro.fitting.run import RunError, is_finished, read_model
 from ddco_pyro.inference import Posterior
 from ddco_pyro.metrics import Metrics
 from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.names import choice_names
 from ddco_pyro.spec import Spec, SpecError, load_spec, user_code
 from ddco_pyro.training.data import demonstrations as read_demonstrations
 from ddco_pyro.training.networks import model_name, named_baselines

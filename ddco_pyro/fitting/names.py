@@ -11,10 +11,10 @@ import numpy as np
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
 from ddco_pyro.data.sources.recording import label_names
-from ddco_pyro.drawing.words import choice_names, label_name, option_name
 from ddco_pyro.errors import BadInput, nearest
 from ddco_pyro.evaluation.agreement import confusion
 from ddco_pyro.metrics import Confusion, NamedByLabel, TrainedLabels
+from ddco_pyro.names import choice_names, label_name, option_name
 from ddco_pyro.spec import Spec
 from ddco_pyro.spec.yaml import dump_yaml, read_yaml
 

@@ -14,16 +14,18 @@ from pydantic import BeforeValidator, model_validator
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.saliency import Looking
 from ddco_pyro.data.files import json_text, write_text
+from ddco_pyro.drawing.colours import all_with_heat
 from ddco_pyro.errors import command
 from ddco_pyro.evaluation.worth import success_worth
 from ddco_pyro.events import EpisodeEnded, OnEvent, ignore
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.fitting.run import RunError
 from ddco_pyro.metrics import Method, Record, Rollouts, read_record, write_table
-from ddco_pyro.simulation.episodes import paired_difference, run_episode, run_episodes, summarize
+from ddco_pyro.simulation.episodes import run_episode, run_episodes, summarize
 from ddco_pyro.simulation.film import write_film
 from ddco_pyro.simulation.task import SUCCESS, Policy, Task, find_task
 from ddco_pyro.spec.base import invalid
+from ddco_pyro.statistics import paired_difference
 
 OrNaN = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
 """A number; NaN, null in the file, for a measure that does not apply."""
@@ -113,7 +115,7 @@ def _film_looks(fit: Fit, name: str, policy: Policy | str, seed: int) -> None:
         looking = Looking(policy)
         again = run_episode(find_task(str(fit.spec.task)), looking, seed, observed=fit.spec.observed, keep=())
         path = fit.run_folder / "videos" / "saliency" / f"{name}-{seed}.mp4"
-        write_film(path, replace(again, frames=looking.frames), _names(policy))
+        write_film(path, replace(again, frames=list(map(all_with_heat, looking.looks))), _names(policy))
 
 
 def _names(policy: Policy | str) -> list[Sequence[str]]:

@@ -13,8 +13,10 @@ from ddco_pyro.drawing import words
 from ddco_pyro.drawing.figures import style
 from ddco_pyro.drawing.page import Block, Facts, Page, Text, footnote
 from ddco_pyro.drawing.shown import pictures, stored_pictures
+from ddco_pyro.evaluation import effort, verdicts
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Metrics, Rate
+from ddco_pyro.names import method
 from ddco_pyro.report import agreement, inputs, likelihood, options, rollouts, skills, training, worth
 from ddco_pyro.report.activity import activity
 from ddco_pyro.segmenting.page import followed, timelines
@@ -70,7 +72,7 @@ def subtitle(fit: Fit) -> str:
     """The model, its run folder and the time at which it was fitted."""
     folder = fit.run_folder.resolve()
     fitted = datetime.fromtimestamp((folder / "model.safetensors").stat().st_mtime)
-    return f"{words.method(fit.name)}, {folder.parent.name}/{folder.name}, fitted {fitted:%Y-%m-%d %H:%M}"
+    return f"{method(fit.name)}, {folder.parent.name}/{folder.name}, fitted {fitted:%Y-%m-%d %H:%M}"
 
 
 def _stored(fit: Fit, demos: Demonstrations) -> list[Observed]:
@@ -86,17 +88,17 @@ def header(fit: Fit, metrics: Metrics) -> list[Block]:
     """The verdict, success in rollouts, and the main numbers."""
     counts = metrics.demonstrations
     facts = {
-        **words.leads(metrics),
+        **verdicts.leads(metrics),
         **agreement.in_short(fit),
-        "Demonstrations": words.division(counts),
+        "Demonstrations": verdicts.division(counts),
         "Parameters": str(metrics.parameters),
-        "Training": words.spent(metrics.training),
+        "Training": effort.spent(metrics.training),
     }
     supervisor = counts.supervisor.get("success")
     if isinstance(supervisor, Rate):
         facts["Supervisor’s own success"] = f"{words.rate(supervisor, 'demonstrations')}, 95 % interval"
-    blocks: list[Block] = [Text(words.headline(metrics), "verdict")]
-    if success := words.success(metrics):
+    blocks: list[Block] = [Text(verdicts.headline(metrics), "verdict")]
+    if success := verdicts.success(metrics):
         blocks.append(Text(success))
     held_out = "used neither in training nor in tuning, which decides when to stop"
     if counts.left_out:

@@ -10,9 +10,9 @@ import numpy as np
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.sources.recording import label_names
-from ddco_pyro.drawing.words import option_name
 from ddco_pyro.evaluation.inferred import Inferred
 from ddco_pyro.fitting.fitted import Fit
+from ddco_pyro.names import option_name
 from ddco_pyro.segmenting import Segmented, Segments, of_piece, of_run
 from ddco_pyro.segmenting.page import label_colours
 

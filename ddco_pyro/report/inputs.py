@@ -12,13 +12,14 @@ from torch import Tensor
 
 from ddco_pyro.acting.saliency import Saliency
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.drawing.colours import option_colour, with_heat
+from ddco_pyro.drawing.colours import all_with_heat, option_colour
 from ddco_pyro.drawing.figures import FAINT, WIDTH, blank, save
 from ddco_pyro.drawing.page import Section, Table, note
-from ddco_pyro.drawing.words import name_in_level, number, option_name, percent
+from ddco_pyro.drawing.words import number, percent
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import BranchUse
 from ddco_pyro.model.networks import Inputs
+from ddco_pyro.names import name_in_level, option_name
 from ddco_pyro.training.data import parts
 
 COLUMNS, ROWS = 4, 3
@@ -47,9 +48,7 @@ def saliency(fit: Fit, demos: Demonstrations) -> Section | None:
         looks = gradients.step({key: values[step] for key, values in demo.observations.items()}, choices)
         if step in shown:
             title = f"step {step}" + (f", {option_name(choices[0], names)}" if choices else "")
-            panels.append(
-                (title, choices[0] if choices else 0, np.hstack([with_heat(*look) for look in looks.values()]))
-            )
+            panels.append((title, choices[0] if choices else 0, all_with_heat(looks)))
     height, width = panels[0][2].shape[:2]
     figure = blank(ROWS * (WIDTH / COLUMNS * height / width + 0.25))
     for axes, (title, choice, drawn) in zip(figure.subplots(ROWS, COLUMNS, squeeze=False).flat, panels, strict=False):

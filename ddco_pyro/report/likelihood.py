@@ -10,9 +10,12 @@ from matplotlib.figure import Figure
 from ddco_pyro.data.controls import ControlDimension
 from ddco_pyro.drawing.figures import Interval, Panel, interval_plot, save
 from ddco_pyro.drawing.page import Block, Cell, Section, Table, Text, note
-from ddco_pyro.drawing.words import about, capital, duration, effort, listed, method, number, verdict, with_error
+from ddco_pyro.drawing.words import about, capital, duration, listed, number, with_error
+from ddco_pyro.evaluation.effort import effort
+from ddco_pyro.evaluation.verdicts import verdict
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Compared, Metrics
+from ddco_pyro.names import method
 from ddco_pyro.segmenting.page import anchor
 
 SHOWN = 20

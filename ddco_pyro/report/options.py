@@ -19,9 +19,10 @@ from ddco_pyro.drawing.colours import add_legend, is_bright, option_colour
 from ddco_pyro.drawing.figures import FAINT, GRID, INK, blank, hide_frame, save
 from ddco_pyro.drawing.page import Block, Cell, Picture, Section, Table, Text, note
 from ddco_pyro.drawing.timeline import Timelines
-from ddco_pyro.drawing.words import duration, label_name, number, numbered_name, percent
+from ddco_pyro.drawing.words import duration, number, percent
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import NamedByLabel
+from ddco_pyro.names import label_name, numbered_name
 from ddco_pyro.report import trajectories
 from ddco_pyro.report.activity import Activity, Bins, LevelActivity, bins
 from ddco_pyro.segmenting import Segmented

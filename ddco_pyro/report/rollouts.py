@@ -11,9 +11,10 @@ from matplotlib.figure import Figure
 from ddco_pyro.data.sources.video import frames
 from ddco_pyro.drawing.figures import WIDTH, Interval, Panel, blank, data_uri, hide_frame, interval_plot, save
 from ddco_pyro.drawing.page import Block, Film, Films, Section, Table, Text, note
-from ddco_pyro.drawing.words import P_VALUE, interval, measure, method, number, p_value, rate
+from ddco_pyro.drawing.words import P_VALUE, interval, measure, number, p_value, rate
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Mean, Measure, Method, read_successes
+from ddco_pyro.names import method
 
 MOST_BYTES = 4_000_000
 """Films are held in the page up to this size together; the page links to the others."""

@@ -29,10 +29,11 @@ from ddco_pyro.drawing.page import (
     note,
 )
 from ddco_pyro.drawing.shown import frames, in_words, jpeg, paths_of, positions, projection
-from ddco_pyro.drawing.words import duration, number, numbered_name, percent
+from ddco_pyro.drawing.words import duration, number, percent
 from ddco_pyro.errors import command
 from ddco_pyro.evaluation.options import SMALLEST_DIVERGENCE
 from ddco_pyro.fitting.fitted import Fit
+from ddco_pyro.names import numbered_name
 from ddco_pyro.report.inputs import deciding
 from ddco_pyro.report.options import agreeing
 from ddco_pyro.segmenting import Segmented

@@ -16,9 +16,11 @@ from ddco_pyro.drawing import words
 from ddco_pyro.drawing.figures import INK, blank, save
 from ddco_pyro.drawing.page import Block, Code, Columns, Facts, Folded, Section, Text, Warned, note
 from ddco_pyro.drawing.words import number, percent
+from ddco_pyro.evaluation import effort
 from ddco_pyro.evaluation.options import Finding, diagnose
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import read_table, refit
+from ddco_pyro.names import method, numbered_name
 from ddco_pyro.spec import dump_spec
 
 COLUMNS = 4
@@ -39,6 +41,15 @@ STAGES = {
 """Explanations of stages of training."""
 
 
+def _stage_name(name: str) -> str:
+    """A stage of training in words: ``vq-1`` is ``level 1 from clusters``."""
+    kind, _, level = name.partition("-")
+    whole = {"meta-policy": "meta-policy alone", "joint": "all together", "mixture": "all together without memory"}
+    whole |= {"segments": "levels above the lowest from segments", "upper": "levels above the lowest together"}
+    how = {"vq": "from clusters", "parts": "from equal parts", "cuts": "from random cuts", "level": "alone"}.get(kind)
+    return f"level {level} {how}" if how else whole.get(name, name)
+
+
 @dataclass(frozen=True)
 class Curves:
     """One stage of one model: for each restart an array of (epoch, train, tune) [E, 3], nats per step."""
@@ -50,7 +61,7 @@ class Curves:
     @property
     def title(self) -> str:
         """Model and stage in words."""
-        return f"{words.method(self.model)}: {words.stage(self.stage)}"
+        return f"{method(self.model)}: {_stage_name(self.stage)}"
 
 
 def learning(fit: Fit) -> Section | None:
@@ -135,7 +146,7 @@ def warnings(fit: Fit) -> Section | None:
 
     None for a converged policy without options.
     """
-    blocks: list[Block] = [Warned(*sign) for sign in words.unconverged(fit.metrics)]
+    blocks: list[Block] = [Warned(*sign) for sign in effort.unconverged(fit.metrics)]
     if fit.spec.hierarchy is None:
         return Section("warnings", "Warnings", blocks) if blocks else None
     signs = degeneracies(fit)
@@ -198,7 +209,7 @@ def _sign(found: Sequence[Finding], level: str, fit: Fit) -> str:
 def _who(finding: Finding, names: Sequence[str]) -> str:
     """The option, or the two options, of a finding."""
     both = (finding.other, finding.choice) if finding.other else (finding.choice,)
-    return words.listed(words.numbered_name(option, names) for option in both)
+    return words.listed(numbered_name(option, names) for option in both)
 
 
 def _value(finding: Finding, frequency: float | None) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from ddco_pyro.drawing import words
 from ddco_pyro.drawing.page import Section, Table, footnote
 from ddco_pyro.metrics import Metrics
+from ddco_pyro.names import method
 
 EXPLAINED = (
     "A mixture has the options’ policies and the gate that chooses among them, and chooses anew at every step. The "
@@ -19,7 +20,7 @@ def section(metrics: Metrics) -> Section | None:
     found, seeds, rollouts = metrics.worth, metrics.seeds, metrics.rollouts
     if not found:
         return None
-    ours, flat = words.method(metrics.model), words.method(found.flat or "flat")
+    ours, flat = method(metrics.model), method(found.flat or "flat")
     parts = {
         "experts": f"Several policies: mixture − {flat}",
         "memory": f"Options that last: {ours} − mixture",

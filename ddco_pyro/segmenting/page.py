@@ -19,8 +19,9 @@ from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.drawing.page import Block, Cell, Page, Section, Table, Text, footnote, note
 from ddco_pyro.drawing.shown import paths_of
 from ddco_pyro.drawing.timeline import Lane, Runs, Timelines, Track, following
-from ddco_pyro.drawing.words import NAT, duration, label_name, number, numbered_name, option_name, percent
+from ddco_pyro.drawing.words import NAT, duration, number, percent
 from ddco_pyro.fitting.fitted import Fit
+from ddco_pyro.names import label_name, numbered_name, option_name
 from ddco_pyro.segmenting import Segmented, Segments
 from ddco_pyro.segmenting.agreement import EXPLAINED, LevelAgreement, agreement_table, matched, tolerances
 

@@ -1,4 +1,4 @@
-"""Episodes of policies in a task, and summaries of their outcomes with confidence intervals."""
+"""Episodes of policies in a task, and summaries of their outcomes."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from ddco_pyro.data.demonstrations import Demonstration
-from ddco_pyro.drawing.words import CONFIDENCE, mean_interval
 from ddco_pyro.simulation.task import Observation, Policy, Task, find_task
+from ddco_pyro.statistics import mean, rate
 
 if TYPE_CHECKING:
     import dm_env
@@ -223,38 +223,3 @@ def summarize(task: Task, outcomes: Sequence[Mapping[str, float]]) -> dict[str, 
         values = values[~np.isnan(values)]
         summary[name] = rate(int(values.sum()), len(values)) if task.kind(name) == "rate" else mean(values)
     return summary
-
-
-def mean(values: np.ndarray) -> dict[str, Any]:
-    """A mean with its standard deviation and Student's 95 % interval; both are None for less than two values."""
-    trials = len(values)
-    centre = float(values.mean()) if trials else None
-    if centre is None or trials < 2:
-        return {"mean": centre, "std": None, "trials": trials, "interval": None}
-    return {"mean": centre, "std": float(values.std(ddof=1)), "trials": trials, "interval": [*mean_interval(values)]}
-
-
-def rate(successes: int, trials: int) -> dict[str, Any]:
-    """A success rate and its Wilson 95 % interval."""
-    if trials == 0:
-        return {"successes": 0, "trials": 0, "rate": None, "interval": None}
-    from scipy.stats import binomtest
-
-    interval = binomtest(successes, trials).proportion_ci(CONFIDENCE, method="wilson")
-    return {
-        "successes": successes,
-        "trials": trials,
-        "rate": successes / trials,
-        "interval": [float(interval.low), float(interval.high)],
-    }
-
-
-def paired_difference(ours: Sequence[float], theirs: Sequence[float]) -> dict[str, Any]:
-    """Successes from the same initial states: counts of those of one policy alone, and McNemar's exact p-value."""
-    from scipy.stats import binomtest
-
-    only_ours = int(sum(a > b for a, b in zip(ours, theirs, strict=True)))
-    only_theirs = int(sum(a < b for a, b in zip(ours, theirs, strict=True)))
-    discordant = only_ours + only_theirs
-    p_value = float(binomtest(only_ours, discordant).pvalue) if discordant else 1.0
-    return {"only_ours": only_ours, "only_theirs": only_theirs, "trials": len(ours), "p_value": p_value}

@@ -10,7 +10,7 @@ import numpy as np
 
 from ddco_pyro.data.files import whole_file
 from ddco_pyro.drawing.colours import option_rgb
-from ddco_pyro.drawing.words import option_name
+from ddco_pyro.names import option_name
 from ddco_pyro.simulation.episodes import Episode
 
 FRAMES_PER_SECOND = 3

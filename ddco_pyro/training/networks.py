@@ -23,6 +23,7 @@ from ddco_pyro.model.encoder import Shapes
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import ShapeError
 from ddco_pyro.model.seeding import seeded
+from ddco_pyro.names import HIERARCHY, MIXTURE
 from ddco_pyro.spec import BaselineSpec, Spec, SpecError, user_code, with_overrides
 from ddco_pyro.training.devices import device_of
 
@@ -142,10 +143,6 @@ def parameters(network: nn.Module) -> int:
     return sum(parameter.numel() for parameter in network.parameters())
 
 
-HIERARCHY = "ddco"
-"""The name of a hierarchy whose options last, in tables."""
-
-
 def model_name(spec: Spec) -> str:
     """The name of a model in tables: ``ddco``, or a baseline's (:attr:`~ddco_pyro.spec.BaselineSpec.name`)."""
     if spec.hierarchy is None:
@@ -154,7 +151,7 @@ def model_name(spec: Spec) -> str:
     memoryless = [level.name for level in spec.hierarchy.levels if not level.lasts]
     if not memoryless:
         return HIERARCHY
-    return "_".join(("mixture", *(memoryless if len(memoryless) < len(spec.hierarchy.levels) else ())))
+    return "_".join((MIXTURE, *(memoryless if len(memoryless) < len(spec.hierarchy.levels) else ())))
 
 
 def check_models(spec: Spec, dimensions: Dimensions) -> dict[str, tuple[Spec, Hierarchy]]:

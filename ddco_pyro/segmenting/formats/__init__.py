@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from ddco_pyro.data.sources import Source
-from ddco_pyro.drawing.words import name_in_level
 from ddco_pyro.errors import BadInput
 from ddco_pyro.fitting.fitted import Fit
+from ddco_pyro.names import name_in_level
 from ddco_pyro.segmenting import Segmented, Segments
 
 Run = tuple[int, int, int]

@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 from xml.etree import ElementTree
 
 from ddco_pyro.data.files import whole_folder, write_text
-from ddco_pyro.drawing.words import name_in_level
+from ddco_pyro.names import name_in_level
 from ddco_pyro.segmenting import Segmented, Segments
 from ddco_pyro.segmenting.formats import Writer
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from ddco_pyro.data.files import whole_folder
-from ddco_pyro.drawing.words import name_in_level
 from ddco_pyro.errors import BadInput
+from ddco_pyro.names import name_in_level
 from ddco_pyro.segmenting import Segmented, Segments
 from ddco_pyro.segmenting.formats import Writer
 

@@ -9,8 +9,8 @@ from typing import Any
 
 from ddco_pyro.data.files import whole_file
 from ddco_pyro.data.sources.recording import BOUNDARY
-from ddco_pyro.drawing.words import option_name
 from ddco_pyro.errors import BadInput
+from ddco_pyro.names import option_name
 from ddco_pyro.segmenting import Segmented
 from ddco_pyro.segmenting.formats import Writer
 
