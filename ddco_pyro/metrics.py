@@ -273,7 +273,9 @@ class Use(Record):
     - ``demonstrations``: the expected number of demonstrations with a selection, Σ_n min(1, Σ_t v_t);
     - ``duration``: expected steps from a selection to the next, Σ u_t / Σ v_t; None without a selection;
     - ``segments``: how often the most likely paths go over to the choice; ``steps`` with it; ``length``: the median
-      steps of a segment, None without one.
+      steps of a segment, None without one;
+    - ``having``: the number of demonstrations with a segment; ``within``: the share of their steps with the choice,
+      None where all demonstrations have it, or none.
     """
 
     choice: int
@@ -284,6 +286,8 @@ class Use(Record):
     segments: int
     steps: int
     length: Finite | None
+    having: int
+    within: Finite | None
 
 
 class Alike(Record):

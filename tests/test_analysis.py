@@ -50,12 +50,13 @@ def test_an_option_that_is_never_selected_has_no_duration():
     chosen[0, [1, 3, 4]] = 0
     (found,) = option_use(Posterior((active,), (chosen,), (active,)), [[np.array([1, 1, 2, 2, 2, -1])]])
     never = {"share": 0.0, "selected": 0.0, "demonstrations": 0.0, "duration": None, "segments": 0, "steps": 0}
-    once = {"selected": 1.0, "demonstrations": 1.0, "segments": 1}
+    never |= {"length": None, "having": 0, "within": None}
+    once = {"selected": 1.0, "demonstrations": 1.0, "segments": 1, "having": 1, "within": None}
     assert [dict(one) for one in found] == [
-        {"choice": 0, **never, "length": None},
+        {"choice": 0, **never},
         {"choice": 1, "share": 0.4, **once, "duration": 2.0, "steps": 2, "length": 2.0},
         {"choice": 2, "share": 0.6, **once, "duration": 3.0, "steps": 3, "length": 3.0},
-        {"choice": 3, **never, "length": None},
+        {"choice": 3, **never},
     ]
 
 
@@ -232,7 +233,9 @@ def level(*shares, durations=None):
     """Options that are selected ten times in each of two demonstrations."""
     durations = durations or [5.0] * len(shares)
     return [
-        Use.model_construct(choice=choice, share=share, selected=20.0, demonstrations=2.0, duration=duration)
+        Use.model_construct(
+            choice=choice, share=share, selected=20.0, demonstrations=2.0, duration=duration, having=2, within=None
+        )
         for choice, (share, duration) in enumerate(zip(shares, durations, strict=True))
     ]
 
@@ -253,7 +256,11 @@ def use(*demonstrations):
 
 
 def short(option, selections, duration=1.0):
-    return Finding("never_persisting", 1, option, duration, selections=selections)
+    return Finding("never_persisting", 1, option, duration, times=selections)
+
+
+def whole(option, having, share=1.0):
+    return Finding("whole", 1, option, share, times=having)
 
 
 def lasting(duration):
@@ -284,7 +291,11 @@ def lasting(duration):
         # the first reach of every demonstration, and a grasp: each is selected once and ends by design
         (use(*[[(1, 1), (2, 6), (3, 1), (2, 7)]] * 4), []),
         # one demonstration in ten flickers; that it is not in the others is no excuse
-        (use([(1, 1)] * 10, *[[(2, 5), (3, 5)]] * 9), [short(1, 10.0)]),
+        (use([(1, 1)] * 10, *[[(2, 5), (3, 5)]] * 9), [whole(1, 1), short(1, 10.0)]),
+        # two demonstrations are one option from their start to their end, and another is divided
+        (use([(1, 4)], [(1, 4)], [(2, 2), (3, 2)]), [whole(1, 2)]),
+        (use([(1, 9)], [(1, 9), (2, 1)], [(2, 5), (3, 5)]), [whole(1, 2, 18 / 19)]),
+        (use([(1, 4)], [(1, 3), (2, 1)], [(2, 2), (3, 2)]), []),  # 7 of 8 steps
     ],
 )
 def test_signs_of_a_degenerate_solution(levels, found):

@@ -22,6 +22,7 @@ from ddco_pyro.cli import console
 from ddco_pyro.data.files import Damaged
 from ddco_pyro.data.tensors import read_tensors, write_tensors
 from ddco_pyro.evaluation import verdicts
+from ddco_pyro.evaluation.options import degeneracies
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.metrics import Metrics
@@ -126,7 +127,7 @@ def read_all(fit: Fit, metrics: Metrics) -> None:
     """Everything that is read from ``metrics.json``, short of drawing it."""
     verdicts.verdict(metrics), verdicts.success(metrics)
     again = replace(fit, metrics=metrics)
-    training.degeneracies(again), header(fit, metrics), training.particulars(again)
+    degeneracies(again.metrics, again.spec, again.names), header(fit, metrics), training.particulars(again)
     agreement.section(again, fit.demonstrations)
     likelihood.table(metrics)
     options.use_table(again)

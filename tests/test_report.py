@@ -17,13 +17,15 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.drawing import words
 from ddco_pyro.drawing.shown import movement, position_key
 from ddco_pyro.evaluation import verdicts
+from ddco_pyro.evaluation.options import degeneracies
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.fitted import load
 from ddco_pyro.metrics import Metrics
 from ddco_pyro.report import rollouts as rolling
-from ddco_pyro.report import training, trajectories, write_report
+from ddco_pyro.report import trajectories, write_report
 from ddco_pyro.report.activity import Activity, LevelActivity, activity, bins
 from ddco_pyro.report.options import row_order, shares, terminations
+from ddco_pyro.segmenting import Segmented
 from ddco_pyro.simulation.episodes import Episode, summarize
 from ddco_pyro.simulation.film import write_film
 from ddco_pyro.spec import TrainingSpec, parse_spec
@@ -280,7 +282,7 @@ def test_bins_are_steps_of_equally_long_demonstrations_and_normalised_time_other
 def test_shares_and_terminations_are_weighted_means():
     active = np.array([[[0, 1, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 0], [0, 0.5, 0.5], [0, 0, 1]]], dtype=float)
     termination = np.array([[[0.1, 0.2], [0.3, 0.4], [0.5, 0.6]], [[0.1, 0.2], [0.7, 0.8], [0.9, 1.0]]])
-    level = LevelActivity("option", active, np.zeros((2, 3), int), np.zeros((2, 3), int), termination)
+    level = LevelActivity("option", (), active, np.zeros((2, 3), int), termination)
     gathered = bins(np.array([3, 3]))
     np.testing.assert_allclose(shares(level, gathered), [[0, 1, 0], [0, 0.75, 0.25], [0, 0, 1]])
     nan = np.nan  # no option ends before the first step, and option 2 is not active before the last
@@ -294,11 +296,8 @@ def test_rows_are_sorted_by_length_then_by_the_first_change():
     low = np.array([[-1 if step == "-" else int(step) for step in path] for path in paths])
     high = np.array([[1, 2, 1, 1, 1]] * len(paths))
     nothing = np.zeros((len(paths), 5, 3))
-    levels = tuple(
-        LevelActivity(name, nothing, path, np.zeros_like(path), nothing)
-        for name, path in (("low", low), ("high", high))
-    )
-    found = row_order(Activity(levels, (low >= 0).sum(1)))
+    levels = tuple(LevelActivity(name, (), nothing, path, nothing) for name, path in (("low", low), ("high", high)))
+    found = row_order(Activity(levels, (low >= 0).sum(1), Segmented((), {}, None)))
     assert [paths[row] for row in found] == ["1----", "1222-", "1121-", "1111-", "12111", "11222", "11111"]
 
 
@@ -456,17 +455,20 @@ def test_a_fit_that_fell_apart_comes_first(ours, flat, first, concludes, capsys)
 def test_like_warnings_are_one_with_a_list():
     """Of nineteen unused options the ten least used; a finding alone is a sentence of its own."""
     use = {"selected": 1.0, "demonstrations": 1.0, "duration": 9.0, "segments": 1, "steps": 9, "length": 9.0}
-    options = [[use | {"choice": h, "share": 0.0005 * h if h < 20 else 0.2} for h in range(24)]]
-    pairs = [[{"options": (20, 21), "divergence": 0.01}]]
-    levels = [SimpleNamespace(name="skill", lasts=True)]
-    fit = SimpleNamespace(
-        spec=SimpleNamespace(hierarchy=SimpleNamespace(levels=levels), training=TrainingSpec()),
-        names={"skill": []},
-        metrics=made_metrics(options=options, divergences=pairs),
-    )
-    unused, alike = (what for what, _ in training.degeneracies(fit))
+    rows = [use | {"choice": h, "share": 0.0005 * h if h < 20 else 0.2, "having": 3, "within": None} for h in range(24)]
+    rows[22]["within"] = rows[23]["within"] = 0.9
+    metrics = made_metrics(options=[rows], divergences=[[{"options": (20, 21), "divergence": 0.01}]])
+    level = SimpleNamespace(name="skill", lasts=True)
+    spec = SimpleNamespace(hierarchy=SimpleNamespace(levels=[level]), training=TrainingSpec())
+    signs = degeneracies(metrics, spec, {"skill": []})
+    unused, whole, alike = (sign for sign, _ in signs)
     assert unused.startswith("19 options of level “skill” are unused; their shares of all steps are 0.1 % (option 1), ")
     assert unused.endswith("0.5 % (option 10) and so on for 9 more.")
+    assert whole == (
+        "2 options of level “skill” say which demonstration, not which skill; they take 90 % of the 3 demonstrations "
+        "that have it (option 22) and 90 % of the 3 demonstrations that have it (option 23)."
+    )
+    assert "relative to the first step, or differences" in signs[1][1]
     assert alike == (
         "Option 20 and option 21 of level “skill” act alike; while either is active they differ, in nats per step, by "
         "0.010."

@@ -18,7 +18,7 @@ from ddco_pyro.drawing.colours import CONTROL, OPTIONS, option_rgb
 from ddco_pyro.drawing.diagrams import dendrogram, path_film, transition_graph, typical_paths
 from ddco_pyro.drawing.shown import frames, projection
 from ddco_pyro.report.inputs import _shares
-from ddco_pyro.report.skills import Instance, _not_a_skill, aligned, film_of, instances, sheet_of, transitions
+from ddco_pyro.report.skills import Instance, aligned, film_of, instances, sheet_of, transitions
 from ddco_pyro.segmenting import LevelLabels, Segmented, Segments
 from ddco_pyro.simulation.episodes import Episode
 from ddco_pyro.simulation.film import FRAMES_PER_SECOND, captioned, write_film
@@ -59,24 +59,6 @@ def test_starts_and_ends_are_drawn_however_many_transitions_there_are():
     assert {"start → a: 2 of 3", "start → b: 1 of 3", "b → end: 2 of 450", "a → end: 1 of 450"} < set(
         re.findall(r"<title>([^<]*)</title>", drawn)
     )
-
-
-@pytest.mark.parametrize(
-    ("paths", "said"),
-    [
-        (
-            ["1111", "1111", "2233"],
-            "takes 100 % of the 2 demonstrations that have it: it says which demonstration, not",
-        ),
-        (["1111", "1112", "2233"], ""),  # 7 of 8 steps
-        (["1111", "1111", "1111"], ""),  # one option for all
-    ],
-)
-def test_an_option_of_whole_demonstrations_is_no_skill(paths, said):
-    found = segmented(paths)
-    facts = _not_a_skill(instances(found, "option", 1), found)
-    assert facts.get("No skill", "").startswith(said)
-    assert bool(facts) == bool(said)
 
 
 def test_the_most_typical_segments_come_first_and_of_different_demonstrations():

@@ -282,9 +282,9 @@ def merged(pair: Pair, before: Fit, after: Fit) -> None:
 
 def warnings(fit: Fit) -> None:
     """Warnings of too short a training and of a degenerate solution, each with the usual remedy."""
-    from ddco_pyro.report.training import degeneracies
+    from ddco_pyro.evaluation.options import degeneracies
 
-    for what, advice in (*effort.unconverged(fit.metrics), *degeneracies(fit)):
+    for what, advice in (*effort.unconverged(fit.metrics), *degeneracies(fit.metrics, fit.spec, fit.names)):
         say(f"warning: {what} {advice}")
 
 

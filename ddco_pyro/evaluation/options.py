@@ -4,18 +4,43 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ddco_pyro.acting.monitor import run_lengths
+from ddco_pyro.drawing.words import capital, duration, listed, number, percent
 from ddco_pyro.events import OnEvent, OptionsCompared, ignore
 from ddco_pyro.inference import Posterior
-from ddco_pyro.metrics import Alike, Use
+from ddco_pyro.metrics import Alike, Metrics, Use
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
-from ddco_pyro.spec import TrainingSpec
+from ddco_pyro.names import numbered_name
+from ddco_pyro.spec import Spec, TrainingSpec
+
+
+class OnPaths(NamedTuple):
+    """One choice on the most likely paths of demonstrations.
+
+    :param lengths: steps of its segments in rising order; the same option chosen anew stays one segment.
+    :param having: the number of demonstrations with a segment.
+    :param within: the share of their steps that it takes; None where all demonstrations have it, or none.
+    """
+
+    lengths: np.ndarray
+    having: int
+    within: float | None
+
+
+def on_paths(paths: Sequence[np.ndarray], count: int) -> list[OnPaths]:
+    """Each choice 0 to ``count`` on the paths [T] of demonstrations; -1 past an end is no choice."""
+    steps, found = np.array([(path >= 0).sum() for path in paths]), []
+    for choice, lengths in enumerate(run_lengths(paths, count)):
+        having = np.array([bool((path == choice).any()) for path in paths])
+        within = float(lengths.sum() / steps[having].sum()) if having.any() and not having.all() else None
+        found.append(OnPaths(lengths, int(having.sum()), within))
+    return found
 
 
 def option_use(posterior: Posterior, paths: Iterable[Sequence[np.ndarray]]) -> list[list[Use]]:
@@ -26,28 +51,25 @@ def option_use(posterior: Posterior, paths: Iterable[Sequence[np.ndarray]]) -> l
     uses = []
     for u, v, path in zip(posterior.u, posterior.v, paths, strict=True):
         active, selected = u.sum((0, 1)).numpy(), v.sum(1).numpy()
-        total, lengths = float(active.sum()), run_lengths(path, len(active) - 1)
-        choices = range(len(active))
-        uses.append(
-            [_use(choice, float(active[choice]), selected[:, choice], total, lengths[choice]) for choice in choices]
-        )
+        total, choices = float(active.sum()), enumerate(on_paths(path, len(active) - 1))
+        uses.append([_use(choice, float(active[choice]), selected[:, choice], total, one) for choice, one in choices])
     return uses
 
 
-def _use(choice: int, active: float, selected: np.ndarray, total: float, lengths: np.ndarray) -> Use:
+def _use(choice: int, active: float, selected: np.ndarray, total: float, on_path: OnPaths) -> Use:
     """The use of a choice that is ``active`` in so many of ``total`` steps; ``selected`` is by demonstration."""
-    often = float(selected.sum())
-    duration = active / often if often > 1e-6 else None
-    within = float(selected.clip(max=1.0).sum())
+    often, lengths = float(selected.sum()), on_path.lengths
     return Use(
         choice=choice,
         share=active / total,
         selected=often,
-        demonstrations=within,
-        duration=duration,
+        demonstrations=float(selected.clip(max=1.0).sum()),
+        duration=active / often if often > 1e-6 else None,
         segments=len(lengths),
         steps=int(lengths.sum()),
         length=float(np.median(lengths)) if len(lengths) else None,
+        having=on_path.having,
+        within=on_path.within,
     )
 
 
@@ -118,7 +140,10 @@ HIGH_FITTING_SHARE = 0.5
 SMALLEST_DIVERGENCE = 0.1
 """Nats per step; two Gaussian policies whose means are 0.45 σ apart."""
 
-Kind = Literal["unused", "redundant", "dominating", "never_persisting", "high_fitting"]
+WHOLE = 0.9
+"""An option with this share of the steps of its demonstrations takes them whole."""
+
+Kind = Literal["unused", "redundant", "dominating", "whole", "never_persisting", "high_fitting"]
 
 ADVICE: Mapping[Kind, str] = {
     "unused": "Fewer options may do: compare hierarchy.levels.*.count by cross-validation (ddco-pyro select), or try "
@@ -128,6 +153,8 @@ ADVICE: Mapping[Kind, str] = {
     "count.",
     "dominating": "Train layer by layer (training.layerwise: true), or give the options' policies less capacity, so "
     "that one of them cannot do all the work.",
+    "whole": "Observe what is alike in all demonstrations: write positions relative to the first step, or differences "
+    "alone, into the file, and leave the originals out of observations.",
     "never_persisting": "A simpler termination (network: linear), fewer options, or observations that change more "
     "slowly (differences: false) let options last.",
     "high_fitting": "Train layer by layer (training.layerwise: true), give the calling policy less capacity, or let it "
@@ -147,7 +174,8 @@ class Finding:
     :param choice: the choice of the level.
     :param value: a share of the time, a duration in steps, or nats per step.
     :param other: the option that acts like a redundant one.
-    :param selections: of an option that never persists, in each demonstration with the option.
+    :param times: selections of an option that never persists, in each demonstration with the option; the number of
+        demonstrations that an option takes whole.
     """
 
     kind: Kind
@@ -155,7 +183,7 @@ class Finding:
     choice: int
     value: float
     other: int = 0
-    selections: float = 0.0
+    times: float = 0.0
 
     def advice(self, training: TrainingSpec) -> str:
         """The usual remedy for a model that was trained so."""
@@ -163,6 +191,22 @@ class Finding:
         if start is None or training.labels or {start, "vq_controls"} & {*training.starts}:
             return ADVICE[self.kind]
         return f"{ADVICE[self.kind]} Or start from clusters (training.initialize: {start})."
+
+    def options(self, names: Sequence[str]) -> str:
+        """The option, or the two options that act alike, by the names of a level's choices."""
+        both = (self.other, self.choice) if self.other else (self.choice,)
+        return listed(numbered_name(option, names) for option in both)
+
+    def amount(self, frequency: float | None) -> str:
+        """The value in words; the frequency is that of the control in Hz, None where unknown."""
+        if self.kind == "redundant":
+            return number(self.value, 3)
+        if self.kind == "never_persisting":
+            lasts = duration(frequency, self.value)
+            return f"{lasts}, selected {number(self.times, 1)} times a demonstration"
+        if self.kind == "whole":
+            return f"{percent(self.value)} of the {self.times:.0f} demonstrations that have it"
+        return percent(self.value, 1)
 
 
 def diagnose(options: Sequence[Sequence[Use]], divergences: Sequence[Sequence[Alike]] = ()) -> list[Finding]:
@@ -172,6 +216,7 @@ def diagnose(options: Sequence[Sequence[Use]], divergences: Sequence[Sequence[Al
     - dominating: one of several options that is active more than 90 % of the time;
     - never persisting: an option with an expected duration below 1.5 steps and at least three selections in each
       demonstration with the option, so that its caller does all the work;
+    - whole: an option that takes at least 90 % of the demonstrations that have it, where others lack it;
     - redundant: two used options with a divergence below 0.1 nats per step;
     - high-fitting: a caller that emits the control itself more than half of the time that it acts.
     """
@@ -191,9 +236,11 @@ def _of_option(level: int, use: Use, alone: bool) -> list[Finding]:
     findings = []
     if use.share > DOMINATING_SHARE and not alone:
         findings.append(Finding("dominating", level, use.choice, use.share))
+    if use.within is not None and use.within >= WHOLE:
+        findings.append(Finding("whole", level, use.choice, use.within, times=use.having))
     selections = use.selected / use.demonstrations if use.demonstrations else 0.0
     if use.duration is not None and use.duration < SHORTEST_DURATION and selections >= AGAIN_AND_AGAIN:
-        findings.append(Finding("never_persisting", level, use.choice, use.duration, selections=selections))
+        findings.append(Finding("never_persisting", level, use.choice, use.duration, times=selections))
     return findings
 
 
@@ -213,3 +260,55 @@ def _of_caller(level: int, control: float, not_acting: float) -> list[Finding]:
         return []
     own = (control - not_acting) / acting
     return [Finding("high_fitting", level, 0, own)] if own > HIGH_FITTING_SHARE else []
+
+
+# --- signs in words ---------------------------------------------------------------------------------------------------
+
+LISTED = 10
+"""Options, or pairs of options, that a sign lists, the clearest first."""
+
+SIGNS: Mapping[Kind, tuple[str, str]] = {
+    "unused": ("is unused; its share of all steps is", "are unused; their shares of all steps are"),
+    "dominating": ("dominates; its share of all steps is",) * 2,
+    "whole": (
+        "says which demonstration, not which skill; it takes",
+        "say which demonstration, not which skill; they take",
+    ),
+    "never_persisting": ("never persists; on average it lasts", "never persist; on average they last"),
+    "redundant": ("act alike; while either is active they differ, in nats per step, by",) * 2,
+}
+"""What one option, or one pair, does, and several."""
+
+
+def degeneracies(metrics: Metrics, spec: Spec, names: Mapping[str, Sequence[str]]) -> list[tuple[str, str]]:
+    """The findings of :func:`diagnose` in words, those of a kind and level as one sign, with the usual remedy.
+
+    :param names: of the choices of each level, such as ``fit.names``.
+    """
+    levels = spec.hierarchy.levels if spec.hierarchy else ()
+    groups: dict[tuple[int, Kind], list[Finding]] = {}
+    for finding in diagnose(metrics.options, metrics.divergences):
+        if finding.kind != "never_persisting" or levels[finding.level - 1].lasts:
+            groups.setdefault((finding.level, finding.kind), []).append(finding)
+    signs = []
+    for (number_of_level, _), findings in groups.items():
+        level = levels[number_of_level - 1].name
+        text = _sign(findings, level, names[level], metrics.control_frequency)
+        signs.append((text, findings[0].advice(spec.training)))
+    return signs
+
+
+def _sign(findings: Sequence[Finding], level: str, names: Sequence[str], frequency: float | None) -> str:
+    """The findings of one kind in a level as one sign of a degenerate solution."""
+    kind, first, many = findings[0].kind, findings[0], len(findings)
+    if kind == "high_fitting":
+        share = first.amount(frequency)
+        return f"High-fitting: the caller of level “{level}” emits the control itself in {share} of its steps."
+    one, several = SIGNS[kind]
+    if many == 1:
+        return f"{capital(first.options(names))} of level “{level}” {one} {first.amount(frequency)}."
+    ordered = sorted(findings, key=lambda finding: finding.value)[:LISTED]
+    values = [f"{finding.amount(frequency)} ({finding.options(names)})" for finding in ordered]
+    values += [f"so on for {many - LISTED} more"] if many > LISTED else []
+    what = "pairs of options" if kind == "redundant" else "options"
+    return f"{many} {what} of level “{level}” {several} {listed(values)}."

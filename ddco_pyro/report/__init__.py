@@ -12,7 +12,7 @@ from ddco_pyro.data.sources import open_source
 from ddco_pyro.drawing import words
 from ddco_pyro.drawing.figures import style
 from ddco_pyro.drawing.page import Block, Facts, Page, Text, footnote
-from ddco_pyro.drawing.shown import pictures, stored_pictures
+from ddco_pyro.drawing.shown import paths_of, pictures, stored_pictures
 from ddco_pyro.evaluation import effort, verdicts
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Metrics, Rate
@@ -31,18 +31,18 @@ def write_report(fit: Fit, demos: Demonstrations) -> Path:
     """
     path, metrics = fit.run_folder / "report.html", fit.metrics
     active = activity(fit, demos) if fit.spec.hierarchy else None
-    segmented = options.segmented(fit, active) if active else None
+    segmented, paths = active.segmented if active else None, paths_of(fit.spec.report.trajectory, demos)
     if segmented:
         ordered = demos.select([demo.name for demo in segmented.segments])
         shown = pictures(ordered) or _stored(fit, ordered)
-        follows = followed(ordered, shown, segmented, fit, options.MOST_STEPS)
+        follows = followed(ordered, shown, segmented, paths, options.MOST_STEPS)
         drawn = timelines(segmented, follows, options.MOST_STEPS)
     with style():
         learning = training.learning(fit)  # or a history is damaged, and no figure is written
         warned = training.warnings(fit)
         sections = [
             None if warned is None or warned.folded else warned,
-            skills.section(fit, ordered, shown, segmented) if segmented else None,
+            skills.section(fit, ordered, shown, paths, active) if active else None,
             options.segments(drawn, len(metrics.demonstrations_by_likelihood)) if segmented else None,
             agreement.section(fit, demos),
             worth.section(metrics),
@@ -51,8 +51,8 @@ def write_report(fit: Fit, demos: Demonstrations) -> Path:
             likelihood.section(fit),
             likelihood.demonstrations(metrics, {track.anchor for track in drawn.tracks} if segmented else ()),
             likelihood.dimensions(fit),
-            options.section(fit, demos, active) if active else None,
-            inputs.saliency(fit, demos),
+            options.section(fit, demos, active, paths) if active else None,
+            inputs.saliency(fit, demos, segmented),
             inputs.branches(fit),
             learning,
             warned if warned and warned.folded else None,

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, replace
 
 import numpy as np
+from torch import Tensor
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.sources.recording import label_names
-from ddco_pyro.evaluation.inferred import Inferred
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.names import option_name
 from ddco_pyro.segmenting import Segmented, Segments, of_piece, of_run
-from ddco_pyro.segmenting.page import label_colours
 
 MOST_BINS = 60
 
@@ -23,21 +21,17 @@ MOST_BINS = 60
 class LevelActivity:
     """One level over N demonstrations of at most T steps, C = 1 + k choices, control first.
 
+    :param names: the name of each choice, control first.
     :param active: u_t, the posterior probability of each choice [N, T, C]; 0 past a demonstration's end.
     :param path: choices of the most likely path [N, T]; -1 past the end.
-    :param ended: whether the path makes a new choice at this step: 1, 0, or -1 past the end [N, T].
     :param termination: ψ_h(s_t) of the k options [N, T, k].
-    :param lasts: whether options can be active for more than one step.
-    :param names: the name of each choice, control first.
     """
 
     name: str
+    names: Sequence[str]
     active: np.ndarray
     path: np.ndarray
-    ended: np.ndarray
     termination: np.ndarray
-    lasts: bool = field(default=True, kw_only=True)
-    names: Sequence[str] = field(default=(), kw_only=True)
 
     @property
     def choices(self) -> list[int]:
@@ -45,21 +39,16 @@ class LevelActivity:
         return [choice for choice in range(self.active.shape[2]) if choice or self.active[..., 0].any()]
 
 
-NOTHING = Segmented((), {}, None)
-
-
 @dataclass(frozen=True)
 class Activity:
-    """All levels, lowest first, over the same demonstrations of ``lengths`` [N] steps, and their segments."""
+    """All levels, lowest first, over the same demonstrations of ``lengths`` [N] steps.
+
+    :param segmented: their segments, in the order and with the numbers of ``demonstrations_by_likelihood``.
+    """
 
     levels: tuple[LevelActivity, ...]
     lengths: np.ndarray
-    segmented: Segmented = NOTHING
-
-    @cached_property
-    def label_colours(self) -> dict[str, dict[int, str]]:
-        """The colour of each label by the name of the labels: that of the option that it is matched with."""
-        return label_colours(self.segmented)
+    segmented: Segmented
 
     @property
     def choices(self) -> set[int]:
@@ -78,33 +67,30 @@ class Activity:
 
 def activity(fit: Fit, demos: Demonstrations) -> Activity:
     """The activity of a fit with at least one level."""
-    assert fit.spec.hierarchy is not None  # a baseline has no levels
-    known = fit.spec.hierarchy.levels
+    steps, pieces, segments = max(demos.lengths), [], dict[str, Segments]()
     labels = {demo.name: {name: demo.labels[name] for name in fit.spec.demonstrations.label_names} for demo in demos}
-    parts: list[tuple[list[np.ndarray], ...]] = []
-    segments: list[Segments] = []
     for piece in fit.infer(demos):
-        parts.append(_arrays(piece, max(demos.lengths)))
-        segments += of_piece(fit, piece, labels, intervals=True)
-    levels = []
-    for number, level in enumerate(known):
-        arrays = (np.concatenate([part[what][number] for part in parts]) for what in range(4))
-        levels.append(LevelActivity(level.name, *arrays, lasts=level.lasts, names=fit.names[level.name]))
-    segmented = of_run(fit, segments, demos.frequency, label_names(demos.attributes))
-    return Activity(tuple(levels), np.array(demos.lengths), segmented)
+        endings = (level[..., 1].exp() for level in piece.outputs.termination)
+        arrays = zip(piece.posterior.u, piece.path.choices, endings, strict=True)
+        pieces.append([(_padded(u.float(), steps), _padded(h, steps, -1), _padded(psi, steps)) for u, h, psi in arrays])
+        segments |= {demo.name: demo for demo in of_piece(fit, piece, labels, intervals=True)}
+    levels = tuple(
+        LevelActivity(name, names, *map(np.concatenate, zip(*arrays, strict=True)))
+        for (name, names), arrays in zip(fit.names.items(), zip(*pieces, strict=True), strict=True)
+    )
+    ordered = [
+        replace(segments[row.name], log_likelihood=row.log_likelihood_per_step[fit.name], held_out=row.part == "valid")
+        for row in fit.metrics.demonstrations_by_likelihood
+        if row.name in segments
+    ]
+    segmented = of_run(fit, ordered, demos.frequency, label_names(demos.attributes))
+    return Activity(levels, np.array(demos.lengths), segmented)
 
 
-def _arrays(piece: Inferred, steps: int) -> tuple[list[np.ndarray], ...]:
-    active = [_padded(u.float().numpy(), steps, 0.0) for u in piece.posterior.u]
-    choices, ended = ([_padded(level.numpy(), steps, -1) for level in part] for part in piece.path)
-    termination = [_padded(level[..., 1].exp().numpy(), steps, 0.0) for level in piece.outputs.termination]
-    return active, choices, ended, termination
-
-
-def _padded(array: np.ndarray, steps: int, value: float) -> np.ndarray:
+def _padded(values: Tensor, steps: int, end: float = 0.0) -> np.ndarray:
     """[N, T', ...] to [N, steps, ...]."""
-    missing = [(0, 0), (0, steps - array.shape[1])] + [(0, 0)] * (array.ndim - 2)
-    return np.pad(array, missing, constant_values=value)
+    missing = [(0, 0), (0, steps - values.shape[1])] + [(0, 0)] * (values.ndim - 2)
+    return np.pad(values.numpy(), missing, constant_values=end)
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import BranchUse
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.names import name_in_level, option_name
+from ddco_pyro.segmenting import Segmented
 from ddco_pyro.training.data import parts
 
 COLUMNS, ROWS = 4, 3
@@ -31,20 +32,22 @@ SHADES = ("#1f3b73", "#6f8fc9", "#c9a227", "#8c4a32", "#5b8c5a", "#7d6b91")
 """One for each branch, in turn."""
 
 
-def saliency(fit: Fit, demos: Demonstrations) -> Section | None:
-    """Saliency over a held-out demonstration, or over the first one where none is held out; None without pictures."""
+def saliency(fit: Fit, demos: Demonstrations, segmented: Segmented | None) -> Section | None:
+    """Saliency over a held-out demonstration, or over the first one where none is held out; None without pictures.
+
+    :param segmented: the segments of demonstrations; None for a policy without options.
+    """
     keys = fit.hierarchy.encoder.images
     if not keys:
         return None
     split = parts(fit.spec, demos)
     part = "valid" if "valid" in split and not fit.without else "train"
-    chosen = split[part].select(split[part].names[:1])
-    paths, names = [level[0] for level in fit.segment(chosen)], next(iter(fit.names.values()), ())
-    demo, gradients = chosen[0], Saliency(fit.hierarchy)
+    demo, gradients, names = split[part][0], Saliency(fit.hierarchy), next(iter(fit.names.values()), ())
+    levels = next((one.levels for one in segmented.segments if one.name == demo.name), {}) if segmented else {}
     shown = np.unique(np.linspace(0, len(demo) - 1, COLUMNS * ROWS).round().astype(int))
     panels = []
     for step in range(shown[-1] + 1):
-        choices = [int(path[step]) for path in paths]
+        choices = [int(level.options[step]) for level in levels.values()]
         looks = gradients.step({key: values[step] for key, values in demo.observations.items()}, choices)
         if step in shown:
             title = f"step {step}" + (f", {option_name(choices[0], names)}" if choices else "")

@@ -25,8 +25,8 @@ from ddco_pyro.metrics import NamedByLabel
 from ddco_pyro.names import label_name, numbered_name
 from ddco_pyro.report import trajectories
 from ddco_pyro.report.activity import Activity, Bins, LevelActivity, bins
-from ddco_pyro.segmenting import Segmented
 from ddco_pyro.segmenting.page import HOW
+from ddco_pyro.spec import PathSpec
 
 EXAMPLES = 4
 """Demonstrations whose posterior is shown step by step."""
@@ -50,9 +50,8 @@ LABEL_SHADES = ("#ffffff", "#d4d4d4")
 """Shades of segments whose label is matched with no option, in turn."""
 
 
-def section(fit: Fit, demos: Demonstrations, activity: Activity) -> Section:
-    """When each option is active, and how it is used."""
-    assert fit.spec.hierarchy is not None  # or there is no activity
+def section(fit: Fit, demos: Demonstrations, activity: Activity, paths: Sequence[PathSpec]) -> Section:
+    """When each option is active, how it is used, and the paths in space."""
     labels = [
         {name: demo.labels[name] for name in fit.spec.demonstrations.label_names if name in demo.labels}
         for demo in demos
@@ -60,7 +59,7 @@ def section(fit: Fit, demos: Demonstrations, activity: Activity) -> Section:
     pictures = (
         _posterior_picture(fit, demos, activity, labels),
         _rows_picture(fit, activity, labels),
-        trajectories.picture(fit, demos, activity),
+        trajectories.picture(fit, demos, activity, paths),
         _timing_picture(fit, activity),
     )
     used = note("On the most likely path of all demonstrations. The same option chosen anew stays one segment.")
@@ -178,7 +177,7 @@ def _example(
         strip.set_ylabel("path", **beside)
     for strip, (name, values) in zip(panels, labels.items(), strict=True):
         text = [label_name(name, value, known.get(name, ())) for value in values.tolist()]
-        _labels(strip, values, text, activity.label_colours.get(name, {}))
+        _labels(strip, values, text, activity.segmented.label_colours(name))
         strip.set_ylabel("label" if len(labels) == 1 else name, **beside)
     last = figure.axes[-1]
     last.set_xlim(-0.5, length - 0.5)
@@ -239,7 +238,7 @@ def draw_rows(activity: Activity, labels: Mapping[str, Sequence[np.ndarray]]) ->
     images = [(f"level “{level.name}”", colour_image(level.path[rows])) for level in reversed(activity.levels)]
     for name, values in labels.items():
         title = "ground-truth labels" if len(labels) == 1 else f"labels “{name}”"
-        colours = activity.label_colours.get(name, {})
+        colours = activity.segmented.label_colours(name)
         image = label_image([values[row] for row in rows], activity.lengths.max(), colours)
         images.append((title, image))
     figure = blank(float(np.clip(0.9 + 0.045 * len(rows), 2.2, 7)))
@@ -329,18 +328,6 @@ def terminations(level: LevelActivity, gathered: Bins) -> np.ndarray:
 
 
 # --- segments ---------------------------------------------------------------------------------------------------------
-
-
-def segmented(fit: Fit, activity: Activity) -> Segmented:
-    """The segments in the order of ``demonstrations_by_likelihood``, with its numbers."""
-    found = {demo.name: demo for demo in activity.segmented.segments}
-    entries = {one.name: one for one in fit.metrics.demonstrations_by_likelihood}  # held out, where it trains too
-    ordered = [
-        replace(found[name], log_likelihood=one.log_likelihood_per_step[fit.name], held_out=one.part == "valid")
-        for name, one in entries.items()
-        if name in found
-    ]
-    return replace(activity.segmented, segments=tuple(ordered))
 
 
 def segments(drawn: Timelines, demonstrations: int) -> Section:

@@ -28,16 +28,19 @@ from ddco_pyro.drawing.page import (
     Text,
     note,
 )
-from ddco_pyro.drawing.shown import frames, in_words, jpeg, paths_of, positions, projection
+from ddco_pyro.drawing.shown import frames, in_words, jpeg, positions, projection
 from ddco_pyro.drawing.words import duration, number, percent
 from ddco_pyro.errors import command
-from ddco_pyro.evaluation.options import SMALLEST_DIVERGENCE
+from ddco_pyro.evaluation.options import SMALLEST_DIVERGENCE, diagnose
 from ddco_pyro.fitting.fitted import Fit
+from ddco_pyro.metrics import Use
 from ddco_pyro.names import numbered_name
+from ddco_pyro.report.activity import Activity
 from ddco_pyro.report.inputs import deciding
 from ddco_pyro.report.options import agreeing
 from ddco_pyro.segmenting import Segmented
 from ddco_pyro.simulation.film import encoded
+from ddco_pyro.spec import PathSpec
 
 INSTANCES = 9
 """Instances in a film."""
@@ -128,29 +131,33 @@ def aligned(chosen: Sequence[Instance], most: int = FRAMES) -> np.ndarray:
     return steps
 
 
-def section(fit: Fit, demos: Demonstrations, pictures: Sequence[Observed], segmented: Segmented) -> Section:
+def section(
+    fit: Fit, demos: Demonstrations, pictures: Sequence[Observed], paths: Sequence[PathSpec], activity: Activity
+) -> Section:
     """Every option of every level, the highest level first, then the order and the likeness of the options.
 
     :param demos: in the order of their segments.
     :param pictures: of each demonstration; empty for none.
     """
-    shown = _Shown(fit, demos, pictures)
+    shown, segmented = _Shown(demos, pictures, paths), activity.segmented
     reads = deciding(fit, demos)
     blocks: list[Block] = [note(shown.explained())]
+    findings = diagnose(fit.metrics.options)
+    whole = {(finding.level, finding.choice): finding for finding in findings if finding.kind == "whole"}
     for place, (level, names) in reversed(list(enumerate(fit.names.items()))):
         if len(fit.names) > 1:
             blocks.append(Text(f"Level “{level}”", "heading"))
         counts = transitions(segmented, level)
-        steps = np.bincount(
-            np.concatenate([demo.levels[level].options for demo in segmented.segments]), minlength=len(names)
-        )
+        use = fit.metrics.options[place]
+        shares = [row.steps / sum(one.steps for one in use) for row in use]
         every = {choice: instances(segmented, level, choice) for choice in range(len(names))}
         present = [choice for choice, found in every.items() if found]
         for choice in present:
-            facts = _facts(steps[choice] / steps.sum(), every[choice], counts, choice, names, segmented.frequency)
+            facts = _facts(use[choice], shares[choice], every[choice], counts, names, segmented.frequency)
             labels = [one for one in fit.metrics.named_by_labels if (one.level, one.option) == (level, choice)]
             facts |= {f"Label {one.labels}, agreement": agreeing(one) for one in labels}
-            facts |= _not_a_skill(every[choice], segmented)
+            if takes := whole.get((1 + place, choice)):
+                facts["No skill"] = f"takes {takes.amount(None)}: it says which demonstration, not which skill"
             facts |= {what: values[choice] for what, values in reads.get(level, {}).items() if choice in values}
             facts = {what: said.replace(" %", "\N{NO-BREAK SPACE}%") for what, said in facts.items()}
             title = Cell(numbered_name(choice, names), colour=option_colour(choice))
@@ -169,42 +176,28 @@ def section(fit: Fit, demos: Demonstrations, pictures: Sequence[Observed], segme
             "mean onset: "
             f"{', '.join(names[choice] for choice in order)}."
         )
-        blocks.append(Drawing(transition_graph(counts, steps / steps.sum(), names, order), caption))
+        blocks.append(Drawing(transition_graph(counts, shares, names, order), caption))
         blocks += _alike(fit, place, level, names)
     return Section("skills", "Skills", blocks)
 
 
 def _facts(
+    use: Use,
     share: float,
     found: Sequence[Instance],
     counts: np.ndarray,
-    choice: int,
     names: Sequence[str],
     frequency: float | None,
 ) -> dict[str, str]:
-    low, median, high = np.percentile([len(one) for one in found], [25, 50, 75])
+    low, high = np.percentile([len(one) for one in found], [25, 75])
     return {
         "Share of steps": percent(share, 1),
-        "Segments": str(len(found)),
-        "Median length": duration(frequency, median),
+        "Segments": str(use.segments),
+        "Median length": duration(frequency, use.length or 0.0),
         "Quartiles of length": duration(frequency, low, high),
-        "Comes after": _frequent(counts[:, choice], [*names, "start"]),
-        "Comes before": _frequent(counts[choice], [*names, "end"]),
+        "Comes after": _frequent(counts[:, use.choice], [*names, "start"]),
+        "Comes before": _frequent(counts[use.choice], [*names, "end"]),
     }
-
-
-WHOLE = 0.9
-"""An option with this share of the steps of its demonstrations takes them whole."""
-
-
-def _not_a_skill(found: Sequence[Instance], segmented: Segmented) -> dict[str, str]:
-    """A fact on an option that some demonstrations have from their start to their end; empty for others."""
-    rows = {one.row for one in found}
-    share = sum(map(len, found)) / sum(len(segmented.segments[row]) for row in rows)
-    if share < WHOLE or len(rows) == len(segmented):
-        return {}
-    takes = f"takes {percent(share)} of the {len(rows)} demonstrations that have it"
-    return {"No skill": f"{takes}: it says which demonstration, not which skill"}
 
 
 def _frequent(counts: np.ndarray, names: Sequence[str], most: int = 2) -> str:
@@ -241,11 +234,10 @@ def _alike(fit: Fit, place: int, level: str, names: Sequence[str]) -> list[Block
 
 
 class _Shown:
-    """Pictures and films of the segments of one fit, from what its demonstrations have."""
+    """Pictures and films of segments, from what demonstrations have."""
 
-    def __init__(self, fit: Fit, demos: Demonstrations, pictures: Sequence[Observed]) -> None:
-        self.demos, self.pictures = demos, pictures
-        self.drawn = () if pictures else paths_of(fit.spec.report.trajectory, demos)
+    def __init__(self, demos: Demonstrations, pictures: Sequence[Observed], paths: Sequence[PathSpec]) -> None:
+        self.demos, self.pictures, self.drawn = demos, pictures, () if pictures else paths
         self.films = 0
         self.paths: list[np.ndarray] = []
         if self.drawn:

@@ -12,15 +12,14 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from ddco_pyro.drawing import words
 from ddco_pyro.drawing.figures import INK, blank, save
 from ddco_pyro.drawing.page import Block, Code, Columns, Facts, Folded, Section, Text, Warned, note
-from ddco_pyro.drawing.words import number, percent
+from ddco_pyro.drawing.words import number
 from ddco_pyro.evaluation import effort
-from ddco_pyro.evaluation.options import Finding, diagnose
+from ddco_pyro.evaluation.options import degeneracies
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import read_table, refit
-from ddco_pyro.names import method, numbered_name
+from ddco_pyro.names import method
 from ddco_pyro.spec import dump_spec
 
 COLUMNS = 4
@@ -149,76 +148,20 @@ def warnings(fit: Fit) -> Section | None:
     blocks: list[Block] = [Warned(*sign) for sign in effort.unconverged(fit.metrics)]
     if fit.spec.hierarchy is None:
         return Section("warnings", "Warnings", blocks) if blocks else None
-    signs = degeneracies(fit)
+    signs = degeneracies(fit.metrics, fit.spec, fit.names)
     blocks += [Warned(*sign) for sign in signs]
-    found = bool(blocks)
+    problems = bool(blocks)
     if not signs:
         blocks.append(
             Text(
                 "No sign of a degenerate solution. Every option is used (at least 1 % of all steps) and none dominates "
                 "(more than 90 %). No two options act alike (differ by less than 0.1 nats per step). No option ends at "
                 "once again and again (lasts less than 1.5 steps, with three selections or more in a demonstration). "
+                "No option takes some demonstrations whole (at least 90 % of their steps). "
                 "No caller emits the control itself most of the time."
             )
         )
-    return Section("warnings", "Warnings", blocks, folded=not found)
-
-
-def degeneracies(fit: Fit) -> list[tuple[str, str]]:
-    """Signs of a degenerate solution in ``metrics.json``, each in words with its number, and the usual remedy."""
-    if fit.spec.hierarchy is None:
-        return []
-    levels, groups = fit.spec.hierarchy.levels, dict[tuple[int, str], list[Finding]]()
-    for finding in diagnose(fit.metrics.options, fit.metrics.divergences):
-        if finding.kind != "never_persisting" or levels[finding.level - 1].lasts:
-            groups.setdefault((finding.level, finding.kind), []).append(finding)
-    return [
-        (_sign(found, levels[level - 1].name, fit), found[0].advice(fit.spec.training))
-        for (level, _), found in groups.items()
-    ]
-
-
-LISTED = 10
-"""Options, or pairs of options, that a sign lists, the clearest first."""
-
-
-def _sign(found: Sequence[Finding], level: str, fit: Fit) -> str:
-    """The findings of one kind in a level as one sign of a degenerate solution, in words."""
-    if found[0].kind == "high_fitting":
-        share = percent(found[0].value, 1)
-        return f"High-fitting: the caller of level “{level}” emits the control itself in {share} of its steps."
-    many = len(found) > 1
-    said = {
-        "unused": "are unused; their shares of all steps are" if many else "is unused; its share of all steps is",
-        "dominating": "dominates; its share of all steps is",
-        "redundant": "act alike; while either is active they differ, in nats per step, by",
-        "never_persisting": "never persist; on average they last" if many else "never persists; on average it lasts",
-    }[found[0].kind]
-    ordered = sorted(found, key=lambda finding: finding.value)
-    each = [_value(finding, fit.metrics.control_frequency) for finding in ordered[:LISTED]]
-    who = [_who(finding, fit.names[level]) for finding in ordered[:LISTED]]
-    left = len(found) - LISTED
-    if many:
-        values = [f"{value} ({name})" for value, name in zip(each, who, strict=True)]
-        kind = "pairs of options" if found[0].kind == "redundant" else "options"
-        more = [f"so on for {left} more"] if left > 0 else []
-        return f"{len(found)} {kind} of level “{level}” {said} {words.listed([*values, *more])}."
-    return f"{words.capital(who[0])} of level “{level}” {said} {each[0]}."
-
-
-def _who(finding: Finding, names: Sequence[str]) -> str:
-    """The option, or the two options, of a finding."""
-    both = (finding.other, finding.choice) if finding.other else (finding.choice,)
-    return words.listed(numbered_name(option, names) for option in both)
-
-
-def _value(finding: Finding, frequency: float | None) -> str:
-    if finding.kind == "redundant":
-        return number(finding.value, 3)
-    if finding.kind == "never_persisting":
-        lasts = words.duration(frequency, finding.value)
-        return f"{lasts}, selected {number(finding.selections, 1)} times a demonstration"
-    return percent(finding.value, 1)
+    return Section("warnings", "Warnings", blocks, folded=not problems)
 
 
 # --- particulars ------------------------------------------------------------------------------------------------------

@@ -17,9 +17,10 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.drawing.colours import add_legend, option_colour
 from ddco_pyro.drawing.figures import FAINT, INK, blank, save
 from ddco_pyro.drawing.page import Picture
-from ddco_pyro.drawing.shown import LINES, MOST_STRETCHED, in_words, paths_of, positions, spans, view
+from ddco_pyro.drawing.shown import LINES, MOST_STRETCHED, in_words, positions, spans, view
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.report.activity import Activity, LevelActivity
+from ddco_pyro.spec import PathSpec
 
 MOST_TRAJECTORIES = 40
 MOST_POINTS = 300
@@ -30,10 +31,8 @@ CHOSEN = (
 )
 
 
-def picture(fit: Fit, demos: Demonstrations, activity: Activity) -> Picture | None:
-    """The demonstrations in space or in the plane; None where no observation looks like a position."""
-    named = fit.spec.report.trajectory
-    paths = paths_of(named, demos)
+def picture(fit: Fit, demos: Demonstrations, activity: Activity, paths: Sequence[PathSpec]) -> Picture | None:
+    """The demonstrations in space or in the plane; None without paths."""
     if not paths:
         return None
     places = [positions(demo, paths) for demo in demos]
@@ -41,7 +40,8 @@ def picture(fit: Fit, demos: Demonstrations, activity: Activity) -> Picture | No
     seen = "Both axes have one scale." if plane else "Seen along the direction in which the trajectories spread least."
     caption = (
         f"{min(len(demos), MOST_TRAJECTORIES)} demonstrations, coloured by the most likely option: "
-        f"{in_words(paths, demos)}, in its own units. {'' if named else CHOSEN}Circles: first steps. {seen}"
+        f"{in_words(paths, demos)}, in its own units. {'' if fit.spec.report.trajectory else CHOSEN}"
+        f"Circles: first steps. {seen}"
     )
     names = [f"{paths[0].key}[{place}]" for place in paths[0].among(demos.observation_shapes[paths[0].key][0])]
     figure = draw(activity, places, names if len(paths) == 1 else ["x", "y", "z"][: len(names)])

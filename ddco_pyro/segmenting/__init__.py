@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,9 @@ from ddco_pyro.data.hdf5 import DemonstrationsError
 from ddco_pyro.data.memory import Extent, refuse_too_much
 from ddco_pyro.data.sources import Recording, Source, open_source
 from ddco_pyro.data.sources.recording import label_names
+from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.errors import BadInput
+from ddco_pyro.evaluation.agreement import confusion
 from ddco_pyro.evaluation.inferred import Inferred, started
 from ddco_pyro.events import BaselineSegmented, DemonstrationsDone, OnEvent, ignore
 from ddco_pyro.fitting.fitted import Fit
@@ -110,6 +113,32 @@ class Segmented:
 
     def __len__(self) -> int:
         return len(self.segments)
+
+    def labelled(self, truth: str) -> dict[str, Sequence[Segments]]:
+        """The demonstrations that have these labels, by part in words: the held-out ones first, then the others."""
+        labelled = [demo for demo in self.segments if truth in demo.labels]
+        held_out, others = ([demo for demo in labelled if demo.held_out is held] for held in (True, False))
+        parts = {f"{len(held_out)} held out": held_out, f"{len(others)} {'others' if held_out else 'in all'}": others}
+        return {part: group for part, group in parts.items() if group}
+
+    @cached_property
+    def matched(self) -> dict[str, dict[int, int]]:
+        """For labels that the run's spec compares with a level: the option that each label is matched with.
+
+        They are matched in held-out demonstrations, or in all where none is held out, as in tables. Labels of several
+        levels are matched with the lowest one's options.
+        """
+        options_of: dict[str, dict[int, int]] = {}
+        for level, truth in self.truth.items():
+            group = next(iter(self.labelled(truth).values()), ())
+            table = confusion([demo.levels[level].options for demo in group], [demo.labels[truth] for demo in group])
+            pairs = zip(table.matched, table.options, strict=True)
+            options_of.setdefault(truth, {label: option for label, option in pairs if label is not None})
+        return options_of
+
+    def label_colours(self, name: str) -> dict[int, str]:
+        """The colour of each label of this name: that of the option that it is matched with."""
+        return {label: option_colour(option) for label, option in self.matched.get(name, {}).items()}
 
 
 def segment(fit: Fit, path: str | Path) -> Segmented:

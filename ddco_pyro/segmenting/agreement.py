@@ -9,9 +9,9 @@ import numpy as np
 
 from ddco_pyro.drawing.page import Table
 from ddco_pyro.drawing.words import duration, number
-from ddco_pyro.evaluation.agreement import MATCHED, TOLERANCES, UNMATCHED, agreement, confusion
+from ddco_pyro.evaluation.agreement import MATCHED, TOLERANCES, UNMATCHED, agreement
 from ddco_pyro.metrics import Scores
-from ddco_pyro.segmenting import Segmented, Segments
+from ddco_pyro.segmenting import Segmented
 from ddco_pyro.segmenting.baselines import BASELINES, EQUAL, equal_lengths
 
 MATCHINGS = {"matched_globally": "one for all", "matched_per_demonstration": "each its own"}
@@ -82,7 +82,7 @@ def level_agreements(segmented: Segmented) -> dict[str, LevelAgreement]:
     """
     agreements = {}
     for level, truth in segmented.truth.items():
-        groups = _groups(segmented, truth)
+        groups = segmented.labelled(truth)
         if not groups:
             continue
         scores: dict[str, Scores | None] = {}
@@ -102,26 +102,3 @@ def level_agreements(segmented: Segmented) -> dict[str, LevelAgreement]:
 def of_equal_lengths(labels: Sequence[np.ndarray], count: int) -> Scores | None:
     """The agreement with labels [T] of demonstrations that are cut into ``count`` equal parts."""
     return agreement([equal_lengths(len(own), count) for own in labels], labels)
-
-
-def matched(segmented: Segmented) -> dict[str, dict[int, int]]:
-    """For labels that the run's spec compares with a level: the option that each label is matched with.
-
-    They are matched in held-out demonstrations, or in all where none is held out, as in tables. Labels of several
-    levels are matched with the lowest one's options.
-    """
-    found: dict[str, dict[int, int]] = {}
-    for level, truth in segmented.truth.items():
-        labelled = next(iter(_groups(segmented, truth).values()), ())
-        table = confusion([demo.levels[level].options for demo in labelled], [demo.labels[truth] for demo in labelled])
-        pairs = zip(table.matched, table.options, strict=True)
-        found.setdefault(truth, {label: option for label, option in pairs if label is not None})
-    return found
-
-
-def _groups(segmented: Segmented, truth: str) -> dict[str, Sequence[Segments]]:
-    """The demonstrations that have these labels, by part: the held-out ones first, then the others."""
-    labelled = [demo for demo in segmented.segments if truth in demo.labels]
-    held_out, others = ([demo for demo in labelled if demo.held_out is held] for held in (True, False))
-    named = {f"{len(held_out)} held out": held_out, f"{len(others)} {'others' if held_out else 'in all'}": others}
-    return {name: group for name, group in named.items() if group}

@@ -4,29 +4,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import accumulate, chain, islice, zip_longest
+from itertools import accumulate, islice, zip_longest
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 import numpy as np
 
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.demonstrations import Demonstration
 from ddco_pyro.data.files import write_text
 from ddco_pyro.data.pictures import Observed
 from ddco_pyro.data.sources.recording import BOUNDARY
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.drawing.page import Block, Cell, Page, Section, Table, Text, footnote, note
-from ddco_pyro.drawing.shown import paths_of
 from ddco_pyro.drawing.timeline import Lane, Runs, Timelines, Track, following
 from ddco_pyro.drawing.words import NAT, duration, number, percent
-from ddco_pyro.fitting.fitted import Fit
+from ddco_pyro.evaluation.options import on_paths
 from ddco_pyro.names import label_name, numbered_name, option_name
 from ddco_pyro.segmenting import Segmented, Segments
-from ddco_pyro.segmenting.agreement import EXPLAINED, LevelAgreement, agreement_table, matched, tolerances
-
-FIRST = 10
-"""Demonstrations among which an observation that moves like a position is sought."""
+from ddco_pyro.segmenting.agreement import EXPLAINED, LevelAgreement, agreement_table, tolerances
+from ddco_pyro.spec import PathSpec
 
 HOW = (
     "Time runs to the right. Colours are options; the height of a band is the posterior probability of its option. A "
@@ -60,18 +57,14 @@ def write_page(
 
 def _level(name: str, segmented: Segmented, agreement: LevelAgreement | None) -> Section:
     """How much of the time each option of a level takes, how often, and for how long."""
-    per_demo = [demo.levels[name].runs(anew=False) for demo in segmented.segments]
-    runs = [run for each in per_demo for run in each]
-    total = sum(end - start for _, start, end in runs)
-    rows = []
-    for option in range(segmented.counts[name] + 1):
-        lengths = [end - start for choice, start, end in runs if choice == option]
-        if option or lengths:
+    paths, rows = [demo.levels[name].options for demo in segmented.segments], []
+    total = sum(map(len, paths))
+    for option, (lengths, having, _) in enumerate(on_paths(paths, segmented.counts[name])):
+        if option or having:
             named = Cell(numbered_name(option, segmented.names.get(name, ())), colour=option_colour(option))
-            median = duration(segmented.frequency, float(np.median(lengths))) if lengths else "–"
-            there = sum(any(choice == option for choice, _, _ in each) for each in per_demo)
-            used = [percent(sum(lengths) / total, 1), str(len(lengths)), median]
-            rows.append([named, *used, f"{there} of {len(segmented)}"])
+            median = duration(segmented.frequency, float(np.median(lengths))) if having else "–"
+            share = percent(float(lengths.sum()) / total, 1)
+            rows.append([named, share, str(len(lengths)), median, f"{having} of {len(segmented)}"])
     head = ["Option", "Share of steps", "Segments", "Median length", "Demonstrations with it"]
     blocks: list[Block] = [Table(head, rows)]
     if agreement:
@@ -93,8 +86,7 @@ def timelines(
     :param follows: what follows the cursor, of :func:`~ddco_pyro.drawing.timeline.following`.
     """
     lanes = {name: _level_lane(name, segmented) for name in reversed(segmented.counts)}
-    colours = label_colours(segmented)
-    lanes |= {name: Lane(name, names, colours.get(name, {})) for name, names in _values(segmented).items()}
+    lanes |= {name: Lane(name, names, segmented.label_colours(name)) for name, names in _values(segmented).items()}
     before = accumulate((len(demo) * len(segmented.counts) for demo in segmented.segments), initial=0)
     shown = [demo for demo, steps in zip(segmented.segments, before, strict=False) if steps < most_steps]
     tracks = [
@@ -112,31 +104,21 @@ def timelines(
     return Timelines(list(lanes.values()), tracks, segmented.frequency)
 
 
-def label_colours(segmented: Segmented) -> dict[str, dict[int, str]]:
-    """The colour of each label: that of the option that it is matched with."""
-    return {
-        name: {label: option_colour(option) for label, option in options.items()}
-        for name, options in matched(segmented).items()
-    }
-
-
 def followed(
     demos: Iterable[Demonstration],
     pictures: Sequence[Observed],
     segmented: Segmented,
-    fit: Fit,
+    paths: Sequence[PathSpec],
     most_steps: float = math.inf,
 ) -> Iterator[Mapping[str, Any]]:
     """What follows the cursor along demonstrations in the order of their segments.
 
     :param pictures: of each demonstration; empty for none.
+    :param paths: in space that are drawn.
     :param most_steps: as in :func:`timelines`.
     """
     steps = min(sum(map(len, segmented.segments)), most_steps / len(segmented.counts))
-    ordered = iter(demos)
-    first = list(islice(ordered, FIRST))
-    paths = paths_of(fit.spec.report.trajectory, Demonstrations(tuple(first)))
-    return following(chain(first, ordered), pictures, int(steps), paths)
+    return following(demos, pictures, int(steps), paths)
 
 
 def _level_lane(name: str, segmented: Segmented) -> Lane:

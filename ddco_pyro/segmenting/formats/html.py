@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
-from ddco_pyro.drawing.shown import stored_pictures
+from itertools import chain, islice
+
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.drawing.shown import paths_of, stored_pictures
 from ddco_pyro.segmenting import Segmented, recorded
 from ddco_pyro.segmenting.agreement import level_agreements
 from ddco_pyro.segmenting.formats import Writer
 from ddco_pyro.segmenting.page import followed, write_page
+
+FIRST = 10
+"""Demonstrations among which an observation that moves like a position is sought."""
 
 
 class Page(Writer):
@@ -15,6 +21,9 @@ class Page(Writer):
     def write(self, segmented: Segmented) -> str:
         asked = self.asked
         pictures = stored_pictures(asked.source, {demo.name: len(demo) for demo in segmented.segments})
-        follows = followed(recorded(segmented, asked.fit, asked.source), pictures, segmented, asked.fit)
+        demos = recorded(segmented, asked.fit, asked.source)
+        first = list(islice(demos, FIRST))
+        paths = paths_of(asked.fit.spec.report.trajectory, Demonstrations(tuple(first)))
+        follows = followed(chain(first, demos), pictures, segmented, paths)
         write_page(self.out, segmented, str(asked.run), str(asked.demos), level_agreements(segmented), follows)
         return str(self.out)
