@@ -427,7 +427,7 @@ def test_the_verdict_is_honest(mean, error, held_out, said):
         (
             (16.5, -9.7),
             (15.9, 15.4),
-            "Options fell apart on held-out demonstrations: −9.70 nats per step there,",
+            "Options fell apart on held-out demonstrations: −9.70 nats per step",
             False,
         ),
         ((-17.0, -409.0), (-3.0, -3.3), "Options fell apart on held-out demonstrations: −409.00 nats", False),

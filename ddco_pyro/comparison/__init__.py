@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ddco_pyro.data.controls import difference
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.pictures import same
 from ddco_pyro.errors import BadInput, path_of
 from ddco_pyro.evaluation.agreement import UNMATCHED
@@ -178,16 +178,11 @@ def _check_same(first: Fit, ours: Demonstrations, second: Fit, theirs: Demonstra
         remedy = "fit both with the same demonstrations, valid_fraction and seed"
         raise CompareError(f"{lead}: {only[0]} was held out by {where} alone; {remedy}")
     for mine, yours in zip(ours, theirs.select(ours.names), strict=True):
-        if different := _different(mine, yours):
+        both = [key for key in mine.observations if key in yours.observations]
+        arrays = {f"obs/{key}": (mine.observations[key], yours.observations[key]) for key in both}
+        arrays["actions"] = (mine.actions, yours.actions)
+        if different := ", ".join(key for key, (left, right) in arrays.items() if not same(left, right)):
             raise CompareError(f"{lead}: {mine.name} has other {different}; fit both to the same demonstrations")
-
-
-def _different(mine: Demonstration, yours: Demonstration) -> str:
-    """The arrays that differ, among those of both demonstrations; empty where none does."""
-    both = [key for key in mine.observations if key in yours.observations]
-    arrays = {f"obs/{key}": (mine.observations[key], yours.observations[key]) for key in both}
-    arrays["actions"] = (mine.actions, yours.actions)
-    return ", ".join(key for key, (left, right) in arrays.items() if not same(left, right))
 
 
 def _check_measure(first: Fit, second: Fit) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import takewhile
 
 import numpy as np
 
@@ -168,11 +169,11 @@ def projection(points: np.ndarray) -> np.ndarray:
 
 def pictures(demos: Sequence[Demonstration]) -> list[Observed]:
     """The first observation of each demonstration that is a picture; empty where one has none."""
-    found = (
+    first = (
         next((array for array in demo.observations.values() if len(array.shape) == 1 + PICTURE_DIMENSIONS), None)
         for demo in demos
     )
-    return _every(found)
+    return _all_or_none(first, len(demos))
 
 
 def stored_pictures(source: Source, lengths: Mapping[str, int]) -> list[Observed]:
@@ -188,16 +189,13 @@ def stored_pictures(source: Source, lengths: Mapping[str, int]) -> list[Observed
         next((column.kept for column in each if column.image and len(column.kept or ()) == steps), None)
         for each, steps in zip(columns, lengths.values(), strict=True)
     )
-    return _every(lazy)
+    return _all_or_none(lazy, len(lengths))
 
 
-def _every(found: Iterable[Observed | None]) -> list[Observed]:
-    there = []
-    for array in found:
-        if array is None:
-            return []
-        there.append(array)
-    return there
+def _all_or_none(arrays: Iterable[Observed | None], count: int) -> list[Observed]:
+    """The arrays up to the first that is missing, where these are all."""
+    there = list(takewhile(lambda array: array is not None, arrays))
+    return [array for array in there if array is not None] if len(there) == count else []
 
 
 def frames(observed: Observed, steps: Sequence[int] | np.ndarray, height: int) -> np.ndarray:

@@ -17,7 +17,7 @@ from ddco_pyro.evaluation import effort, verdicts
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Metrics, Rate
 from ddco_pyro.names import method
-from ddco_pyro.report import agreement, inputs, likelihood, options, rollouts, skills, training, worth
+from ddco_pyro.report import agreement, inputs, likelihood, options, rollouts, skills, training
 from ddco_pyro.report.activity import activity
 from ddco_pyro.segmenting.page import followed, timelines
 
@@ -45,7 +45,7 @@ def write_report(fit: Fit, demos: Demonstrations) -> Path:
             skills.section(fit, ordered, shown, paths, active) if active else None,
             options.segments(drawn, len(metrics.demonstrations_by_likelihood)) if segmented else None,
             agreement.section(fit, demos),
-            worth.section(metrics),
+            likelihood.parts(metrics),
             rollouts.success(fit),
             rollouts.films(fit),
             likelihood.section(fit),

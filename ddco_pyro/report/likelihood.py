@@ -9,8 +9,17 @@ from matplotlib.figure import Figure
 
 from ddco_pyro.data.controls import ControlDimension
 from ddco_pyro.drawing.figures import Interval, Panel, interval_plot, save
-from ddco_pyro.drawing.page import Block, Cell, Section, Table, Text, note
-from ddco_pyro.drawing.words import about, capital, duration, listed, number, with_error
+from ddco_pyro.drawing.page import Block, Cell, Section, Table, Text, footnote, note
+from ddco_pyro.drawing.words import (
+    about,
+    capital,
+    duration,
+    listed,
+    mean_and_interval,
+    number,
+    of_episodes,
+    with_error,
+)
 from ddco_pyro.evaluation.effort import effort
 from ddco_pyro.evaluation.verdicts import verdict
 from ddco_pyro.fitting.fitted import Fit
@@ -147,3 +156,43 @@ def dimensions(fit: Fit) -> Section:
     text = f"Nats per step on {shown} demonstrations."
     blocks: list[Block] = [Text(text), Table(head, rows, {0, len(head) - 2, len(head) - 1}), note(explained)]
     return Section("dimensions", "Log-likelihood by control dimension", blocks, folded=True)
+
+
+# --- what options are worth ------------------------------------------------------------------------------------------
+
+
+PARTS_EXPLAINED = (
+    "A mixture has the options’ policies and the gate that chooses among them, and chooses anew at every step. The "
+    "mixture’s lead over one flat policy is the worth of several policies and of their parameters. The options’ lead "
+    "over the mixture is the worth of options that last. This fit: ± one standard error over held-out demonstrations, "
+    "p by McNemar’s exact test. Training seeds: mean with its 95 % interval."
+)
+
+
+def parts(metrics: Metrics) -> Section | None:
+    """The parts in held-out log-likelihood and in success, a row each; None where the run has no mixture."""
+    found, seeds, rollouts = metrics.worth, metrics.seeds, metrics.rollouts
+    if not found:
+        return None
+    ours, flat = method(metrics.model), method(found.flat or "flat")
+    parts = {
+        "experts": f"Several policies: mixture − {flat}",
+        "memory": f"Options that last: {ours} − mixture",
+        "total": f"Together: {ours} − {flat}",
+    }
+    columns = {"Nats per step, this fit": {part: with_error(getattr(found, part)) for part in parts}}
+    if seeds:
+        each = {part: mean_and_interval(values) for part, values in seeds.worth.items()}
+        columns[f"Nats per step, {len(seeds.training_seeds)} training seeds"] = each
+    if rollouts and rollouts.worth:
+        column = f"Successes of {rollouts.episodes} episodes, this fit"
+        columns[column] = {part: of_episodes(getattr(rollouts.worth, part)) for part in parts}
+    if rollouts and rollouts.seeds:
+        each = {part: mean_and_interval(values, 100, 0) for part, values in rollouts.seeds.worth.items()}
+        columns[f"Points of success, {len(rollouts.seeds.training_seeds)} training seeds"] = each
+    rows = [
+        [name, *(values.get(part, "–") for values in columns.values())]
+        for part, name in parts.items()
+        if getattr(found, part)
+    ]
+    return Section("worth", "What options are worth", [Table(["Part", *columns], rows), footnote(PARTS_EXPLAINED)])

@@ -11,7 +11,7 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
-from matplotlib.figure import Figure, SubFigure
+from matplotlib.figure import SubFigure
 from matplotlib.ticker import MaxNLocator
 
 from ddco_pyro.data.demonstrations import Demonstrations
@@ -89,15 +89,8 @@ def use_table(fit: Fit, levels: Sequence[str] | None = None) -> Table:
                 length = "–" if row.length is None else duration(fit.metrics.control_frequency, row.length)
                 label = [stands_for.get((level, row.choice), "–")] if stands_for else []
                 rows.append([level, named, percent(row.steps / total, 1), str(row.segments), length, *label])
-    head = [
-        "Level",
-        "Option",
-        "Share of steps",
-        "Segments",
-        "Median length",
-        *(["Label, agreement"] if stands_for else []),
-    ]
-    return Table(head, rows, {0, 1, 5})
+    head = ["Level", "Option", "Share of steps", "Segments", "Median length"]
+    return Table([*head, *(["Label, agreement"] if stands_for else [])], rows, {0, 1, 5})
 
 
 def agreeing(one: NamedByLabel) -> str:
@@ -116,6 +109,7 @@ def quoted(names: Mapping[str, Any] | Sequence[str]) -> str:
 def _posterior_picture(
     fit: Fit, demos: Demonstrations, activity: Activity, labels: Sequence[Mapping[str, np.ndarray]]
 ) -> Picture:
+    """Two demonstrations side by side: for each level u_t, stacked, over the most likely path."""
     held_out = [demo.name for demo in fit.metrics.valid if demo.name in demos.names]
     names = (held_out or list(demos.names))[:EXAMPLES]
     examples = {name: demos.names.index(name) for name in names}
@@ -125,41 +119,18 @@ def _posterior_picture(
     )
     if known := labels[examples[names[0]]]:
         caption += f" Boxes: ground-truth {quoted(known)}, in the colour of the option that a label is matched with."
-    figure = draw_posteriors(activity, examples, labels, activity.segmented.label_names)
+    rows = -(-len(examples) // 2)
+    figure = blank(0.35 + rows * (0.55 + 1.25 * len(activity.levels) + 0.2 * len(known)))
+    for part, (name, row) in zip(figure.subfigures(rows, 2, squeeze=False).flat, examples.items(), strict=False):
+        _example(part, activity, row, labels[row])
+        part.axes[0].set_title(name)
+    add_legend(figure, activity.choices, activity.names)
     alt = f"Stacked probabilities of the options over time in {', '.join(names)}"
     return save(figure, fit.run_folder / "figures" / "posterior.png", alt, caption)
 
 
-def draw_posteriors(
-    activity: Activity,
-    examples: Mapping[str, int],
-    labels: Sequence[Mapping[str, np.ndarray]],
-    known: Mapping[str, Sequence[str]],
-) -> Figure:
-    """Two demonstrations side by side: for each level u_t, stacked, over the most likely path.
-
-    :param examples: name and row of each demonstration.
-    :param labels: of every demonstration, name to [T].
-    :param known: the names of labels 0, 1, ... by name of labels.
-    """
-    rows = -(-len(examples) // 2)
-    strips = len(labels[next(iter(examples.values()))])
-    figure = blank(0.35 + rows * (0.55 + 1.25 * len(activity.levels) + 0.2 * strips))
-    for part, (name, row) in zip(figure.subfigures(rows, 2, squeeze=False).flat, examples.items(), strict=False):
-        _example(part, activity, row, labels[row], known)
-        part.axes[0].set_title(name)
-    add_legend(figure, activity.choices, activity.names)
-    return figure
-
-
-def _example(
-    figure: SubFigure,
-    activity: Activity,
-    row: int,
-    labels: Mapping[str, np.ndarray],
-    known: Mapping[str, Sequence[str]],
-) -> None:
-    length = int(activity.lengths[row])
+def _example(figure: SubFigure, activity: Activity, row: int, labels: Mapping[str, np.ndarray]) -> None:
+    length, known = int(activity.lengths[row]), activity.segmented.label_names
     heights = [*([5, 0.8] * len(activity.levels)), *([0.9] * len(labels))]
     panels = iter(figure.subplots(len(heights), 1, height_ratios=heights, gridspec_kw={"hspace": 0.02}))
     beside: dict[str, Any] = {"rotation": 0, "ha": "right", "va": "center", "fontsize": 7.5}
@@ -211,19 +182,6 @@ def _labels(axes: Axes, labels: np.ndarray, names: Sequence[str], colours: Mappi
 # --- the most likely path of every demonstration ----------------------------------------------------------------------
 
 
-def _rows_picture(fit: Fit, activity: Activity, labels: Sequence[Mapping[str, np.ndarray]]) -> Picture:
-    count = len(labels)
-    caption = (
-        f"Most likely options of all {count} demonstrations, one row each, sorted by length, then by the step at which "
-        "the option first changes."
-    )
-    if labels[0]:
-        caption += " A ground-truth label has the colour of the option that it is matched with, or is grey."
-    figure = draw_rows(activity, {name: [each[name] for each in labels] for name in labels[0]})
-    alt = f"Rows of colour: the most likely option at each step of {count} demonstrations"
-    return save(figure, fit.run_folder / "figures" / "segments.png", alt, caption)
-
-
 def row_order(activity: Activity) -> np.ndarray:
     """Demonstrations by length, then by the step at which the option of the lowest level first changes [N]."""
     path = activity.levels[0].path
@@ -232,26 +190,33 @@ def row_order(activity: Activity) -> np.ndarray:
     return np.lexsort((first, activity.lengths))
 
 
-def draw_rows(activity: Activity, labels: Mapping[str, Sequence[np.ndarray]]) -> Figure:
+def _rows_picture(fit: Fit, activity: Activity, labels: Sequence[Mapping[str, np.ndarray]]) -> Picture:
     """A panel for each level, the highest first, and each kind of labels; a row of colour for each demonstration."""
-    rows = row_order(activity)
+    count, rows = len(labels), row_order(activity)
+    caption = (
+        f"Most likely options of all {count} demonstrations, one row each, sorted by length, then by the step at which "
+        "the option first changes."
+    )
+    if labels[0]:
+        caption += " A ground-truth label has the colour of the option that it is matched with, or is grey."
     images = [(f"level “{level.name}”", colour_image(level.path[rows])) for level in reversed(activity.levels)]
-    for name, values in labels.items():
-        title = "ground-truth labels" if len(labels) == 1 else f"labels “{name}”"
-        colours = activity.segmented.label_colours(name)
-        image = label_image([values[row] for row in rows], activity.lengths.max(), colours)
-        images.append((title, image))
-    figure = blank(float(np.clip(0.9 + 0.045 * len(rows), 2.2, 7)))
+    for name in labels[0]:
+        title, colours = "ground-truth labels", activity.segmented.label_colours(name)
+        image = label_image([labels[row][name] for row in rows], activity.lengths.max(), colours)
+        images.append((title if len(labels[0]) == 1 else f"labels “{name}”", image))
+    figure = blank(float(np.clip(0.9 + 0.045 * count, 2.2, 7)))
     panels = figure.subplots(1, len(images), sharey=True, squeeze=False)[0]
     for axes, (title, image) in zip(panels, images, strict=True):
-        extent = (-0.5, image.shape[1] - 0.5, len(rows) + 0.5, 0.5)
-        axes.imshow(image, aspect="auto", interpolation="nearest", extent=extent)
+        axes.imshow(
+            image, aspect="auto", interpolation="nearest", extent=(-0.5, image.shape[1] - 0.5, count + 0.5, 0.5)
+        )
         axes.set(title=title, xlabel="step t")
         axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
         axes.yaxis.set_major_locator(MaxNLocator(6, integer=True))
     panels[0].set_ylabel("demonstration")
     add_legend(figure, activity.choices, activity.names)
-    return figure
+    alt = f"Rows of colour: the most likely option at each step of {count} demonstrations"
+    return save(figure, fit.run_folder / "figures" / "segments.png", alt, caption)
 
 
 def colour_image(path: np.ndarray) -> np.ndarray:
@@ -276,18 +241,13 @@ def label_image(labels: Sequence[np.ndarray], steps: int, colours: Mapping[int, 
 
 
 def _timing_picture(fit: Fit, activity: Activity) -> Picture:
+    """For each level, the highest first: share of each choice and termination probability of each option over time."""
     caption = (
         "Left: mean probability of each option over all demonstrations. Right: probability that an active option ends "
         "at a step (its termination condition, ψ in the paper); not drawn where the option is hardly ever active."
     )
     if len(activity.levels) > 1:
         caption += " Above the lowest level an option can end only where the option below it ends."
-    alt = f"Share of each option and termination probabilities over time, {len(activity.lengths)} demonstrations"
-    return save(draw_timing(activity), fit.run_folder / "figures" / "timing.png", alt, caption)
-
-
-def draw_timing(activity: Activity) -> Figure:
-    """For each level, the highest first: share of each choice and termination probability of each option over time."""
     gathered = bins(activity.lengths)
     figure = blank(0.5 + 2.1 * len(activity.levels))
     panels = figure.subplots(len(activity.levels), 2, sharex=True, squeeze=False)
@@ -302,7 +262,8 @@ def draw_timing(activity: Activity) -> Figure:
     for axes in panels[-1]:
         axes.set_xlabel(gathered.axis)
     add_legend(figure, activity.choices, activity.names)
-    return figure
+    alt = f"Share of each option and termination probabilities over time, {len(activity.lengths)} demonstrations"
+    return save(figure, fit.run_folder / "figures" / "timing.png", alt, caption)
 
 
 def shares(level: LevelActivity, gathered: Bins) -> np.ndarray:
