@@ -9,7 +9,7 @@ import csv
 import io
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Generic, TypeVar
 
 from pydantic import (
     BaseModel,
@@ -197,14 +197,32 @@ class InARow(Record):
     mixture: Finite
 
 
-class Worth(Record):
-    """The parts of the hierarchy's advantage (:func:`ddco_pyro.evaluation.worth.worth`)."""
+class Against(Record):
+    """Successes of two methods from the same initial states (McNemar's test)."""
 
-    memory: Difference
-    experts: LeftOut[Difference | None] = None
-    total: LeftOut[Difference | None] = None
+    only_ours: int
+    only_theirs: int
+    trials: int
+    p_value: Finite
+
+
+class Parts(Record, Generic[T]):
+    """The parts of the hierarchy's advantage (:mod:`ddco_pyro.evaluation.worth`), and the flat baseline's name."""
+
+    memory: T
+    experts: LeftOut[T | None] = None
+    total: LeftOut[T | None] = None
     flat: LeftOut[str | None] = None
+
+
+class Worth(Parts[Difference]):
+    """The parts in nats per step."""
+
     steps_in_a_row: LeftOut[list[InARow]] = []
+
+
+class SuccessWorth(Parts[Against]):
+    """The parts in success."""
 
 
 class Seeds(Record):
@@ -323,29 +341,11 @@ Measure = Annotated[Annotated[Rate, Tag("[Rate]")] | Annotated[Mean, Tag("[Mean]
 """A measure of episodes."""
 
 
-class Against(Record):
-    """Successes of two methods from the same initial states (McNemar's test)."""
-
-    only_ours: int
-    only_theirs: int
-    trials: int
-    p_value: Finite
-
-
 class Method(Record):
     """The rollouts of a method."""
 
     measures: dict[str, Measure]
     against: LeftOut[Against | None] = None
-
-
-class SuccessWorth(Record):
-    """The parts of the hierarchy's advantage in success (:func:`ddco_pyro.evaluation.worth.success_worth`)."""
-
-    memory: Against
-    experts: LeftOut[Against | None] = None
-    total: LeftOut[Against | None] = None
-    flat: LeftOut[str | None] = None
 
 
 class SuccessOfSeeds(Record):

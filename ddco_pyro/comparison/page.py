@@ -18,7 +18,7 @@ from ddco_pyro.drawing.page import Block, Cell, Page, Picture, Section, Table, T
 from ddco_pyro.evaluation import effort, verdicts
 from ddco_pyro.evaluation.agreement import UNMATCHED
 from ddco_pyro.evaluation.worth import paired, worth
-from ddco_pyro.metrics import Difference, Rate
+from ddco_pyro.metrics import Difference, PerStep, Rate
 from ddco_pyro.names import FLAT, HIERARCHY, MIXTURE, method
 from ddco_pyro.report.likelihood import SHOWN
 from ddco_pyro.segmenting.agreement import measure_names
@@ -137,7 +137,11 @@ def _caution(compared: Comparison) -> str:
         for row in rows
         if flat and row.model == HIERARCHY
     }
-    return verdicts.cautions({row.name: (row.in_training, row.per_step) for row in rows}, below, len(steps))
+    return verdicts.cautions({row.name: _per_step(row) for row in rows}, below, len(steps))
+
+
+def _per_step(row: Row) -> PerStep:
+    return PerStep(train=row.in_training, valid=row.per_step)
 
 
 def _worth(compared: Comparison) -> str:
@@ -145,9 +149,7 @@ def _worth(compared: Comparison) -> str:
     models = [row.model for row in compared.rows]
     alone = {row.model: np.array(row.each) for row in compared.rows if models.count(row.model) == 1}
     found = worth(HIERARCHY, alone, compared.steps)
-    sound = not any(
-        verdicts.apart(row.in_training, row.per_step) for row in compared.rows if row.model in (HIERARCHY, MIXTURE)
-    )
+    sound = not any(verdicts.apart(_per_step(row)) for row in compared.rows if row.model in (HIERARCHY, MIXTURE))
     return verdicts.worth(found, method(HIERARCHY), len(compared.trajectories), sound) if found else ""
 
 

@@ -51,26 +51,25 @@ def option_use(posterior: Posterior, paths: Iterable[Sequence[np.ndarray]]) -> l
     uses = []
     for u, v, path in zip(posterior.u, posterior.v, paths, strict=True):
         active, selected = u.sum((0, 1)).numpy(), v.sum(1).numpy()
-        total, choices = float(active.sum()), enumerate(on_paths(path, len(active) - 1))
-        uses.append([_use(choice, float(active[choice]), selected[:, choice], total, one) for choice, one in choices])
+        often, within = selected.sum(0), selected.clip(max=1.0).sum(0)
+        uses.append(
+            [
+                Use(
+                    choice=choice,
+                    share=float(active[choice] / active.sum()),
+                    selected=float(often[choice]),
+                    demonstrations=float(within[choice]),
+                    duration=float(active[choice] / often[choice]) if often[choice] > 1e-6 else None,
+                    segments=len(one.lengths),
+                    steps=int(one.lengths.sum()),
+                    length=float(np.median(one.lengths)) if one.having else None,
+                    having=one.having,
+                    within=one.within,
+                )
+                for choice, one in enumerate(on_paths(path, len(active) - 1))
+            ]
+        )
     return uses
-
-
-def _use(choice: int, active: float, selected: np.ndarray, total: float, on_path: OnPaths) -> Use:
-    """The use of a choice that is ``active`` in so many of ``total`` steps; ``selected`` is by demonstration."""
-    often, lengths = float(selected.sum()), on_path.lengths
-    return Use(
-        choice=choice,
-        share=active / total,
-        selected=often,
-        demonstrations=float(selected.clip(max=1.0).sum()),
-        duration=active / often if often > 1e-6 else None,
-        segments=len(lengths),
-        steps=int(lengths.sum()),
-        length=float(np.median(lengths)) if len(lengths) else None,
-        having=on_path.having,
-        within=on_path.within,
-    )
 
 
 MANY = 20
@@ -208,6 +207,10 @@ class Finding:
             return f"{percent(self.value)} of the {self.times:.0f} demonstrations that have it"
         return percent(self.value, 1)
 
+    def deed(self, frequency: float | None) -> str:
+        """What the option does, in words."""
+        return f"{SIGNS[self.kind][0]} {self.amount(frequency)}"
+
 
 def diagnose(options: Sequence[Sequence[Use]], divergences: Sequence[Sequence[Alike]] = ()) -> list[Finding]:
     """The signs of a degenerate solution in the ``options`` and ``divergences`` of a run, lowest level first.
@@ -304,11 +307,10 @@ def _sign(findings: Sequence[Finding], level: str, names: Sequence[str], frequen
     if kind == "high_fitting":
         share = first.amount(frequency)
         return f"High-fitting: the caller of level “{level}” emits the control itself in {share} of its steps."
-    one, several = SIGNS[kind]
     if many == 1:
-        return f"{capital(first.options(names))} of level “{level}” {one} {first.amount(frequency)}."
+        return f"{capital(first.options(names))} of level “{level}” {first.deed(frequency)}."
     ordered = sorted(findings, key=lambda finding: finding.value)[:LISTED]
     values = [f"{finding.amount(frequency)} ({finding.options(names)})" for finding in ordered]
     values += [f"so on for {many - LISTED} more"] if many > LISTED else []
     what = "pairs of options" if kind == "redundant" else "options"
-    return f"{many} {what} of level “{level}” {several} {listed(values)}."
+    return f"{many} {what} of level “{level}” {SIGNS[kind][1]} {listed(values)}."

@@ -50,26 +50,24 @@ def caution(metrics: Metrics) -> str:
     ours = capital(method(metrics.model))
     lowest = min(flats, key=lambda name: flats[name].nats_per_step, default=None)
     below = {} if lowest is None else {ours: (method(lowest), flats[lowest])}
-    values = {capital(method(name)): _of_parts(one.log_likelihood_per_step) for name, one in metrics.methods.items()}
+    values = {capital(method(name)): one.log_likelihood_per_step for name, one in metrics.methods.items()}
     return cautions(values, below, len(metrics.valid))
 
 
-def cautions(
-    values: Mapping[str, tuple[float, float]], flats: Mapping[str, tuple[str, Difference]], held_out: int
-) -> str:
+def cautions(values: Mapping[str, PerStep], flats: Mapping[str, tuple[str, Difference]], held_out: int) -> str:
     """Sentences on the models that fell apart, and on those below flat, with what to do; empty where all are sound.
 
     A model fell apart that loses more than :data:`FAR` from training to held-out demonstrations. It is below flat where
     the 95 % interval of their difference says so, or by more than that.
 
-    :param values: nats per step of each model in training, and held out.
+    :param values: of each model.
     :param flats: the difference of a model to a flat one, with that one's name.
     """
     said = [
-        f"{name} fell apart on held-out demonstrations: {number(held)} nats per step there, "
-        f"{number(trained)} in training."
-        for name, (trained, held) in values.items()
-        if apart(trained, held)
+        f"{name} fell apart on held-out demonstrations: {number(per_step.valid)} nats per step there, "
+        f"{number(per_step.train)} in training."
+        for name, per_step in values.items()
+        if apart(per_step)
     ]
     if said:
         said.append(
@@ -87,20 +85,15 @@ def cautions(
     return " ".join(said)
 
 
-def apart(trained: float, held: float) -> bool:
-    """Whether a model with these nats per step in training, and held out, fell apart."""
-    return trained - held > FAR
-
-
-def _of_parts(value: PerStep) -> tuple[float, float]:
-    """Nats per step in training, and held out; the same number twice where nothing was held out."""
-    return value.train, value.train if value.valid is None else value.valid
+def apart(per_step: PerStep) -> bool:
+    """Whether a model with this log-likelihood fell apart."""
+    return per_step.valid is not None and per_step.train - per_step.valid > FAR
 
 
 def sound(metrics: Metrics) -> bool:
     """Whether differences between the hierarchy and the mixture mean something: neither fell apart."""
     both = (one for name, one in metrics.methods.items() if name in (metrics.model, MIXTURE))
-    return not any(apart(*_of_parts(one.log_likelihood_per_step)) for one in both)
+    return not any(apart(one.log_likelihood_per_step) for one in both)
 
 
 def headline(metrics: Metrics) -> str:
@@ -245,19 +238,14 @@ def over_seeds(found: Seeds, ours: str, held_out: int, sound: bool = True) -> st
     text = f"Over {len(found.training_seeds)} training seeds, with the same demonstrations held out{said}."
     if "memory" not in found.worth or not sound:
         return text
-    return f"{text} {_lasting(found.worth['memory'], found.standard_error['memory'], held_out)}"
-
-
-def _lasting(memory: Sequence[float], errors: Sequence[float | None], held_out: int) -> str:
-    """The verdict on options that last, by :func:`_range` and :data:`SMALLEST`."""
-    low, high = _range(memory, errors, held_out)
-    wider = high > mean_interval(memory)[1]
-    said = f"Over held-out demonstrations it is {interval((low, high))}. " if wider else ""
-    return said + _verdict(low, high)
+    memory = found.worth["memory"]
+    low, high = _range(memory, found.standard_error["memory"], held_out)
+    wider = f" Over held-out demonstrations it is {interval((low, high))}." if high > mean_interval(memory)[1] else ""
+    return f"{text}{wider} {_verdict(low, high)}"
 
 
 def _range(memory: Sequence[float], errors: Sequence[float | None], held_out: int) -> tuple[float, float]:
-    """The interval of the worth of options that last, by :func:`wider_interval`.
+    """The interval of the worth of options that last over seeds or, where wider, over held-out demonstrations.
 
     :param errors: standard errors over held-out demonstrations; None where there is one.
     """
@@ -266,6 +254,7 @@ def _range(memory: Sequence[float], errors: Sequence[float | None], held_out: in
 
 
 def _verdict(low: float, high: float) -> str:
+    """The verdict on options that last by the interval of their worth and :data:`SMALLEST`."""
     if low > -SMALLEST and high < SMALLEST:
         return f"So options that last make no difference here: less than {SMALLEST} nats per step."
     if low > 0:

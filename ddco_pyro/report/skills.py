@@ -142,8 +142,7 @@ def section(
     shown, segmented = _Shown(demos, pictures, paths), activity.segmented
     reads = deciding(fit, demos)
     blocks: list[Block] = [note(shown.explained())]
-    findings = diagnose(fit.metrics.options)
-    whole = {(finding.level, finding.choice): finding for finding in findings if finding.kind == "whole"}
+    whole = {(one.level, one.choice): one for one in diagnose(fit.metrics.options) if one.kind == "whole"}
     for place, (level, names) in reversed(list(enumerate(fit.names.items()))):
         if len(fit.names) > 1:
             blocks.append(Text(f"Level “{level}”", "heading"))
@@ -156,8 +155,8 @@ def section(
             facts = _facts(use[choice], shares[choice], every[choice], counts, names, segmented.frequency)
             labels = [one for one in fit.metrics.named_by_labels if (one.level, one.option) == (level, choice)]
             facts |= {f"Label {one.labels}, agreement": agreeing(one) for one in labels}
-            if takes := whole.get((1 + place, choice)):
-                facts["No skill"] = f"takes {takes.amount(None)}: it says which demonstration, not which skill"
+            if finding := whole.get((1 + place, choice)):
+                facts["No skill"] = finding.deed(segmented.frequency)
             facts |= {what: values[choice] for what, values in reads.get(level, {}).items() if choice in values}
             facts = {what: said.replace(" %", "\N{NO-BREAK SPACE}%") for what, said in facts.items()}
             title = Cell(numbered_name(choice, names), colour=option_colour(choice))
