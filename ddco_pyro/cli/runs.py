@@ -273,7 +273,7 @@ def segment(
     from ddco_pyro.data.sources import open_source
     from ddco_pyro.fitting.fitted import load
     from ddco_pyro.segmenting import beside_baselines, segments
-    from ddco_pyro.segmenting.agreement import agreement_table, level_agreements, tolerances
+    from ddco_pyro.segmenting.agreement import agreement_table, tolerances
     from ddco_pyro.segmenting.baselines import BASELINES, check_installed
     from ddco_pyro.segmenting.formats import Asked
 
@@ -307,8 +307,9 @@ def segment(
         segmented = replace(segmented, frequency=fps or segmented.frequency)
         if baselines:
             segmented = beside_baselines(segmented, fit, source, gripper, progress)
-            for name, found in level_agreements(segmented).items():
-                console.show(agreement_table(found.scores, f"level {name}: agreement with the label {found.labels}"))
+            for name, scores in segmented.agreements.items():
+                title = f"level {name}: agreement with the label {segmented.truth[name]}"
+                console.show(agreement_table(scores, title))
                 if said := tolerances(segmented.frequency):
                     console.say(said)
             if missing:

@@ -12,8 +12,8 @@ from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Confusion, Scores
 from ddco_pyro.names import label_name, option_name
 from ddco_pyro.report.options import quoted
-from ddco_pyro.segmenting.agreement import EXPLAINED, agreement_table, of_equal_lengths, tolerances
-from ddco_pyro.segmenting.baselines import BASELINES, EQUAL
+from ddco_pyro.segmenting.agreement import EXPLAINED, agreement_table, tolerances
+from ddco_pyro.segmenting.baselines import BASELINES, EQUAL, of_equal_lengths
 from ddco_pyro.training.data import parts
 
 

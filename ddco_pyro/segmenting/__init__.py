@@ -18,10 +18,11 @@ from ddco_pyro.data.sources import Recording, Source, open_source
 from ddco_pyro.data.sources.recording import label_names
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.errors import BadInput
-from ddco_pyro.evaluation.agreement import confusion
+from ddco_pyro.evaluation.agreement import agreement, confusion
 from ddco_pyro.evaluation.inferred import Inferred, started
 from ddco_pyro.events import BaselineSegmented, DemonstrationsDone, OnEvent, ignore
 from ddco_pyro.fitting.fitted import Fit
+from ddco_pyro.metrics import Scores
 from ddco_pyro.segmenting import baselines
 from ddco_pyro.training.data import parts
 
@@ -135,6 +136,29 @@ class Segmented:
             pairs = zip(table.matched, table.options, strict=True)
             options_of.setdefault(truth, {label: option for label, option in pairs if label is not None})
         return options_of
+
+    @cached_property
+    def agreements(self) -> dict[str, dict[str, Scores | None]]:
+        """Agreement of each level that has labels: the measures of each kind of segments, by its name.
+
+        Parts of equal length stand beside the options. Other baselines are compared on the held-out demonstrations, or
+        on all where none is held out.
+        """
+        agreements: dict[str, dict[str, Scores | None]] = {}
+        for level, truth in self.truth.items():
+            groups = self.labelled(truth)
+            for part, group in groups.items():
+                options, labels = [demo.levels[level].options for demo in group], [demo.labels[truth] for demo in group]
+                scores = agreements.setdefault(level, {})
+                scores[f"options, {part}"] = agreement(options, labels)
+                equal = f"{baselines.BASELINES[baselines.EQUAL]}, {part}"
+                scores[equal] = baselines.of_equal_lengths(labels, self.counts[level])
+            for part, group in [*groups.items()][:1]:
+                for name, words in baselines.BASELINES.items():
+                    if group[0].baselines and name != baselines.EQUAL:
+                        kinds = [demo.baselines[f"{level}_{name}"] for demo in group]
+                        agreements[level][f"{words}, {part}"] = agreement(kinds, [demo.labels[truth] for demo in group])
+        return agreements
 
     def label_colours(self, name: str) -> dict[int, str]:
         """The colour of each label of this name: that of the option that it is matched with."""

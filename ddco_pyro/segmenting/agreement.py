@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-
-import numpy as np
+from collections.abc import Iterable, Mapping
 
 from ddco_pyro.drawing.page import Table
 from ddco_pyro.drawing.words import duration, number
-from ddco_pyro.evaluation.agreement import MATCHED, TOLERANCES, UNMATCHED, agreement
+from ddco_pyro.evaluation.agreement import MATCHED, TOLERANCES, UNMATCHED
 from ddco_pyro.metrics import Scores
-from ddco_pyro.segmenting import Segmented
-from ddco_pyro.segmenting.baselines import BASELINES, EQUAL, equal_lengths
 
 MATCHINGS = {"matched_globally": "one for all", "matched_per_demonstration": "each its own"}
 
@@ -64,41 +59,3 @@ def agreement_table(scores: Mapping[str, Scores | None], title: str | None = Non
             rows.append([*first, matching, *(number(value) for _, value in getattr(known, key))])
             first = [""] * len(first)
     return Table(head, rows, {0, 1 + len(UNMATCHED)}, title)
-
-
-@dataclass(frozen=True)
-class LevelAgreement:
-    """Agreement of one level with the labels so named: the measures of each kind of segments, by its name."""
-
-    labels: str
-    scores: dict[str, Scores | None]
-
-
-def level_agreements(segmented: Segmented) -> dict[str, LevelAgreement]:
-    """Agreement of each level that has labels, by the level's name.
-
-    Parts of equal length stand beside the options. Other baselines are compared on the held-out demonstrations, or on
-    all where none is held out.
-    """
-    agreements = {}
-    for level, truth in segmented.truth.items():
-        groups = segmented.labelled(truth)
-        if not groups:
-            continue
-        scores: dict[str, Scores | None] = {}
-        for part, group in groups.items():
-            options, labels = [demo.levels[level].options for demo in group], [demo.labels[truth] for demo in group]
-            scores[f"options, {part}"] = agreement(options, labels)
-            scores[f"{BASELINES[EQUAL]}, {part}"] = of_equal_lengths(labels, segmented.counts[level])
-        part, group = next(iter(groups.items()))
-        for name, words in BASELINES.items():
-            if group[0].baselines and name != EQUAL:
-                found = [demo.baselines[f"{level}_{name}"] for demo in group]
-                scores[f"{words}, {part}"] = agreement(found, [demo.labels[truth] for demo in group])
-        agreements[level] = LevelAgreement(truth, scores)
-    return agreements
-
-
-def of_equal_lengths(labels: Sequence[np.ndarray], count: int) -> Scores | None:
-    """The agreement with labels [T] of demonstrations that are cut into ``count`` equal parts."""
-    return agreement([equal_lengths(len(own), count) for own in labels], labels)

@@ -16,6 +16,8 @@ import torch
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.errors import BadInput, nearest
+from ddco_pyro.evaluation.agreement import agreement
+from ddco_pyro.metrics import Scores
 from ddco_pyro.model.encoder import ObservationEncoder
 from ddco_pyro.spec import ObservationSpec
 from ddco_pyro.training.initialization import block_means, distinct, joined
@@ -195,3 +197,8 @@ BASELINES = {
     "gripper": "gripper changes",
 }
 """The baselines and their names in tables."""
+
+
+def of_equal_lengths(labels: Sequence[np.ndarray], count: int) -> Scores | None:
+    """The agreement with labels [T] of demonstrations that are cut into ``count`` equal parts."""
+    return agreement([equal_lengths(len(own), count) for own in labels], labels)

@@ -22,7 +22,7 @@ from ddco_pyro.drawing.words import NAT, duration, number, percent
 from ddco_pyro.evaluation.options import on_paths
 from ddco_pyro.names import label_name, numbered_name, option_name
 from ddco_pyro.segmenting import Segmented, Segments
-from ddco_pyro.segmenting.agreement import EXPLAINED, LevelAgreement, agreement_table, tolerances
+from ddco_pyro.segmenting.agreement import EXPLAINED, agreement_table, tolerances
 from ddco_pyro.spec import PathSpec
 
 HOW = (
@@ -38,24 +38,22 @@ def write_page(
     segmented: Segmented,
     run: str,
     file: str,
-    agreements: Mapping[str, LevelAgreement],
     follows: Iterable[Mapping[str, Any]] = (),
 ) -> None:
     """Write the page, whole or not at all.
 
-    :param agreements: agreement of each level with labels.
     :param follows: of :func:`followed`.
     """
     count, held_out = len(segmented), sum(demo.held_out for demo in segmented.segments)
     intro = f"{held_out} of {count} demonstrations were held out when the run was fitted. They are marked “held out”."
-    sections = [_level(name, segmented, agreements.get(name)) for name in segmented.counts]
+    sections = [_level(name, segmented) for name in segmented.counts]
     drawn = note(f"{HOW} Nats per step: the log-likelihood of the demonstration's controls under the model; {NAT}.")
     sections.append(Section("segments", "Every demonstration", [drawn, timelines(segmented, follows)]))
     page = Page(file, [Text(intro)] if held_out else [], sections, subtitle=f"segmented by {run}")
     write_text(path, page.html())
 
 
-def _level(name: str, segmented: Segmented, agreement: LevelAgreement | None) -> Section:
+def _level(name: str, segmented: Segmented) -> Section:
     """How much of the time each option of a level takes, how often, and for how long."""
     paths, rows = [demo.levels[name].options for demo in segmented.segments], []
     total = sum(map(len, paths))
@@ -67,9 +65,9 @@ def _level(name: str, segmented: Segmented, agreement: LevelAgreement | None) ->
             rows.append([named, share, str(len(lengths)), median, f"{having} of {len(segmented)}"])
     head = ["Option", "Share of steps", "Segments", "Median length", "Demonstrations with it"]
     blocks: list[Block] = [Table(head, rows)]
-    if agreement:
-        blocks.append(Text(f"Agreement with the label “{agreement.labels}”", "heading"))
-        blocks += [agreement_table(agreement.scores), footnote(f"{EXPLAINED} {tolerances(segmented.frequency)}")]
+    if scores := segmented.agreements.get(name):
+        blocks.append(Text(f"Agreement with the label “{segmented.truth[name]}”", "heading"))
+        blocks += [agreement_table(scores), footnote(f"{EXPLAINED} {tolerances(segmented.frequency)}")]
     return Section(f"level-{quote(name, safe='')}", f"Level “{name}”", blocks)
 
 
@@ -85,7 +83,10 @@ def timelines(
 
     :param follows: what follows the cursor, of :func:`~ddco_pyro.drawing.timeline.following`.
     """
-    lanes = {name: _level_lane(name, segmented) for name in reversed(segmented.counts)}
+    lanes = {}
+    for name, count in reversed(segmented.counts.items()):
+        names = [option_name(choice, segmented.names.get(name, ())) for choice in range(count + 1)]
+        lanes[name] = Lane(name, names, list(map(option_colour, range(count + 1))))
     lanes |= {name: Lane(name, names, segmented.label_colours(name)) for name, names in _values(segmented).items()}
     before = accumulate((len(demo) * len(segmented.counts) for demo in segmented.segments), initial=0)
     shown = [demo for demo, steps in zip(segmented.segments, before, strict=False) if steps < most_steps]
@@ -119,12 +120,6 @@ def followed(
     """
     steps = min(sum(map(len, segmented.segments)), most_steps / len(segmented.counts))
     return following(demos, pictures, int(steps), paths)
-
-
-def _level_lane(name: str, segmented: Segmented) -> Lane:
-    choices = range(segmented.counts[name] + 1)
-    names = segmented.names.get(name, ())
-    return Lane(name, [option_name(choice, names) for choice in choices], [option_colour(choice) for choice in choices])
 
 
 def _values(segmented: Segmented) -> dict[str, dict[int, str]]:

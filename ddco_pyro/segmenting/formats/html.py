@@ -7,7 +7,6 @@ from itertools import chain, islice
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.drawing.shown import paths_of, stored_pictures
 from ddco_pyro.segmenting import Segmented, recorded
-from ddco_pyro.segmenting.agreement import level_agreements
 from ddco_pyro.segmenting.formats import Writer
 from ddco_pyro.segmenting.page import followed, write_page
 
@@ -25,5 +24,5 @@ class Page(Writer):
         first = list(islice(demos, FIRST))
         paths = paths_of(asked.fit.spec.report.trajectory, Demonstrations(tuple(first)))
         follows = followed(chain(first, demos), pictures, segmented, paths)
-        write_page(self.out, segmented, str(asked.run), str(asked.demos), level_agreements(segmented), follows)
+        write_page(self.out, segmented, str(asked.run), str(asked.demos), follows)
         return str(self.out)
