@@ -78,10 +78,11 @@ def activity(fit: Fit, demos: Demonstrations) -> Activity:
         LevelActivity(name, names, *map(np.concatenate, zip(*arrays, strict=True)))
         for (name, names), arrays in zip(fit.names.items(), zip(*pieces, strict=True), strict=True)
     )
+    rows = {row.name: row for row in fit.metrics.demonstrations_by_likelihood}  # held out, where it trains too
     ordered = [
-        replace(segments[row.name], log_likelihood=row.log_likelihood_per_step[fit.name], held_out=row.part == "valid")
-        for row in fit.metrics.demonstrations_by_likelihood
-        if row.name in segments
+        replace(segments[name], log_likelihood=row.log_likelihood_per_step[fit.name], held_out=row.part == "valid")
+        for name, row in rows.items()
+        if name in segments
     ]
     segmented = of_run(fit, ordered, demos.frequency, label_names(demos.attributes))
     return Activity(levels, np.array(demos.lengths), segmented)
