@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, get_args
@@ -32,6 +31,9 @@ ROUNDING = 4 * float(np.finfo(np.float32).eps)
 
 MOST_DISTINCT = 64
 """Most distinct values of a dimension that are kept."""
+
+MOST_DIMENSIONS = 256
+"""Largest control in which common values are looked for."""
 
 
 def same(values: np.ndarray, value: np.ndarray | float) -> np.ndarray:
@@ -156,221 +158,113 @@ def few(names: Sequence[str]) -> str:
     return ", ".join(names[:3]) + ", ..." * (len(names) > 3)
 
 
-class ControlStatistics:
-    """Streaming :class:`ControlDimension` statistics of controls; NaN and infinite values are ignored."""
+class _Steps:
+    """The values of one dimension over all steps [T]; ``starts`` [N] are the first steps of the demonstrations.
 
-    def __init__(self) -> None:
-        self._columns: dict[str, list[np.ndarray]] = {}  # by name: minimum, maximum, steps there, steps, each [A]
-        self._distinct: list[np.ndarray] = []
-        self._common = _CommonValues()
-        self._integer = True
+    ``low``, ``high``, ``at_low``, ``at_high`` and ``steps`` are the statistics of each demonstration, [N].
+    """
 
-    def add(self, controls: np.ndarray, name: str) -> None:
-        """Add some steps [T, ...] of the demonstration with this name."""
-        self._integer &= controls.dtype.kind in "iu"
-        values = np.asarray(controls, dtype=np.float64).reshape(len(controls), -1)
+    def __init__(self, values: np.ndarray, starts: np.ndarray) -> None:
+        self.values, self.starts = values, starts
         finite = np.isfinite(values)
-        if not len(values):
-            return
-        low, high = np.where(finite, values, np.inf).min(0), np.where(finite, values, -np.inf).max(0)
-        new = [low, high, same(values, low).sum(0), same(values, high).sum(0), finite.sum(0)]
-        self._columns[name] = _merged(np.array([self._columns[name], new])) if name in self._columns else new
-        before = self._distinct or [np.empty(0)] * values.shape[1]
-        self._distinct = [
-            old if len(old) > MOST_DISTINCT else np.union1d(old, column[use])[: MOST_DISTINCT + 1]
-            for old, column, use in zip(before, values.T, finite.T, strict=True)
-        ]
-        self._common.add(values, len(self._columns) - 1)
+        self.low = np.minimum.reduceat(np.where(finite, values, np.inf), starts)
+        self.high = np.maximum.reduceat(np.where(finite, values, -np.inf), starts)
+        lengths = np.diff(starts, append=len(values))
+        self.at_low, self.at_high = (self.at(np.repeat(end, lengths)) for end in (self.low, self.high))
+        self.steps = self._count(finite)
+        self.distinct, self.times = np.unique(values[finite], return_counts=True)
 
-    def dimensions(self) -> tuple[ControlDimension, ...]:
-        """The statistics of all dimensions that have a finite value."""
-        if not self._columns:
-            return ()
-        each = np.array(list(self._columns.values()))  # [N, 5, A]
-        low, high, at_low, at_high, steps = (column.tolist() for column in _merged(each))
-        inside = self._common.inside(np.array(low), np.array(high), each[:, 4])
-        return tuple(
-            ControlDimension(
-                index,
-                low[index],
-                high[index],
-                int(at_low[index]),
-                int(at_high[index]),
-                int(steps[index]),
-                tuple(values.tolist()) if len(values) <= MOST_DISTINCT else (),
-                *inside.get(index, _NOWHERE)[:3],
-                integer=self._integer,
-                made_by=self._made_by(each[:, :, index], low[index], high[index], inside.get(index, _NOWHERE)[3]),
-                strays=self._named(_strays(each[:, :, index])),
-            )
-            for index, values in enumerate(self._distinct)
-            if steps[index]
+    def _count(self, which: np.ndarray) -> np.ndarray:
+        return np.add.reduceat(which, self.starts, dtype=np.int64)
+
+    def at(self, value: np.ndarray | float) -> np.ndarray:
+        """Number of steps at a value in each demonstration [N]."""
+        return self._count(same(self.values, value))
+
+    def makers(self, value: float, often: float, least: int) -> np.ndarray:
+        """The few demonstrations without which a value is rare.
+
+        :param often: share of the steps from which on the value is common.
+        :param least: steps with which a demonstration has the value by more than chance.
+        :returns: their places; empty where the value is rare with them, or common without them.
+        """
+        at = self.at(value)
+        makes = at >= least
+        rare = at.sum() < max(2, often * self.steps.sum()) or at[~makes].sum() >= often * max(
+            self.steps[~makes].sum(), 1
         )
+        return np.flatnonzero(makes) if not rare and makes.sum() <= most_few(len(at)) else np.empty(0, dtype=int)
 
-    def still(self) -> dict[str, np.ndarray]:
-        """By name of each demonstration that has the same control [A] in all of :data:`FEWEST` steps or more: it."""
-        return {
-            name: low
-            for name, (low, high, *_, steps) in self._columns.items()
-            if (same(low, high) & (steps >= FEWEST)).all()
-        }
+    def strays(self) -> np.ndarray:
+        """The few demonstrations without which the dimension would be constant or a switch."""
+        two = (self.at_low + self.at_high == self.steps) | same(self.low, self.high)
+        values, times = np.unique(np.concatenate([self.low[two], self.high[two]]), return_counts=True)
+        commonest = values[np.argsort(-times, kind="stable")]
+        for count in (1, 2):
+            ends = [np.any([same(end, value) for value in commonest[:count]], axis=0) for end in (self.low, self.high)]
+            outside = np.flatnonzero(~(two & np.all(ends, 0)) & (self.steps > 0))
+            if len(commonest) >= count and len(outside) <= most_few(len(self.steps)):
+                return outside
+        return np.empty(0, dtype=int)
 
-    def _made_by(self, each: np.ndarray, low: float, high: float, at_inside: np.ndarray) -> dict[str, tuple[str, ...]]:
-        """``made_by`` of a dimension, from its columns [N, 5] and the steps [N] at its value inside."""
-        ends = [np.where(same(each[:, place], end), each[:, place + 2], 0) for place, end in ((0, low), (1, high))]
-        places = {end: _makers(at, each[:, 4], OFTEN, 1) for end, at in zip(("minimum", "maximum"), ends, strict=True)}
-        if len(at_inside):
-            places["inside"] = _makers(at_inside, each[:, 4], ATOM, FEWEST)
-        return {end: self._named(names) for end, names in places.items() if len(names)}
-
-    def _named(self, places: np.ndarray) -> tuple[str, ...]:
-        names = list(self._columns)
-        return tuple(names[place] for place in sorted(places.tolist()))
+    def inside(self) -> float | None:
+        """The commonest value between the extremes; one that few demonstrations make comes last."""
+        often = self.times >= max(FEWEST, ATOM * len(self.values))
+        ends = np.array([self.low.min(), self.high.max()])
+        values = [value for value in (self.distinct[often] + 0.0).tolist() if not same(ends, value).any()]  # no minus 0
+        key = {value: (len(self.makers(value, ATOM, FEWEST)) > 0, -int(self.at(value).sum())) for value in values}
+        return min(values, key=key.__getitem__, default=None)
 
 
-_NOWHERE: tuple[float | None, int, tuple[int, ...], np.ndarray] = (None, 0, (), np.empty(0))
+def control_dimensions(controls: Mapping[str, np.ndarray]) -> tuple[ControlDimension, ...]:
+    """The statistics of each dimension in the controls [T, A] of demonstrations by name.
+
+    NaN and infinite values are ignored, and so are dimensions without other values.
+    """
+    names = [name for name, steps in controls.items() if len(steps)]
+    if not names:
+        return ()
+    integer = all(steps.dtype.kind in "iu" for steps in controls.values())
+    starts = np.cumsum([0, *(len(controls[name]) for name in names)])
+    rows = np.concatenate([controls[name].reshape(len(controls[name]), -1) for name in names]).astype(np.float64)
+    dimensions: dict[int, ControlDimension] = {}
+    rests: dict[int, np.ndarray] = {}
+    for index, values in enumerate(rows.T):
+        steps = _Steps(np.ascontiguousarray(values), starts[:-1])
+        if not steps.steps.any():
+            continue
+        low, high = float(steps.low.min()), float(steps.high.max())
+        inside = steps.inside() if rows.shape[1] <= MOST_DIMENSIONS else None
+        places = {"minimum": steps.makers(low, OFTEN, 1), "maximum": steps.makers(high, OFTEN, 1)}
+        if inside is not None:
+            places["inside"] = steps.makers(inside, ATOM, FEWEST)
+            rests[index] = same(values, inside)
+        dimensions[index] = ControlDimension(
+            index,
+            low,
+            high,
+            at_minimum=int(steps.at(low).sum()),
+            at_maximum=int(steps.at(high).sum()),
+            steps=int(steps.steps.sum()),
+            distinct=tuple(steps.distinct.tolist()) if len(steps.distinct) <= MOST_DISTINCT else (),
+            inside=inside,
+            at_inside=int(rests[index].sum()) if index in rests else 0,
+            integer=integer,
+            made_by={end: tuple(names[place] for place in makers) for end, makers in places.items() if len(makers)},
+            strays=tuple(names[place] for place in steps.strays()),
+        )
+    for index, rest in rests.items():
+        together = (
+            other for other, resting in rests.items()
+            if other != index and (rest & resting).sum() >= TOGETHER * (rest | resting).sum()
+        )  # fmt: skip
+        dimensions[index] = replace(dimensions[index], together=tuple(together))
+    return tuple(dimensions.values())
 
 
 def most_few(number: int) -> int:
     """The largest number of demonstrations, of so many, that are few (:data:`FEW`)."""
     return max(1, int(FEW * number)) if number > 2 else 0
-
-
-def _makers(at: np.ndarray, steps: np.ndarray, often: float, least: int) -> np.ndarray:
-    """The few demonstrations without which a value is rare.
-
-    :param at: steps [N] of each demonstration at the value, of ``steps`` [N].
-    :param often: share of the steps from which on the value is common.
-    :param least: steps with which a demonstration has the value by more than chance.
-    :returns: their places; empty where the value is rare with them, or common without them.
-    """
-    makes = at >= least
-    rare = at.sum() < max(2, often * steps.sum()) or at[~makes].sum() >= often * max(steps[~makes].sum(), 1)
-    return np.flatnonzero(makes) if not rare and makes.sum() <= most_few(len(at)) else np.empty(0, dtype=int)
-
-
-def _strays(each: np.ndarray) -> np.ndarray:
-    """The few demonstrations without which a dimension, with columns [N, 5], would be constant or a switch."""
-    low, high, at_low, at_high, steps = each.T
-    two = (at_low + at_high == steps) | same(low, high)
-    values, times = np.unique(np.concatenate([low[two], high[two]]), return_counts=True)
-    kept = values[np.argsort(-times, kind="stable")]
-    for count in (1, 2):
-        within = two & np.all([np.any([same(end, value) for value in kept[:count]], axis=0) for end in (low, high)], 0)
-        outside = np.flatnonzero(~within & (steps > 0))
-        if len(kept) >= count and len(outside) <= most_few(len(each)):
-            return outside
-    return np.empty(0, dtype=int)
-
-
-def _merged(each: np.ndarray) -> list[np.ndarray]:
-    """Minimum, maximum, steps there and steps of several parts [P, 5, A], together."""
-    low, high = each[:, 0].min(0), each[:, 1].max(0)
-    at = (np.where(same(each[:, end], value), each[:, end + 2], 0).sum(0) for end, value in ((0, low), (1, high)))
-    return [low, high, *at, each[:, 4].sum(0)]
-
-
-CHUNK = 4096
-"""Steps that are searched together for common values."""
-
-KEPT = 3
-"""Common values of a dimension that are counted: possibly both extremes, and one between."""
-
-MOST_DIMENSIONS = 256
-"""Largest control whose common values are counted."""
-
-
-class _CommonValues:
-    """The commonest values of each dimension, and in how many steps each pair of them occurs together.
-
-    Counting of a value starts with the first chunk in which its share is :data:`ATOM`. Counts of up to :data:`CHUNK`
-    steps are exact; counts of more steps are exact for values that are common in the first chunk.
-    """
-
-    def __init__(self) -> None:
-        self._waiting: list[np.ndarray] = []
-        self._values: list[tuple[int, float]] = []
-        self._counts = np.zeros((0, 0))
-        self._each: dict[tuple[int, float], Counter[int]] = {}  # steps by demonstration
-
-    def add(self, controls: np.ndarray, demonstration: int) -> None:
-        """Add some steps [T, A] of the demonstration with this number."""
-        if controls.shape[1] <= MOST_DIMENSIONS:
-            self._waiting.append(np.column_stack([controls, np.full(len(controls), demonstration)]))
-        if sum(map(len, self._waiting)) >= CHUNK:
-            rows = np.concatenate(self._waiting)
-            whole = len(rows) // CHUNK * CHUNK
-            for chunk in np.split(rows[:whole], whole // CHUNK):
-                self._count(chunk[:, :-1], chunk[:, -1].astype(int))
-            self._waiting = [rows[whole:]]
-
-    def inside(
-        self, low: np.ndarray, high: np.ndarray, steps: np.ndarray
-    ) -> dict[int, tuple[float, int, tuple[int, ...], np.ndarray]]:
-        """By dimension: its commonest value between the extremes, the count, the dimensions that rest with it, and the
-        count in each demonstration. A value that few demonstrations make comes last.
-
-        :param steps: of each demonstration and dimension, [N, A].
-        """
-        if waiting := [rows for rows in self._waiting if len(rows)]:
-            rows = np.concatenate(waiting)
-            self._count(rows[:, :-1], rows[:, -1].astype(int))
-            self._waiting = []
-        each = [np.array([counted[number] for number in range(len(steps))]) for counted in self._each.values()]
-        pairs = zip(each, self._values, strict=True)
-        made = [len(_makers(at, steps[:, dimension], ATOM, FEWEST)) > 0 for at, (dimension, _) in pairs]
-        places: dict[int, int] = {}
-        for place in sorted(range(len(made)), key=made.__getitem__):  # the commonest come first
-            dimension, value = self._values[place]
-            if not same(np.array([low[dimension], high[dimension]]), value).any():
-                places.setdefault(dimension, place)
-        return {
-            dimension: (
-                self._values[place][1],
-                int(self._counts[place, place]),
-                tuple(other for other, at in sorted(places.items()) if at != place and self._together(place, at)),
-                each[place],
-            )
-            for dimension, place in places.items()
-        }
-
-    def _together(self, first: int, second: int) -> bool:
-        both = self._counts[first, second]
-        either = self._counts[first, first] + self._counts[second, second] - both
-        return bool(both >= TOGETHER * either)
-
-    def _known(self, dimension: int, value: float) -> bool:
-        return any(own == dimension and same(np.array(known), value) for own, known in self._values)
-
-    def _count(self, rows: np.ndarray, demonstrations: np.ndarray) -> None:
-        for dimension, column in enumerate(rows.T):
-            values, times = np.unique(column[np.isfinite(column)], return_counts=True)
-            often = np.argsort(-times, kind="stable")[:KEPT]
-            often = often[times[often] >= max(FEWEST, ATOM * len(rows))]
-            found = ((dimension, value + 0.0) for value in values[often].tolist())  # + 0.0: minus zero is zero
-            for each in found:
-                if not self._known(*each):
-                    self._values.append(each)
-        at = np.zeros((len(rows), len(self._values)), np.float32)
-        for place, (dimension, value) in enumerate(self._values):
-            at[:, place] = there = same(rows[:, dimension], value)
-            self._each.setdefault((dimension, value), Counter()).update(demonstrations[there].tolist())
-        counts = (at.T @ at).astype(np.float64)
-        counts[: len(self._counts), : len(self._counts)] += self._counts
-        order = np.argsort(-counts.diagonal(), kind="stable").tolist()
-        owners = [self._values[place][0] for place in order]
-        kept = [place for rank, place in enumerate(order) if owners[:rank].count(owners[rank]) < KEPT]
-        self._values = [self._values[place] for place in kept]
-        self._each = {each: self._each[each] for each in self._values}
-        self._counts = counts[np.ix_(kept, kept)]
-
-
-def control_dimensions(controls: Mapping[str, np.ndarray]) -> tuple[ControlDimension, ...]:
-    """The statistics of each control dimension in demonstrations [T, A] by name."""
-    statistics = ControlStatistics()
-    for name, steps in controls.items():
-        statistics.add(steps, name)
-    return statistics.dimensions()
 
 
 def all_constant(dimensions: Sequence[ControlDimension]) -> str:

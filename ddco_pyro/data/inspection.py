@@ -31,7 +31,7 @@ from ddco_pyro.data.controls import (
     FEWEST,
     MOST_DIMENSIONS,
     ControlDimension,
-    ControlStatistics,
+    control_dimensions,
     control_parts,
     described,
     few,
@@ -291,7 +291,6 @@ class _Turns:
     unit: np.ndarray
     flips: np.ndarray
     names: list[str] = field(default_factory=list)
-    last: np.ndarray | None = None
     first: np.ndarray | None = None
 
     @classmethod
@@ -301,22 +300,21 @@ class _Turns:
         empty = np.zeros((len(TURNS), size), int)
         return cls(empty, empty.copy(), np.ones(four, dtype=bool), np.zeros(four, int))
 
-    def add(self, rows: np.ndarray, name: str, begins: bool) -> None:
-        """Add steps [T, D] of a demonstration; a demonstration may begin with another sign than the first one."""
+    def add(self, rows: np.ndarray, name: str) -> None:
+        """Add a demonstration [T, D]; it may begin with another sign than the first one."""
         values = rows.astype(np.float64)
-        before = self.first if begins else self.last
-        self.first, self.last = values[:1] if self.first is None else self.first, values[-1:]
+        pairs = values if self.first is None else np.concatenate([self.first, values])
+        self.first = values[:1] if self.first is None else self.first
         with np.errstate(invalid="ignore", over="ignore"):
             if len(self.unit):
                 self.unit &= (np.abs(_fours(values * values) - 1) < UNIT).all(0)
-            pairs = values if before is None else np.concatenate([before, values])
-            changes = np.abs(np.diff(pairs[1:] if begins and before is not None else pairs, axis=0))
+            changes = np.abs(np.diff(values, axis=0))
             jumps = np.stack([(changes > NEARLY * turn).sum(0) for turn in TURNS.values()])
             self.between += np.stack([(changes > turn / 4).sum(0) for turn in TURNS.values()]) - jumps
             flips = (_fours(pairs[1:] * pairs[:-1]) < -NEARLY).sum(0) if len(self.unit) else self.flips * 0
         self.jumps += jumps
         self.flips += flips
-        if (jumps.any() or (flips > 0)[self.unit].any()) and name not in self.names[-1:]:
+        if jumps.any() or (flips > 0)[self.unit].any():
             self.names.append(name)
 
     @property
@@ -352,7 +350,8 @@ class _Inspector:
         self.fields: dict[str, Field] = {}
         self.lengths: dict[str, int] = {}
         self.problems: dict[tuple[str, str], list[str]] = {}  # messages by kind and subject
-        self.control, self.coincidences = ControlStatistics(), _Coincidences()
+        self.controls: dict[str, np.ndarray] = {}
+        self.coincidences = _Coincidences()
         self.turns: dict[str, _Turns] = {}
         self.periods: dict[str, dict[str, float]] = {}  # of a step, by what says so and by demonstration
 
@@ -369,12 +368,13 @@ class _Inspector:
                 self._problem("unreadable", str(error), re.sub(r"\d+", "", str(error).removeprefix(name)))
                 unreadable.append(name)
                 self.coincidences.forget(name)
+                self.controls.pop(name, None)
         for name, there in places.items():
             for place in (place for place in fields if place not in there):
                 self._problem("missing", f"{name}: {place} is missing", place)
         masks = {mask: tuple(name for name in members if name not in exclude) for mask, members in source.masks.items()}
         self._name_labels()
-        dimensions = self.control.dimensions()
+        dimensions = control_dimensions(self.controls)
         varying = [dimension.number for dimension in dimensions if not dimension.constant]
         found = self.problems.values()
         kinds = (each[0] if len(each) == 1 else f"{each[0]}; the first of {len(each)} such" for each in found)
@@ -405,8 +405,9 @@ class _Inspector:
         """
         if any(dimension.integer for dimension in dimensions):
             return {}
-        still = self.control.still()
-        dead = [name for name, row in still.items() if not row.any()]
+        long = {name: rows for name, rows in self.controls.items() if len(rows) >= FEWEST}
+        still = {name: rows for name, rows in long.items() if same(rows.min(0), rows.max(0)).all()}
+        dead = [name for name, rows in still.items() if not rows.any()]
         others = [name for name in still if name not in dead]
         found = dict.fromkeys(dead, "all commands are 0") if 2 * len(dead) < len(self.lengths) else {}
         if len(others) <= most_few(len(self.lengths)):
@@ -491,26 +492,32 @@ class _Inspector:
         return {place for place, _ in recording.columns()}
 
     def _read_column(self, array: Field, column: Column, name: str) -> None:
-        step, first = 0, np.zeros(0)
-        self.coincidences.begin_column(array.place)
-        for block in column.blocks():
+        """Feed an array to every statistic: in blocks if its steps are large, as those of pictures."""
+        place, step = array.place, 0
+        whole = place == "actions" or math.prod(array.shape) <= WIDEST
+        values = first = np.zeros((0, 0))
+        self.coincidences.begin_column(place)
+        for block in [column.array()] if whole else column.blocks():
             if not len(block):
                 continue
             values = block.reshape(len(block), -1)
             first = first if step else values[:1].copy()
-            if array.place == "actions":
-                self.control.add(block, name)
-            self.coincidences.add(array.place, values, step, column.image)
+            self.coincidences.add(place, values, step)
             array.add(values, name, step, first)
-            if array.dtype.kind == "f" and values.shape[1] <= MOST_DIMENSIONS:
-                turns = self.turns.setdefault(array.place, _Turns.of(values.shape[1]))
-                turns.add(values, name, begins=not step)
             step += len(values)
-        self.coincidences.end_column()
-        if step > 1 and values.shape[1] == 1 and TIME.search(array.place):
-            period = (float(values[-1, 0]) - float(first[0, 0])) / (step - 1)
+        self.coincidences.end_column(place)
+        if not (whole and step):
+            return
+        if place == "actions":
+            self.controls[name] = block
+        if not array.image:
+            self.coincidences.add_vectors(place, values)
+        if array.dtype.kind == "f" and values.shape[1] <= MOST_DIMENSIONS:
+            self.turns.setdefault(place, _Turns.of(values.shape[1])).add(values, name)
+        if step > 1 and values.shape[1] == 1 and TIME.search(place):
+            period = (float(values[-1, 0]) - float(values[0, 0])) / (step - 1)
             if 0 < period < math.inf:
-                self.periods.setdefault(array.place, {})[name] = period
+                self.periods.setdefault(place, {})[name] = period
 
     def _problem(self, kind: str, message: str, about: str) -> None:
         self.problems.setdefault((kind, about), []).append(message)
@@ -548,7 +555,7 @@ LOOKED_AT = 1000
 """Steps of each demonstration in which observations are compared with controls."""
 
 WIDEST = 10_000
-"""Largest observation, in numbers per step, that is compared with controls."""
+"""Largest array, in numbers per step, of which a demonstration is read at once, and compared with controls."""
 
 FEW = 3
 """Number of values of a switch with padding."""
@@ -583,52 +590,30 @@ class _Demonstration:
     """What is known of one demonstration.
 
     :param tails: for each array, the controls first, the number of equal last steps.
-    :param commands: the first controls [T, A], at most :data:`LOOKED_AT`; ``ending`` the last ones.
+    :param controls: [T, A].
     :param rests: for each vector, the number of first steps and of last steps in which it hardly changes.
-    :param values: the values of each control dimension; from :data:`FEW` + 1 values on, not all of them.
-    :param ends: for each control dimension, the number of steps up to the last nonzero value.
-    :param zeros: for each control dimension, the number of steps with value 0.
     """
 
     name: str
     steps: int
-    digest: bytes = b""
+    digest: Any = field(default_factory=hashlib.sha256)
     tails: list[int] = field(default_factory=list)
-    commands: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
-    ending: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
+    controls: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
     rests: list[tuple[int, int]] = field(default_factory=list)
-    values: list[frozenset[float]] = field(default_factory=list)
-    ends: list[int] = field(default_factory=list)
-    zeros: list[int] = field(default_factory=list)
 
     @property
     def tail(self) -> int:
         """Number of last steps in which no array changes."""
         return min(self.tails, default=0)
 
-    def add_controls(self, controls: np.ndarray, first: int) -> None:
-        """Add controls [T, A] from step ``first`` on."""
-        self.commands = _joined(self.commands, controls)[:LOOKED_AT]
-        self.ending = _joined(self.ending, controls)[-LOOKED_AT:]
-        if not first:
-            self.values = [frozenset()] * controls.shape[1]
-            self.ends, self.zeros = [0] * controls.shape[1], [0] * controls.shape[1]
-        for dimension, column in enumerate(controls.T):
-            known = self.values[dimension]
-            if len(known) <= FEW:
-                self.values[dimension] = known | frozenset(np.unique(column)[: FEW + 1].tolist())
-            (moved,) = np.nonzero(column)
-            self.zeros[dimension] += len(column) - len(moved)
-            if len(moved):
-                self.ends[dimension] = first + int(moved[-1]) + 1
-
-
-def _joined(before: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    return np.concatenate([before, rows]) if len(before) else rows.copy()
+    def rest(self, end: int, span: np.ndarray) -> int:
+        """The number of first controls, or at ``end`` 1 of last ones, that change by a small part of ``span`` [A]."""
+        return _rest(self.controls[::-1] if end else self.controls, span)
 
 
 def _rest(rows: np.ndarray, span: np.ndarray) -> int:
-    """The number of first rows [T, D] that equal the very first one up to a small part of ``span`` [D]."""
+    """The number of first rows [T, D], at most :data:`LOOKED_AT`, that equal row 0 up to a part of ``span`` [D]."""
+    rows = rows[:LOOKED_AT]
     with np.errstate(invalid="ignore"):
         moved = (np.abs(rows - rows[0].astype(np.float64)) > STILL * span).any(1)
     return int(moved.argmax()) if moved.any() else len(rows)
@@ -641,8 +626,7 @@ class _Coincidences:
         self._demos: list[_Demonstration] = []
         self._equal: dict[str, np.ndarray] = {}  # by place, for each shift, [D, A]: whether they are always equal
         self._compared: dict[str, np.ndarray] = {}  # number of compared steps, for each shift
-        self._place, self._tail, self._last, self._digest = "", 0, np.empty(0), hashlib.sha256()
-        self._first = self._end = self._low = self._high = np.empty(0)  # of the array: rows, and the range
+        self._tail, self._last = 0, np.empty(0)
 
     def begin(self, name: str, steps: int) -> None:
         """Begin a demonstration, whose controls come first."""
@@ -654,37 +638,35 @@ class _Coincidences:
 
     def begin_column(self, place: str) -> None:
         """Begin an array of the demonstration."""
-        self._place, self._tail, self._digest = place, 0, hashlib.sha256(place.encode())
-        self._first = self._end = np.empty((0, 0))
+        self._tail = 0
+        self._demos[-1].digest.update(place.encode())
 
-    def add(self, place: str, rows: np.ndarray, first: int, image: bool) -> None:
+    def add(self, place: str, rows: np.ndarray, first: int) -> None:
         """Add rows [T, D] of the array from step ``first`` on."""
         if place.startswith("labels/"):
             return
-        demo = self._demos[-1]
         (others,) = np.nonzero((rows != rows[-1]).any(1))
         tail = len(rows) - (int(others[-1]) + 1 if len(others) else 0)
         continues = first and tail == len(rows) and np.array_equal(rows[0], self._last)
         self._tail, self._last = tail + (self._tail if continues else 0), rows[-1].copy()
-        self._digest.update(np.ascontiguousarray(rows).tobytes())
-        if not image and place != "actions" and rows.shape[1] <= WIDEST:
-            ends = [rows.min(0), rows.max(0)]
-            self._low, self._high = (np.minimum(self._low, ends[0]), np.maximum(self._high, ends[1])) if first else ends
-            self._first, self._end = _joined(self._first, rows)[:LOOKED_AT], _joined(self._end, rows)[-LOOKED_AT:]
-        if place == "actions":
-            demo.add_controls(rows, first)
-        elif len(demo.commands) and not first and not image and rows.shape[1] <= WIDEST:
-            self._compare(place, rows[: len(demo.commands)], demo.commands)
+        self._demos[-1].digest.update(np.ascontiguousarray(rows).tobytes())
 
-    def end_column(self) -> None:
+    def end_column(self, place: str) -> None:
         """End the array."""
-        if not self._place.startswith("labels/"):
+        if not place.startswith("labels/"):
             self._demos[-1].tails.append(self._tail)
-            self._demos[-1].digest += self._digest.digest()
-        if len(self._first):
+
+    def add_vectors(self, place: str, rows: np.ndarray) -> None:
+        """Add a whole array [T, D] of vectors."""
+        demo = self._demos[-1]
+        if place == "actions":
+            demo.controls = rows
+        elif place.startswith("obs/"):
             with np.errstate(invalid="ignore"):
-                span = self._high.astype(np.float64) - self._low
-            self._demos[-1].rests.append((_rest(self._first, span), _rest(self._end[::-1], span)))
+                span = rows.max(0).astype(np.float64) - rows.min(0)
+            demo.rests.append((_rest(rows, span), _rest(rows[::-1], span)))
+            if len(demo.controls):
+                self._compare(place, rows[:LOOKED_AT], demo.controls[:LOOKED_AT])
 
     def _compare(self, place: str, rows: np.ndarray, commands: np.ndarray) -> None:
         """Update which numbers of an observation [T, D] equal controls [T, A] of the same or a neighbouring step."""
@@ -708,18 +690,18 @@ class _Coincidences:
         varying = [dimension.number for dimension in dimensions if not dimension.constant]
         padding = list(self._padding())
         idle = () if any(dimension.integer for dimension in dimensions) else self._idle(dimensions, bool(padding))
-        return [*self._switches(varying), *padding, *idle, *self._copies(masks), *self._observed(varying)]
+        return [*self._switches(dimensions), *padding, *idle, *self._copies(masks), *self._observed(varying)]
 
     def paddings(self) -> dict[str, dict[str, np.ndarray]]:
         """By name of the few demonstrations with equal commands at an end: the stretch in words, and the command."""
         found: dict[str, dict[str, np.ndarray]] = {}
-        for where in ("first", "last"):
-            rows = {demo.name: demo.ending[::-1] if where == "last" else demo.commands for demo in self._demos}
-            steps = {name: _rest(own, np.zeros(own.shape[1])) for name, own in rows.items() if len(own)}
-            padded = [name for name in steps if steps[name] >= FEWEST]
-            for name in padded if len(padded) <= most_few(len(rows)) else ():
-                why = f"the {where} {steps[name]} commands are the same, as padding is"
-                found.setdefault(name, {})[why] = rows[name][0]
+        moving = [demo for demo in self._demos if len(demo.controls)]
+        for end, where in enumerate(("first", "last")):
+            steps = {demo.name: demo.rest(end, np.zeros(demo.controls.shape[1])) for demo in moving}
+            padded = [demo for demo in moving if steps[demo.name] >= FEWEST]
+            for demo in padded if len(padded) <= most_few(len(self._demos)) else ():
+                why = f"the {where} {steps[demo.name]} commands are the same, as padding is"
+                found.setdefault(demo.name, {})[why] = demo.controls[-end]
         return found
 
     def _idle(self, dimensions: Sequence[ControlDimension], padded: bool) -> Iterator[str]:
@@ -729,11 +711,10 @@ class _Coincidences:
         for end, where in enumerate(("start", "end")):
             found: dict[str, int] = {}
             for demo in self._demos:
-                rows = demo.ending[::-1] if end else demo.commands
-                if demo.steps == 0 or rows.shape[1] != len(span) or (end and padded and demo.tail > 1):
+                if not len(demo.controls) or len(span) != demo.controls.shape[1] or (end and padded and demo.tail > 1):
                     continue
-                steps = _rest(rows, span)
-                if rows[0][moves].any():  # no velocity: what is seen has to rest, too
+                steps = demo.rest(end, span)
+                if demo.controls[-end][moves].any():  # no velocity: what is seen has to rest, too
                     steps = min([steps, *(rests[end] for rests in demo.rests)])
                 if max(LONG, LONG_SHARE * demo.steps) <= steps < demo.steps:
                     found[demo.name] = steps
@@ -786,7 +767,7 @@ class _Coincidences:
 
     def _copies(self, masks: Mapping[str, Sequence[str]]) -> Iterator[str]:
         known: dict[bytes, str] = {}
-        each = [(known.setdefault(demo.digest, demo.name), demo.name) for demo in self._demos]
+        each = [(known.setdefault(demo.digest.digest(), demo.name), demo.name) for demo in self._demos]
         pairs = [(first, again) for first, again in each if first != again]
         effect = "one of two that are the same may be trained on and the other held out"
         if masks.keys() & {"train", "valid"}:
@@ -803,27 +784,26 @@ class _Coincidences:
                 f"{first}: {effect}"
             )
 
-    def _switches(self, varying: Sequence[int]) -> Iterator[str]:
+    def _switches(self, dimensions: Sequence[ControlDimension]) -> Iterator[str]:
         """Dimensions that are switches except for padding, or under two conventions."""
-        for dimension in varying:
-            each = [demo for demo in self._demos if dimension < len(demo.values)]
-            whole = frozenset[float]().union(*(demo.values[dimension] for demo in each))
-            if len(whole) != FEW or 0.0 not in whole:
+        for dimension in dimensions:
+            if len(dimension.distinct) != FEW or 0.0 not in dimension.distinct:
                 continue
-            padded = [demo for demo in each if demo.zeros[dimension]]
-            ends = all(demo.ends[dimension] + demo.zeros[dimension] == demo.steps for demo in padded)
-            if ends and len(padded) > most_few(len(each)):  # fewer are odd
-                low, high = map(number, sorted(whole - {0.0}))
+            where = f"control dimension {dimension.number}"
+            columns = {demo.name: demo.controls[:, dimension.number] for demo in self._demos if len(demo.controls)}
+            moving = {name: np.count_nonzero(column) for name, column in columns.items() if not column.all()}
+            ends = all(columns[name][:steps].all() for name, steps in moving.items())
+            if ends and len(moving) > most_few(len(columns)):  # fewer are odd
+                low, high = (number(value) for value in dimension.distinct if value)
+                first, step = next(iter(moving.items()))
                 yield (
-                    f"control dimension {dimension}: {low} or {high}, and 0 at the end of {len(padded)} of {len(each)} "
-                    f"demonstrations, the first {padded[0].name} from step {padded[0].ends[dimension]} on: cut the "
-                    "ends off if they are padding, and it is a switch"
+                    f"{where}: {low} or {high}, and 0 at the end of {len(moving)} of {len(columns)} demonstrations, "
+                    f"the first {first} from step {step} on: cut the ends off if they are padding, and it is a switch"
                 )
-            signs = [demo for demo in each if demo.values[dimension] == {-1.0, 1.0}]
-            bits = [demo for demo in each if demo.values[dimension] == {0.0, 1.0}]
-            if signs and bits and not any({-1.0, 0.0} <= demo.values[dimension] for demo in each):
+            values = {name: set(np.unique(column).tolist()) for name, column in columns.items()}
+            signs, bits = ([name for name in values if values[name] == pair] for pair in ({-1.0, 1.0}, {0.0, 1.0}))
+            if signs and bits and not any({-1.0, 0.0} <= there for there in values.values()):
                 yield (
-                    f"control dimension {dimension}: -1 or 1 in {len(signs)} demonstrations, the first "
-                    f"{signs[0].name}, and 0 or 1 in {len(bits)}, the first {bits[0].name}: write all of them in one "
-                    "way, and it is a switch"
+                    f"{where}: -1 or 1 in {len(signs)} demonstrations, the first {signs[0]}, and 0 or 1 in "
+                    f"{len(bits)}, the first {bits[0]}: write all of them in one way, and it is a switch"
                 )
