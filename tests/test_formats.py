@@ -82,7 +82,7 @@ class Planted:
         fit = SimpleNamespace(names={"skill": NAMES}, spec=spec)
         out, demos = self.folder / name, demos or self.file
         with open_source(demos) as source:
-            writer = kind(option, out, Asked(fit, self.folder / "run", demos, source, "skill", **more))
+            writer = kind(option, out, Asked(fit, self.folder / "run", demos, source, "skill"), **more)
             writer.check()
             self.said = writer.write(self.segmented)
         return out

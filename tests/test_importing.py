@@ -527,7 +527,8 @@ def test_broken_demonstrations_are_refused_or_left_out(tmp_path: Path, out: Path
         (["--observation", "objct"], "demo_0: there is no observation 'objct' (did you mean 'object'?); there is: "),
         (["--format", "lerobot"], "info.json: cannot be read, or is damaged"),
         (["--format", "minari"], "cannot be read, or is damaged"),
-        (["--action", "actions"], "has the format robomimic, with one control; --action is for LeRobot and Minari"),
+        (["--format", "roboimic"], "there is no format 'roboimic' (did you mean 'robomimic'?); there is: lerobot, "),
+        (["--action", "actions"], "has the format robomimic, with one control; --action is for the folder of a Le"),
         (["--image-size", "3"], "Invalid value for '--image-size'"),
     ],
 )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-from enum import StrEnum
 from pathlib import Path
 from shlex import quote
 from typing import Annotated
@@ -13,32 +12,18 @@ import typer
 
 from ddco_pyro.cli import AllowCode, AllowExternal, Overrides, SpecPath, hint, out_file, written
 from ddco_pyro.data.files import Output, check_outputs, write_text
+from ddco_pyro.data.formats import FORMATS
 from ddco_pyro.errors import BadInput, command
 from ddco_pyro.spec import SpecError, load_spec
 
-
-class FormatName(StrEnum):
-    """Formats of demonstrations."""
-
-    robomimic = "robomimic"
-    minari = "minari"
-    lerobot = "lerobot"
-    maniskill = "maniskill"
-    act = "act"
-    d4rl = "d4rl"
-    jigsaws = "jigsaws"
-    ogbench = "ogbench"
-
-
 SourcePath = Annotated[
-    Path,
-    typer.Argument(
-        metavar="FILE",
-        help="An HDF5 or npz file, or the folder of a Minari or LeRobot dataset, of ACT's episodes, or of JIGSAWS.",
-    ),
+    Path, typer.Argument(metavar="FILE", help=f"Demonstrations: {', '.join(about.text for about in FORMATS.values())}.")
 ]
 FormatOption = Annotated[
-    FormatName | None, typer.Option("--format", help="The format; recognised unless given.", show_default=False)
+    str | None,
+    typer.Option(
+        "--format", metavar="NAME", help=f"One of {', '.join(FORMATS)}; recognised unless given.", show_default=False
+    ),
 ]
 
 
@@ -73,7 +58,7 @@ def inspect(
     from ddco_pyro.data.inspection import inspect as look
     from ddco_pyro.data.starting import starting_spec
 
-    facts = look(file, form.value if form else None)
+    facts = look(file, form)
     if as_json:
         print(json.dumps(facts.as_json(), indent=1))
         return
@@ -145,9 +130,7 @@ def import_(
     size = (image_size, image_size) if image_size else None
     choice = Choice(tuple(observations), mask, videos, size, hz, skip_broken, allow_external, tuple(actions))
     with console.Progress("importing") as progress:
-        imported = import_demonstrations(
-            source, out, form.value if form else None, choice, lambda *done: progress(DemonstrationsDone(*done))
-        )
+        imported = import_demonstrations(source, out, form, choice, lambda *done: progress(DemonstrationsDone(*done)))
     for name, reason in imported.left_out.items():
         print(f"left out {name}: {reason}", file=sys.stderr)
     for line in imported.unread:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import inspect
 import shlex
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from enum import StrEnum
 from functools import wraps
 from importlib import import_module
 from pathlib import Path
@@ -132,17 +131,18 @@ def _check_run(run: Path, *names: str) -> None:
 # --- segment and export -----------------------------------------------------------------------------------------------
 
 
-class LeRobotFormat(StrEnum):
-    """Forms of subtasks, by the first version of LeRobot that reads them."""
-
-    LANGUAGE = "0.6"
-    SUBTASK_INDEX = "0.4"
+def _option(name: str, default: Any, kind: Any, text: str) -> inspect.Parameter:
+    """An option that belongs to formats alone, as a parameter of their writers."""
+    flag = f"--{name.replace('_', '-')}"
+    annotation = Annotated[kind, typer.Option(flag, help=text)]
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
 
 class Format(NamedTuple):
     """A format of segments, an option of ``segment`` that names a file or folder.
 
     :param writer: its class in :mod:`ddco_pyro.segmenting.formats`, ``module:Class``.
+    :param more: further options, which are arguments of that class.
     """
 
     option: str
@@ -150,19 +150,38 @@ class Format(NamedTuple):
     writer: str
     group: str
     text: str
+    more: tuple[inspect.Parameter, ...] = ()
 
 
+OVERWRITE = _option("overwrite", False, bool, "Let --out replace a file that is no labelled copy of DEMOS.")
+LEROBOT_FORMAT = _option(
+    "lerobot_format", "0.6", Literal["0.6", "0.4"], "Subtasks as LeRobot reads them from 0.6 on, or in 0.4 and 0.5."
+)
+SAME_ORDER = _option(
+    "same_order",
+    False,
+    bool,
+    "Leave demonstrations out of --mimicgen and --isaac if their options follow another order than most.",
+)
 GENERAL, DATASETS, TOOLS = "Pages, tables and labels", "Datasets for training", "Annotation tools"
 FORMATS = (
     Format("--html", "stream", "html:Page", GENERAL, "A page with the timeline of every demonstration."),
     Format("--csv", "stream", "tables:CSV", GENERAL, "A table with a row for each step."),
     Format("--parquet", "stream", "tables:Parquet", GENERAL, "The same table as Parquet."),
-    Format("--out", "file", "labels:Labels", GENERAL, "A copy of the HDF5 file with labels for each step."),
-    Format("--lerobot", "folder", "lerobot:Annotated", DATASETS, "A LeRobot dataset with options as subtasks."),
+    Format(
+        "--out", "file", "labels:Labels", GENERAL, "A copy of the HDF5 file with labels for each step.", (OVERWRITE,)
+    ),
+    Format(
+        *("--lerobot", "folder", "lerobot:Annotated", DATASETS, "A LeRobot dataset with options as subtasks."),
+        more=(LEROBOT_FORMAT,),
+    ),
     Format("--sarm", "folder", "lerobot:SARM", DATASETS, "A LeRobot dataset with the stages of SARM's reward model."),
     Format("--rabc", "stream", "rabc:RABC", DATASETS, "Progress of each frame as Parquet, for RA-BC in LeRobot."),
-    Format("--mimicgen", "file", "mimicgen:MimicGen", DATASETS, "A copy of a prepared file, with MimicGen's signals."),
-    Format("--isaac", "file", "mimicgen:Isaac", DATASETS, "The same for Isaac Lab Mimic."),
+    Format(
+        *("--mimicgen", "file", "mimicgen:MimicGen", DATASETS, "A copy of a prepared file, with MimicGen's signals."),
+        more=(SAME_ORDER,),
+    ),
+    Format("--isaac", "file", "mimicgen:Isaac", DATASETS, "The same for Isaac Lab Mimic.", (SAME_ORDER,)),
     Format("--rlds", "folder", "rlds:RLDS", DATASETS, "Steps in the fields of RLDS, as numpy archives."),
     Format("--label-studio", "folder", "label_studio:LabelStudio", TOOLS, "Predictions for Label Studio."),
     Format("--elan", "folder", "elan:ELAN", TOOLS, "ELAN's .eaf of each demonstration."),
@@ -174,7 +193,8 @@ FORMATS = (
 def with_formats(command: Callable[..., None]) -> Callable[..., None]:
     """Give a command an option for each format, between its arguments and its own options.
 
-    The command gets them as ``outputs``, from the option to the path, with the options that were given.
+    The command gets them as ``outputs``, from the option to the path, with the options that were given, and the
+    formats' further options as ``settings`` by name.
     """
     own = list(inspect.signature(command, eval_str=True).parameters.values())
     parsers = {"file": out_file, "stream": out_file, "folder": out_folder}
@@ -193,12 +213,17 @@ def with_formats(command: Callable[..., None]) -> Callable[..., None]:
         for name, form in added.items()
     ]
 
+    more = {option.name: option for form in FORMATS for option in form.more}
+    options += more.values()
+
     @wraps(command)
     def with_outputs(**arguments: Any) -> None:
         paths = {form.option: arguments.pop(name, None) for name, form in added.items()}
-        command(**arguments, outputs={option: path for option, path in paths.items() if path})
+        settings = {name: arguments.pop(name, option.default) for name, option in more.items()}
+        outputs = {option: path for option, path in paths.items() if path}
+        command(**arguments, outputs=outputs, settings=settings)
 
-    parameters = [parameter.replace(kind=keyword) for parameter in own if parameter.name != "outputs"]
+    parameters = [option.replace(kind=keyword) for option in own if option.name not in ("outputs", "settings")]
     vars(with_outputs)["__signature__"] = inspect.Signature([*parameters[:2], *options, *parameters[2:]])
     return with_outputs
 
@@ -206,28 +231,15 @@ def with_formats(command: Callable[..., None]) -> Callable[..., None]:
 @with_formats
 def segment(
     outputs: dict[str, Path],
+    settings: dict[str, Any],
     run: RunPath,
     demos: Annotated[
         Path, typer.Argument(metavar="DEMOS", help="Demonstrations: an HDF5 file, or a Minari or LeRobot dataset.")
     ],
     in_place: Annotated[bool, typer.Option("--in-place", help="Write the labels into the HDF5 file itself.")] = False,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Let --out replace a file that is no labelled copy of DEMOS.")
-    ] = False,
     level: Annotated[
         str | None, typer.Option(help="The level that gives the subtasks; the lowest by default.", show_default=False)
     ] = None,
-    same_order: Annotated[
-        bool,
-        typer.Option(
-            "--same-order",
-            help="Leave demonstrations out of --mimicgen and --isaac if their options follow another order than most.",
-        ),
-    ] = False,
-    lerobot_format: Annotated[
-        LeRobotFormat,
-        typer.Option("--lerobot-format", help="Subtasks as LeRobot reads them from 0.6 on, or in 0.4 and 0.5."),
-    ] = LeRobotFormat.LANGUAGE,
     fps: Annotated[
         float | None,
         typer.Option(
@@ -283,18 +295,8 @@ def segment(
         raise BadInput(f"--level: there is no level {level!r} (there is: {', '.join(fit.names)})")
     with open_source(demos, external=allow_external) as source, console.Progress("segmenting") as progress:
         beside = tuple(f"{level}_{name}" for level in fit.names for name in BASELINES) if baselines else ()
-        asked = Asked(
-            fit,
-            run,
-            demos,
-            source,
-            level or next(iter(fit.names), ""),
-            beside,
-            overwrite,
-            lerobot_format,
-            same_order,
-        )
-        writers = [_writer(place, asked) for place in places]
+        asked = Asked(fit, run, demos, source, level or next(iter(fit.names), ""), beside)
+        writers = [_writer(place, asked, settings) for place in places]
         if fit.names:  # without options, segments() refuses the run
             for writer in writers:
                 writer.check()
@@ -318,14 +320,15 @@ def segment(
             print(writer.write(segmented))
 
 
-def _writer(place: Output, asked: Asked) -> Writer:
-    (name,) = {form.writer for form in FORMATS if form.option == place.option.replace("--in-place", "--out")}
-    module, _, kind = name.partition(":")
+def _writer(place: Output, asked: Asked, settings: Mapping[str, Any]) -> Writer:
+    (form,) = (form for form in FORMATS if form.option == place.option.replace("--in-place", "--out"))
+    module, _, kind = form.writer.partition(":")
     try:
         found = import_module(f"ddco_pyro.segmenting.formats.{module}")
     except ModuleNotFoundError as error:
         raise BadInput(f"{place.option} needs {error.name}; install it with: pip install {error.name}") from None
-    made: Writer = getattr(found, kind)(place.option, place.path, asked)
+    more = {option.name: settings[option.name] for option in form.more}
+    made: Writer = getattr(found, kind)(place.option, place.path, asked, **more)
     return made
 
 

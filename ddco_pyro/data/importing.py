@@ -14,7 +14,7 @@ import numpy as np
 from ddco_pyro.data.checks import NUMBERS, check, check_alike, check_values, reading
 from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError, opened
 from ddco_pyro.data.pictures import resized
-from ddco_pyro.data.sources import Column, Format, Recording, Source, open_source
+from ddco_pyro.data.sources import Column, Recording, Source, open_source
 from ddco_pyro.data.sources.metadata import FREQUENCY
 from ddco_pyro.data.sources.robomimic import Parts, discard, parts_of
 from ddco_pyro.errors import BadInput, nearest
@@ -68,7 +68,7 @@ class Imported:
 def import_demonstrations(
     source: str | Path,
     out: Path,
-    form: Format | None = None,
+    form: str | None = None,
     choice: Choice = Choice(),
     on_recording: OnRecording = lambda done, total: None,
 ) -> Imported:

@@ -43,7 +43,7 @@ from ddco_pyro.data.controls import (
 )
 from ddco_pyro.data.hdf5 import DemonstrationsError, outside_files
 from ddco_pyro.data.pictures import MOVED
-from ddco_pyro.data.sources import Column, Format, Source, open_source
+from ddco_pyro.data.sources import Column, Source, open_source
 from ddco_pyro.data.sources.metadata import rate
 from ddco_pyro.data.sources.recording import UNKNOWN, label_names
 from ddco_pyro.spec import ControlSpec
@@ -186,7 +186,7 @@ class Inspection:
     """
 
     path: Path
-    format: Format
+    format: str
     lengths: Mapping[str, int]
     fields: Mapping[str, Field]
     masks: Mapping[str, tuple[str, ...]]
@@ -266,7 +266,7 @@ class Inspection:
         }
 
 
-def inspect(path: str | Path, form: Format | None = None, exclude: Sequence[str] = ()) -> Inspection:
+def inspect(path: str | Path, form: str | None = None, exclude: Sequence[str] = ()) -> Inspection:
     """Read every array of a file or folder once, in blocks.
 
     :param exclude: names of demonstrations to skip.

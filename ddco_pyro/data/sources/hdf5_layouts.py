@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 from shlex import quote
@@ -16,11 +15,11 @@ import cv2
 import h5py
 import numpy as np
 
+from ddco_pyro.data.formats import EPISODE, TRAJECTORY
 from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError, dataset_at, datasets, member, natural, opened
 from ddco_pyro.data.pictures import block_steps
-from ddco_pyro.data.sources import EPISODE, TRAJECTORY
 from ddco_pyro.data.sources.metadata import inside
-from ddco_pyro.data.sources.recording import Column, Format, Recording, joined, of_array, of_dataset
+from ddco_pyro.data.sources.recording import Column, Recording, joined, of_array, of_dataset
 
 BARE = "state"
 """Key of an observation array without a name."""
@@ -29,7 +28,7 @@ BARE = "state"
 class _Source(ABC):
     """Demonstrations that are groups of HDF5 files."""
 
-    format: Format
+    format: str
     frequency: float | None = None
     masks: Mapping[str, tuple[str, ...]] = {}
     attributes: Mapping[str, Attribute] = {}
@@ -66,7 +65,7 @@ class ManiSkill(_Source):
     The observation after the last action is left out.
     """
 
-    format: Format = "maniskill"
+    format = "maniskill"
 
     def _found(self) -> dict[str, tuple[Path, str]]:
         with opened(self.path) as file:
@@ -95,7 +94,7 @@ class Act(_Source):
     [T, longest].
     """
 
-    format: Format = "act"
+    format = "act"
 
     def _found(self) -> dict[str, tuple[Path, str]]:
         if self.path.is_dir():
@@ -130,7 +129,7 @@ class D4RL(_Source):
     A demonstration ends at a true terminal or timeout, and at the end of the file.
     """
 
-    format: Format = "d4rl"
+    format = "d4rl"
 
     def _found(self) -> dict[str, tuple[Path, str]]:
         with opened(self.path) as file:
@@ -208,12 +207,3 @@ def _decoded(column: Column, where: str) -> Column:
                 yield np.stack([decode(encoded, shape) for encoded in block[at : at + at_once]])
 
     return Column((column.shape[0], *shape), np.dtype(np.uint8), blocks)
-
-
-@contextmanager
-def open_layout(path: Path, form: Format) -> Iterator[ManiSkill | Act | D4RL]:
-    """Open a file of one of these formats, or a folder of ACT.
-
-    :raises DemonstrationsError: the source cannot be read, or holds no demonstrations.
-    """
-    yield ManiSkill(path) if form == "maniskill" else Act(path) if form == "act" else D4RL(path)

@@ -14,14 +14,13 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError
-from ddco_pyro.data.sources.recording import LABEL_NAMES, Format, Recording, of_array
+from ddco_pyro.data.sources.recording import LABEL_NAMES, Recording, of_array
 
 TRIALS = Path("kinematics", "AllGestures")
 """The folder of trials in that of a task."""
@@ -44,7 +43,7 @@ class Jigsaws:
     ``labels/gesture`` is the place of a frame's gesture among those of the task, -1 for a frame without one.
     """
 
-    format: Format = "jigsaws"
+    format = "jigsaws"
     frequency: float | None = 30.0
     masks: Mapping[str, tuple[str, ...]] = {}
 
@@ -109,12 +108,3 @@ def _segments(path: Path) -> list[tuple[int, int, str]]:
             raise DemonstrationsError(f"{path}: row {number} is no FIRST LAST GESTURE: {' '.join(row)}")
         segments.append((int(row[0]), int(row[1]), row[2]))
     return segments
-
-
-@contextmanager
-def open_jigsaws(path: Path) -> Iterator[Jigsaws]:
-    """The folder of a task.
-
-    :raises DemonstrationsError: a transcription cannot be read.
-    """
-    yield Jigsaws(path)

@@ -23,7 +23,7 @@ from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError
 from ddco_pyro.data.memory import refuse_too_much
 from ddco_pyro.data.pictures import block_steps, channels_last, turned
 from ddco_pyro.data.sources.metadata import check_links, filled, first_missing, inside, rate, stored_keys
-from ddco_pyro.data.sources.recording import LABEL_NAMES, Column, Format, Recording, damaged, joined, of_array
+from ddco_pyro.data.sources.recording import LABEL_NAMES, Column, Recording, damaged, joined, of_array
 from ddco_pyro.data.sources.video import video_column
 from ddco_pyro.errors import nearest
 
@@ -65,7 +65,7 @@ class LeRobot:
     :param actions: features that are the control together, in this order; ``action`` if empty.
     """
 
-    format: Format = "lerobot"
+    format = "lerobot"
 
     def __init__(self, folder: Path, actions: Sequence[str] = ()) -> None:
         self.folder = folder

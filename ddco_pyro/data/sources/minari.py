@@ -12,7 +12,7 @@ import numpy as np
 
 from ddco_pyro.data.hdf5 import DAMAGE, Attribute, DemonstrationsError, dataset_at, datasets, member, opened
 from ddco_pyro.data.sources.metadata import check_links, first_missing, stored_keys
-from ddco_pyro.data.sources.recording import Format, Recording, damaged, joined, of_array
+from ddco_pyro.data.sources.recording import Recording, damaged, joined, of_array
 from ddco_pyro.errors import nearest
 
 BARE = "observation"
@@ -28,7 +28,7 @@ class Minari:
     :param actions: names of nested actions that are the control together, such as ``arm/joints``; all if empty.
     """
 
-    format: Format = "minari"
+    format = "minari"
     frequency: float | None = None
     masks: Mapping[str, tuple[str, ...]] = {}
 

@@ -18,7 +18,7 @@ from ddco_pyro.data.memory import refuse_too_much
 from ddco_pyro.data.pictures import channels_last, turned
 from ddco_pyro.data.sources.hdf5_layouts import BARE, spans
 from ddco_pyro.data.sources.metadata import stored_keys
-from ddco_pyro.data.sources.recording import Column, Format, Recording, damaged
+from ddco_pyro.data.sources.recording import Column, Recording, damaged
 
 OBSERVATIONS, ACTIONS, TERMINALS, TIMEOUTS = "observations", "actions", "terminals", "timeouts"
 SUFFIX = ".npy"
@@ -32,7 +32,7 @@ class OGBench:
     for. An array is read whole, because an archive cannot be read in parts.
     """
 
-    format: Format = "ogbench"
+    format = "ogbench"
     frequency: float | None = None
     masks: Mapping[str, tuple[str, ...]] = {}
     attributes: Mapping[str, Attribute] = {}

@@ -7,7 +7,6 @@ import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
 
 import h5py
 import numpy as np
@@ -37,8 +36,6 @@ UNKNOWN = -1
 
 BOUNDARY = "_boundary"
 """End of the name of labels that are 1 where a segment begins, beside the labels of a level."""
-
-Format = Literal["robomimic", "minari", "lerobot", "maniskill", "act", "d4rl", "ogbench", "jigsaws"]
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from ddco_pyro.data.hdf5 import (
     written,
 )
 from ddco_pyro.data.sources.metadata import rate
-from ddco_pyro.data.sources.recording import Column, Format, Recording, of_dataset
+from ddco_pyro.data.sources.recording import Column, Recording, of_dataset
 
 ENVIRONMENT = "env_args"
 """Attribute of the group ``data``, where robomimic's tools look for it: the environment, as JSON."""
@@ -43,7 +43,7 @@ STEPS, ALL_STEPS = "num_samples", "total"
 class Robomimic:
     """An open file."""
 
-    format: Format = "robomimic"
+    format = "robomimic"
 
     def __init__(self, path: Path, file: h5py.File, external: bool = False) -> None:
         self._external = external

@@ -1,9 +1,8 @@
-"""Writers of segments: a class for each format, in a module of its own; ``cli/runs.py`` lists them as options."""
+"""Writers of segments: a class for each, in modules of their own; ``cli/runs.py`` lists them with their options."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections import Counter
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -11,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from ddco_pyro.data.sources import Source
-from ddco_pyro.errors import BadInput
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.names import name_in_level
 from ddco_pyro.segmenting import Segmented, Segments
@@ -27,8 +25,6 @@ class Asked:
     :param demos: the path of the demonstrations; ``source`` is the same, open.
     :param level: the level whose options are subtasks.
     :param baselines: names of further labels, ``<level>_<baseline>``.
-    :param lerobot_format: the first version of LeRobot that reads its subtasks.
-    :param same_order: leave out demonstrations whose options follow another order than most.
     """
 
     fit: Fit
@@ -37,9 +33,6 @@ class Asked:
     source: Source
     level: str
     baselines: tuple[str, ...] = ()
-    overwrite: bool = False
-    lerobot_format: str = "0.6"
-    same_order: bool = False
 
     @cached_property
     def names(self) -> list[str]:
@@ -98,35 +91,3 @@ class Writer(ABC):
             for option, start, stop in runs
         ]
         return np.concatenate(parts) / len(order)
-
-    def one_order(self, segmented: Segmented) -> tuple[list[str], dict[str, list[Run]]]:
-        """The subtasks that demonstrations go through, and the runs of each demonstration that does so.
-
-        A subtask that occurs twice has a number the second time, such as ``grasp_2``. The first one lasts at least two
-        steps: MimicGen looks for the step where its signal rises.
-
-        :raises BadInput: a demonstration has other subtasks than most, and none may be left out.
-        """
-        runs = {demo.name: self.runs(demo) for demo in segmented.segments}
-        subtasks = {name: [self.asked.names[option] for option, _, _ in each] for name, each in runs.items()}
-        ((common, count),) = Counter(map(tuple, subtasks.values())).most_common(1)
-        problems = {}
-        for name, each in runs.items():
-            if tuple(subtasks[name]) != common:
-                most = f"those of {count} of {len(runs)} demonstrations are {', '.join(common)}"
-                problems[name] = f"its subtasks are {', '.join(subtasks[name])}, and {most}"
-            elif each[0][2] == 1:
-                problems[name] = f"its first subtask, {common[0]}, lasts one step, whose end cannot be marked"
-        if len(common) == 1:
-            raise BadInput(f"{self.option}: most demonstrations have one subtask, {common[0]}: there is no end to mark")
-        if problems and not (self.asked.same_order and len(problems) < len(runs)):
-            name, problem = next(iter(problems.items()))
-            raise BadInput(
-                f"{self.option}: {name}: {problem}; --same-order leaves such demonstrations out ({len(problems)} of "
-                f"{len(runs)})"
-            )
-        names = [
-            f"{name}_{common[:place].count(name) + 1}" if name in common[:place] else name
-            for place, name in enumerate(common)
-        ]
-        return names, {name: each for name, each in runs.items() if name not in problems}

@@ -17,7 +17,7 @@ from ddco_pyro.data.sources.recording import BOUNDARY, LABEL_NAMES, label_names
 from ddco_pyro.errors import BadInput
 from ddco_pyro.names import choice_names
 from ddco_pyro.segmenting import Segmented, Segments, chosen_names
-from ddco_pyro.segmenting.formats import Writer
+from ddco_pyro.segmenting.formats import Asked, Writer
 
 OURS = "segmented_by"
 """Attribute of labels written by this library; other labels are never replaced."""
@@ -45,13 +45,20 @@ def labels_of(demo: Segments) -> dict[str, np.ndarray]:
 
 
 class Labels(Writer):
-    """``labels/<level>`` and ``labels/<level>_boundary`` of every level, in a copy or in the file itself."""
+    """``labels/<level>`` and ``labels/<level>_boundary`` of every level, in a copy or in the file itself.
+
+    :param overwrite: replace a file that is no labelled copy of the demonstrations.
+    """
+
+    def __init__(self, option: str, out: Path, asked: Asked, overwrite: bool = False) -> None:
+        super().__init__(option, out, asked)
+        self.overwrite = overwrite
 
     def check(self) -> None:
         fit, demos, source = self.asked.fit, self.asked.demos, self.asked.source
         if source.format != "robomimic":
             raise BadInput(f"{demos}: {NO_LABELS}")
-        if not (self.asked.overwrite or _same(self.out, demos)):
+        if not (self.overwrite or _same(self.out, demos)):
             check_copy(demos, self.out)
         check_labels(demos, [*fit.names, *self.asked.baselines], chosen_names(source, fit))
 

@@ -226,11 +226,13 @@ class Annotated(Writer):
 
     Videos are hard links where the file system has them, else copies. A folder that has these very subtasks is not
     written again.
+
+    :param lerobot_format: the first version of LeRobot that reads its subtasks.
     """
 
-    def __init__(self, option: str, out: Path, asked: Asked) -> None:
+    def __init__(self, option: str, out: Path, asked: Asked, lerobot_format: str = "0.6") -> None:
         super().__init__(option, out, asked)
-        self.form = FORMS[asked.lerobot_format]
+        self.form = FORMS[lerobot_format]
 
     def check(self) -> None:
         source = self.asked.source

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import shutil
+from collections import Counter
 from collections.abc import Sequence
+from pathlib import Path
 from typing import ClassVar
 
 import h5py
@@ -13,7 +15,7 @@ from ddco_pyro.data.files import whole_file
 from ddco_pyro.data.hdf5 import opened, written
 from ddco_pyro.errors import BadInput
 from ddco_pyro.segmenting import Segmented, chosen_names
-from ddco_pyro.segmenting.formats import Writer
+from ddco_pyro.segmenting.formats import Asked, Run, Writer
 
 
 class MimicGen(Writer):
@@ -21,6 +23,8 @@ class MimicGen(Writer):
 
     A signal is 0, and 1 from the last step of its subtask on. The last subtask of a demonstration has none. The copy
     has only demonstrations whose subtasks follow one order.
+
+    :param same_order: leave out demonstrations whose options follow another order than most, rather than refuse.
     """
 
     place: ClassVar = "datagen_info"
@@ -28,6 +32,10 @@ class MimicGen(Writer):
     """What the tool's own script writes there."""
 
     script: ClassVar = "python mimicgen/scripts/prepare_src_dataset.py --dataset {}"
+
+    def __init__(self, option: str, out: Path, asked: Asked, same_order: bool = False) -> None:
+        super().__init__(option, out, asked)
+        self.same_order = same_order
 
     def check(self) -> None:
         asked = self.asked
@@ -43,7 +51,7 @@ class MimicGen(Writer):
                     )
 
     def write(self, segmented: Segmented) -> str:
-        names, runs = self.one_order(segmented)
+        names, runs = self._one_order(segmented)
         with whole_file(self.out) as temporary:
             shutil.copyfile(self.asked.demos, temporary)
             with written(temporary, "r+") as file:
@@ -62,6 +70,38 @@ class MimicGen(Writer):
                         group[signal] = (steps >= stop - 1).astype(np.int64)
         missing = f"; left out: {', '.join(left_out)}" if left_out else ""
         return f"{self.out}: {len(runs)} demonstrations with subtasks {', '.join(names)}{missing}"
+
+    def _one_order(self, segmented: Segmented) -> tuple[list[str], dict[str, list[Run]]]:
+        """The subtasks that demonstrations go through, and the runs of each demonstration that does so.
+
+        A subtask that occurs twice has a number the second time, such as ``grasp_2``. The first one lasts at least two
+        steps: MimicGen looks for the step where its signal rises.
+
+        :raises BadInput: a demonstration has other subtasks than most, and none may be left out.
+        """
+        runs = {demo.name: self.runs(demo) for demo in segmented.segments}
+        subtasks = {name: [self.asked.names[option] for option, _, _ in each] for name, each in runs.items()}
+        ((common, count),) = Counter(map(tuple, subtasks.values())).most_common(1)
+        problems = {}
+        for name, each in runs.items():
+            if tuple(subtasks[name]) != common:
+                most = f"those of {count} of {len(runs)} demonstrations are {', '.join(common)}"
+                problems[name] = f"its subtasks are {', '.join(subtasks[name])}, and {most}"
+            elif each[0][2] == 1:
+                problems[name] = f"its first subtask, {common[0]}, lasts one step, whose end cannot be marked"
+        if len(common) == 1:
+            raise BadInput(f"{self.option}: most demonstrations have one subtask, {common[0]}: there is no end to mark")
+        if problems and not (self.same_order and len(problems) < len(runs)):
+            name, problem = next(iter(problems.items()))
+            raise BadInput(
+                f"{self.option}: {name}: {problem}; --same-order leaves such demonstrations out ({len(problems)} of "
+                f"{len(runs)})"
+            )
+        names = [
+            f"{name}_{common[:place].count(name) + 1}" if name in common[:place] else name
+            for place, name in enumerate(common)
+        ]
+        return names, {name: each for name, each in runs.items() if name not in problems}
 
 
 class Isaac(MimicGen):

@@ -1,0 +1,90 @@
+"""The formats of demonstrations that can be read; to add one, write its reader and a row of :data:`FORMATS`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Collection
+from pathlib import Path
+from typing import NamedTuple
+from zipfile import is_zipfile
+
+TRAJECTORY, EPISODE = re.compile(r"traj_(\d+)"), re.compile(r"episode_(\d+)\.(?:hdf5|h5)")
+"""Names of ManiSkill's groups, and of ACT's files."""
+
+
+class Format(NamedTuple):
+    """A format of demonstrations.
+
+    :param reader: the source's class or context manager in :mod:`ddco_pyro.data.sources`, ``module:name``. A module
+        imports its own library, which need not be installed for other formats.
+    :param fits: whether a path has the format; also given the names at the top of an HDF5 file, else none.
+    :param text: the path in words, such as ``the folder of a Minari dataset``.
+    :param sign: what tells a folder of this format, in words.
+    :param options: further arguments of the reader: ``external``, whether parts of an HDF5 file may be in other files,
+        and ``actions``, names of the arrays that are the control together.
+    """
+
+    reader: str
+    fits: Callable[[Path, Collection[str]], bool]
+    text: str
+    sign: str = ""
+    options: Collection[str] = ()
+
+
+def _minari(path: Path, names: Collection[str]) -> bool:
+    if path.is_file():
+        return path.name == "main_data.hdf5" and path.with_name("metadata.json").is_file()
+    return (path / "data" / "metadata.json").is_file() or (path / "metadata.json").is_file()
+
+
+def _act(path: Path, names: Collection[str]) -> bool:
+    return {"action", "observations"} <= {*names} or (
+        path.is_dir() and any(EPISODE.fullmatch(one.name) for one in path.iterdir())
+    )
+
+
+def _d4rl(path: Path, names: Collection[str]) -> bool:
+    return {"actions", "observations"} <= {*names} and bool({"terminals", "timeouts"} & {*names})
+
+
+FORMATS = {
+    "lerobot": Format(
+        "lerobot:open_lerobot",
+        lambda path, names: (path / "meta" / "info.json").is_file(),
+        "the folder of a LeRobot dataset",
+        "meta/info.json",
+        options=["actions"],
+    ),
+    "minari": Format(
+        "minari:open_minari",
+        _minari,
+        "the folder of a Minari dataset",
+        "data/metadata.json",
+        options=["external", "actions"],
+    ),
+    "ogbench": Format(
+        "ogbench:open_ogbench",
+        lambda path, names: path.is_file() and (path.suffix == ".npz" or is_zipfile(path)),
+        "an npz file of OGBench",
+    ),
+    "maniskill": Format(
+        "hdf5_layouts:ManiSkill",
+        lambda path, names: any(TRAJECTORY.fullmatch(name) for name in names),
+        "an HDF5 file of ManiSkill",
+    ),
+    "act": Format("hdf5_layouts:Act", _act, "the folder of ACT's episodes", "episode_0.hdf5"),
+    "d4rl": Format("hdf5_layouts:D4RL", _d4rl, "an HDF5 file of D4RL"),
+    "jigsaws": Format(
+        "jigsaws:Jigsaws",
+        lambda path, names: (path / "kinematics" / "AllGestures").is_dir(),
+        "the folder of a task of JIGSAWS",
+        "kinematics/AllGestures",
+    ),
+    "robomimic": Format(
+        "robomimic:open_robomimic",
+        lambda path, names: path.is_file(),
+        "an HDF5 file of robomimic's layout",
+        options=["external"],
+    ),
+}
+"""By name, in the order in which they are recognised; the reader of robomimic's files reports what is no HDF5 file."""
