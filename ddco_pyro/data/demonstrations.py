@@ -24,7 +24,7 @@ from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError
 from ddco_pyro.data.memory import PROGRAM, Extent, refuse_too_much
 from ddco_pyro.data.pictures import Observed, Pictures
 from ddco_pyro.data.sources import refuse_foreign
-from ddco_pyro.data.sources.recording import Column, Recording, of_array
+from ddco_pyro.data.sources.recording import Recording
 from ddco_pyro.data.sources.robomimic import Robomimic, frequency_of, open_robomimic, robomimic_file, write_recording
 from ddco_pyro.errors import check_whole, path_of
 
@@ -74,27 +74,9 @@ class Demonstration:
         object.__setattr__(self, "observations", observations)
         object.__setattr__(self, "labels", labels)
 
-    @classmethod
-    def of(cls, recording: Recording) -> Demonstration:
-        """The demonstration in a recording; pictures stay in an HDF5 file.
-
-        :raises DemonstrationsError: the file is damaged, or the recording cannot be used.
-        """
-        observations = {key: column.observed() for key, column in recording.observations.items()}
-        labels = {key: column.array() for key, column in recording.labels.items()}
-        return cls(recording.name, observations, recording.actions.array(), labels, recording.attributes)
-
     def recording(self) -> Recording:
-        """The demonstration as a recording, for writing."""
-        observations = {key: self._column(f"obs/{key}", values) for key, values in self.observations.items()}
-        labels = {key: self._column(f"labels/{key}", values) for key, values in self.labels.items()}
-        return Recording(self.name, observations, self._column("actions", self.actions), labels, self.attributes)
-
-    def _column(self, place: str, values: Any) -> Column:
-        try:
-            return of_array(values)
-        except (ValueError, TypeError, RuntimeError) as error:
-            raise DemonstrationsError(f"{self.name}: {place} is no array: {' '.join(str(error).split())}") from None
+        """The demonstration as a recording."""
+        return Recording.of(**vars(self))
 
     def __len__(self) -> int:
         return len(self.actions)
@@ -170,7 +152,7 @@ class Demonstrations(Sequence[Demonstration]):
         with _opened(path_of(path, "demonstrations")) as source:
             needed = PROGRAM + _extent(source, observations, labels, exclude).size
             refuse_too_much(needed, "reading it", "read only some observations, or scale pictures down")
-            read = tuple(map(Demonstration.of, _recordings(source, observations, labels, exclude)))
+            read = tuple(Demonstration(**vars(each)) for each in _recordings(source, observations, labels, exclude))
             masks = {mask: tuple(name for name in names if name not in exclude) for mask, names in source.masks.items()}
             return cls(read, masks, source.attributes)
 

@@ -176,8 +176,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     """
     with _explained(path):
         if _is_device(path):
-            with _poured_into(path) as temporary:
-                yield temporary
+            yield path
             return
         if path.exists() and not path.is_file():
             raise Output("", path).refused("is no regular file")
@@ -196,17 +195,6 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 def _target(path: Path) -> Path:
     return Path(os.path.realpath(path)) if path.is_symlink() else path
-
-
-@contextmanager
-def _poured_into(device: Path) -> Iterator[Path]:
-    """A temporary file that is copied to a device at the end."""
-    with tempfile.TemporaryDirectory() as folder:
-        temporary = Path(folder) / "file"
-        temporary.touch()
-        yield temporary
-        with temporary.open("rb") as made, device.open("wb") as target:
-            shutil.copyfileobj(made, target)
 
 
 _TEMPORARY = ".tmp"

@@ -496,17 +496,19 @@ class _Inspector:
         place, step = array.place, 0
         whole = place == "actions" or math.prod(array.shape) <= WIDEST
         values = first = np.zeros((0, 0))
-        self.coincidences.begin_column(place)
+        label = place.startswith("labels/")
+        if not label:
+            self.coincidences.begin_column(place)
         for block in [column.array()] if whole else column.blocks():
             if not len(block):
                 continue
             values = block.reshape(len(block), -1)
             first = first if step else values[:1].copy()
-            self.coincidences.add(place, values, step)
+            if not label:
+                self.coincidences.add(values, step)
             array.add(values, name, step, first)
             step += len(values)
-        self.coincidences.end_column(place)
-        if not (whole and step):
+        if label or not (whole and step):
             return
         if place == "actions":
             self.controls[name] = block
@@ -626,7 +628,7 @@ class _Coincidences:
         self._demos: list[_Demonstration] = []
         self._equal: dict[str, np.ndarray] = {}  # by place, for each shift, [D, A]: whether they are always equal
         self._compared: dict[str, np.ndarray] = {}  # number of compared steps, for each shift
-        self._tail, self._last = 0, np.empty(0)
+        self._last = np.empty(0)
 
     def begin(self, name: str, steps: int) -> None:
         """Begin a demonstration, whose controls come first."""
@@ -638,30 +640,24 @@ class _Coincidences:
 
     def begin_column(self, place: str) -> None:
         """Begin an array of the demonstration."""
-        self._tail = 0
+        self._demos[-1].tails.append(0)
         self._demos[-1].digest.update(place.encode())
 
-    def add(self, place: str, rows: np.ndarray, first: int) -> None:
+    def add(self, rows: np.ndarray, first: int) -> None:
         """Add rows [T, D] of the array from step ``first`` on."""
-        if place.startswith("labels/"):
-            return
+        demo = self._demos[-1]
         (others,) = np.nonzero((rows != rows[-1]).any(1))
         tail = len(rows) - (int(others[-1]) + 1 if len(others) else 0)
         continues = first and tail == len(rows) and np.array_equal(rows[0], self._last)
-        self._tail, self._last = tail + (self._tail if continues else 0), rows[-1].copy()
-        self._demos[-1].digest.update(np.ascontiguousarray(rows).tobytes())
-
-    def end_column(self, place: str) -> None:
-        """End the array."""
-        if not place.startswith("labels/"):
-            self._demos[-1].tails.append(self._tail)
+        demo.tails[-1], self._last = tail + (demo.tails[-1] if continues else 0), rows[-1].copy()
+        demo.digest.update(np.ascontiguousarray(rows).tobytes())
 
     def add_vectors(self, place: str, rows: np.ndarray) -> None:
         """Add a whole array [T, D] of vectors."""
         demo = self._demos[-1]
         if place == "actions":
             demo.controls = rows
-        elif place.startswith("obs/"):
+        else:
             with np.errstate(invalid="ignore"):
                 span = rows.max(0).astype(np.float64) - rows.min(0)
             demo.rests.append((_rest(rows, span), _rest(rows[::-1], span)))

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError
-from ddco_pyro.data.sources.recording import LABEL_NAMES, Recording, of_array
+from ddco_pyro.data.sources.recording import LABEL_NAMES, Recording
 
 TRIALS = Path("kinematics", "AllGestures")
 """The folder of trials in that of a task."""
@@ -77,7 +77,7 @@ class Jigsaws:
             raise DemonstrationsError(f"{name}: {trial} {width}")
         arms = rows.reshape(len(rows), -1, ARM)
         observations = {
-            f"{hand}_{key}": of_array(arms[:, place, part])
+            f"{hand}_{key}": arms[:, place, part]
             for hand, (_, place) in HANDS.items()
             for key, part in {"position": slice(3), "rotation": slice(3, 12), "gripper": slice(18, 19)}.items()
         }
@@ -85,8 +85,8 @@ class Jigsaws:
         gesture = np.full(len(rows), -1)
         for first, last, label in self._segments.get(trial, ()):
             gesture[first - 1 : last] = self._gestures.index(label)
-        labels = {"gesture": of_array(gesture)} if self._gestures else {}
-        return Recording(name, observations, of_array(control), labels, self._facts(trial.stem))
+        labels = {"gesture": gesture} if self._gestures else {}
+        return Recording.of(name, observations, control, labels, self._facts(trial.stem))
 
     def _facts(self, trial: str) -> dict[str, Attribute]:
         facts: dict[str, Attribute] = {"file": trial}

@@ -202,14 +202,16 @@ class LeRobot:
             rows = _Rows(path, index, name)
             self._check(rows, index)
             observations = {key: self._column(rows, feature, index) for feature, key in self._keys.items()}
-            labels = {"subtask": rows.vectors(SUBTASK, ())} if SUBTASK in rows.present else {}
+            labels: dict[str, Any] = {"subtask": rows.vectors(SUBTASK, ())} if SUBTASK in rows.present else {}
             if self._subtasks:
-                labels = {"subtask": of_array(self._labels(index, len(rows)))}
+                labels = {"subtask": self._labels(index, len(rows))}
             controls = {key: rows.vectors(key, self.features[key]["shape"]).array() for key in self._actions}
         except _DAMAGE as error:
             raise damaged(self.folder, name, error) from error
         actions = of_array(joined(controls, f"{self.folder}: {name}"))
-        return Recording(name, observations, replace(actions, named=" + ".join(controls)), labels, self._facts(index))
+        return Recording.of(
+            name, observations, replace(actions, named=" + ".join(controls)), labels, self._facts(index)
+        )
 
     def _labels(self, index: int, steps: int) -> np.ndarray:
         """The number of the annotated subtask at each step [T]; -1 where there is none."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from ddco_pyro.data.hdf5 import DAMAGE, Attribute, DemonstrationsError, dataset_at, datasets, member, opened
 from ddco_pyro.data.sources.metadata import check_links, first_missing, stored_keys
-from ddco_pyro.data.sources.recording import Recording, damaged, joined, of_array
+from ddco_pyro.data.sources.recording import Recording, damaged, joined
 from ddco_pyro.errors import nearest
 
 BARE = "observation"
@@ -62,14 +62,14 @@ class Minari:
             raise DemonstrationsError(f"{self.folder}: {name}: total_steps is {total}, and there are {steps} actions")
         # an observation with another number of steps stays, and is refused later
         observations = {
-            key: of_array(array[:-1] if len(array) == steps + 1 else array)
+            key: array[:-1] if len(array) == steps + 1 else array
             for key, array in self._flat(episode["observations"], BARE).items()
         }
         seed = facts.get("seed")
         known: dict[str, Attribute] = {"episode_index": index}
         if seed is not None:
             known["seed"] = int(seed)
-        return Recording(name, observations, of_array(actions), {}, known)
+        return Recording.of(name, observations, actions, {}, known)
 
     def _control(self, actions: Any, where: str) -> np.ndarray:
         """The chosen actions [T, A] of an episode."""

@@ -7,6 +7,8 @@ import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 import h5py
 import numpy as np
@@ -99,6 +101,32 @@ class Recording:
         object.__setattr__(self, "actions", _discrete(self.actions))
         object.__setattr__(self, "labels", {name: _flat(column) for name, column in self.labels.items()})
 
+    @classmethod
+    def of(
+        cls,
+        name: str,
+        observations: Mapping[str, Any],
+        actions: Any,
+        labels: Mapping[str, Any] = MappingProxyType({}),
+        attributes: Mapping[str, Attribute] = MappingProxyType({}),
+    ) -> Recording:
+        """A recording of arrays in memory, of lazy pictures, or of columns.
+
+        :raises DemonstrationsError: one is no array.
+        """
+
+        def column(place: str, values: Any) -> Column:
+            try:
+                return of_array(values)
+            except (ValueError, TypeError, RuntimeError) as error:
+                raise DemonstrationsError(f"{name}: {place} is no array: {' '.join(str(error).split())}") from None
+
+        seen, known = (
+            {key: column(f"{folder}/{key}", values) for key, values in arrays.items()}
+            for folder, arrays in (("obs", observations), ("labels", labels))
+        )
+        return cls(name, seen, column("actions", actions), known, attributes)
+
     @property
     def numbers(self) -> dict[str, Column]:
         """The observations that hold real numbers."""
@@ -129,8 +157,10 @@ def is_image(shape: tuple[int, ...], dtype: np.dtype) -> bool:
     return dtype == np.uint8 and len(shape) == 1 + PICTURE_DIMENSIONS
 
 
-def of_array(values: ArrayLike | Pictures) -> Column:
+def of_array(values: ArrayLike | Pictures | Column) -> Column:
     """A column of an array in memory or of lazy pictures; pictures have their channels last."""
+    if isinstance(values, Column):
+        return values
     if isinstance(values, Pictures):
         return Column(values.shape, values.dtype, lambda: blocks(values), kept=values)
     array = turned(np.asarray(values))
