@@ -103,19 +103,16 @@ def _keep(
     names = _names(source, choice)
     left_out: dict[str, str] = {}
     unread: tuple[str, ...] = ()
-    first: Recording | None = None
     if not choice.skip_broken:
         _check_headers(source, names, choice)
+    first: Recording | None = None
     for number, name in enumerate(names):
         try:
-            whole = source.recording(name)
-            recording = _chosen(whole, choice, source.frequency)
-            check(recording)
-            check_alike(recording, first or recording)
+            recording = _usable(source, name, choice, first)
             if name not in parts.done:
                 check_values(recording, pictures=choice.skip_broken)
                 parts.add(recording)
-            unread = unread if first else tuple(_unread(whole, recording))
+            unread = unread if first else tuple(_unread(source.recording(name), recording))
             first = first or recording
         except DemonstrationsError as error:
             if not choice.skip_broken:
@@ -139,14 +136,20 @@ def _unread(whole: Recording, chosen: Recording) -> Iterator[str]:
             yield f"obs/{key} is a video, left out without --videos"
 
 
+def _usable(source: Source, name: str, choice: Choice, first: Recording | None = None) -> Recording:
+    """The chosen part of a demonstration, which is usable by its headers, beside the first one."""
+    recording = _chosen(source.recording(name), choice, source.frequency)
+    check(recording)
+    check_alike(recording, first or recording)
+    return recording
+
+
 def _check_headers(source: Source, names: Sequence[str], choice: Choice) -> None:
     """Refuse unusable demonstrations by their headers, before anything is written."""
     first: Recording | None = None
     try:
         for name in names:
-            recording = _chosen(source.recording(name), choice, source.frequency)
-            check(recording)
-            check_alike(recording, first or recording)
+            recording = _usable(source, name, choice, first)
             first = first or recording
     except DemonstrationsError as error:
         raise _refused(source, names, choice, error) from None
@@ -156,9 +159,7 @@ def _refused(source: Source, names: Sequence[str], choice: Choice, error: Demons
     """The error, with the advice to leave demonstrations out where one of them can be used."""
     for name in names:
         with suppress(DemonstrationsError):
-            recording = _chosen(source.recording(name), choice, source.frequency)
-            check(recording)
-            check_values(recording, pictures=True)
+            check_values(_usable(source, name, choice), pictures=True)
             return DemonstrationsError(f"{error}; or leave such ones out with --skip-broken")
     return error
 
@@ -229,10 +230,7 @@ def _chosen(recording: Recording, choice: Choice, frequency: float | None) -> Re
 
 
 def _frames(frequency: float | None, hz: float) -> int:
-    """The frames of a step.
-
-    :raises BadInput: they are no whole number.
-    """
+    """The frames of a step."""
     if frequency is None:
         raise BadInput(f"--hz {hz:g}: the source does not say its own rate; leave --hz out")
     frames = round(frequency / hz)

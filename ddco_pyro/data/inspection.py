@@ -205,7 +205,9 @@ class Inspection:
     def exclusions(self) -> list[str]:
         """A line for each reason to exclude demonstrations, with their names."""
         names = {why: [name for name in self.odd if self.odd[name] == why] for why in self.odd.values()}
-        return [f"{few(own)}: {why}; exclude {'them' if len(own) > 1 else 'it'}" for why, own in names.items()]
+        return [
+            f"{few(members)}: {why}; exclude {'them' if len(members) > 1 else 'it'}" for why, members in names.items()
+        ]
 
     @property
     def notes(self) -> list[str]:
@@ -320,20 +322,20 @@ class _Turns:
     @property
     def quaternions(self) -> list[int]:
         """The first number of each unit quaternion that flips its sign."""
-        found: list[int] = []
+        firsts: list[int] = []
         for place in np.flatnonzero(self.unit & (self.flips > 0)).tolist():
-            found += [place] if not found or place >= found[-1] + 4 else []
-        return found
+            firsts += [place] if not firsts or place >= firsts[-1] + 4 else []
+        return firsts
 
     def angles(self, low: np.ndarray, high: np.ndarray) -> dict[str, list[int]]:
         """Numbers within ``low`` and ``high`` [D] that jump by a turn and never by half of one, by the unit."""
         taken = {first + place for first in self.quaternions for place in range(4)}
-        found = {}
+        wrapping = {}
         for (unit, turn), jumps, between in zip(TURNS.items(), self.jumps, self.between, strict=True):
             spread = high.astype(np.float64) - low
             wraps = (jumps > 0) & (10 * between <= jumps) & (spread >= NEARLY * turn) & (spread <= 1.02 * turn)
-            found[unit] = [place for place in np.flatnonzero(wraps).tolist() if place not in taken]
-        return found
+            wrapping[unit] = [place for place in np.flatnonzero(wraps).tolist() if place not in taken]
+        return wrapping
 
 
 def _fours(products: np.ndarray) -> np.ndarray:
@@ -376,8 +378,10 @@ class _Inspector:
         self._name_labels()
         dimensions = control_dimensions(self.controls)
         varying = [dimension.number for dimension in dimensions if not dimension.constant]
-        found = self.problems.values()
-        kinds = (each[0] if len(each) == 1 else f"{each[0]}; the first of {len(each)} such" for each in found)
+        kinds = (
+            messages[0] if len(messages) == 1 else f"{messages[0]}; the first of {len(messages)} such"
+            for messages in self.problems.values()
+        )
         external = {name for file in source.files if h5py.is_hdf5(file) for name in outside_files(file)}
         return Inspection(
             path=path,
@@ -409,9 +413,9 @@ class _Inspector:
         still = {name: rows for name, rows in long.items() if same(rows.min(0), rows.max(0)).all()}
         dead = [name for name, rows in still.items() if not rows.any()]
         others = [name for name in still if name not in dead]
-        found = dict.fromkeys(dead, "all commands are 0") if 2 * len(dead) < len(self.lengths) else {}
+        reasons = dict.fromkeys(dead, "all commands are 0") if 2 * len(dead) < len(self.lengths) else {}
         if len(others) <= most_few(len(self.lengths)):
-            found |= dict.fromkeys(others, "all commands are the same")
+            reasons |= dict.fromkeys(others, "all commands are the same")
         paddings = self.coincidences.paddings()
         for dimension in dimensions:
             made = {name: getattr(dimension, end) for end, names in dimension.made_by.items() for name in names}
@@ -425,8 +429,8 @@ class _Inspector:
                 if not why and name in dimension.strays and not dimension.values:
                     why = f"control dimension {dimension.number} has further values there, and is a switch elsewhere"
                 if why:
-                    found.setdefault(name, why)
-        return {name: found[name] for name in self.lengths if name in found}
+                    reasons.setdefault(name, why)
+        return {name: reasons[name] for name in self.lengths if name in reasons}
 
     def _turning(self, place: str) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """The angles in radians and the quaternions of an array that jump."""
@@ -436,18 +440,19 @@ class _Inspector:
     def _jumps(self) -> Iterator[str]:
         """A line for the angles of an array that jump by a turn, and for its quaternions that change their sign."""
         for place, turns in self.turns.items():
-            where, observed = f"the first in {few(turns.names[:1])}", place != "actions"
-            for unit, own in turns.angles(self.fields[place].minimum, self.fields[place].maximum).items():
-                remedy = f"with angles: {own} beside its key networks read sine and cosine" if observed else "unwrap it"
-                if observed and unit != "2π":
+            where, seen = f"the first in {few(turns.names[:1])}", place != "actions"
+            for unit, numbers in turns.angles(self.fields[place].minimum, self.fields[place].maximum).items():
+                remedy = f"with angles: {numbers} beside its key networks read sine and cosine" if seen else "unwrap it"
+                if seen and unit != "2π":
                     remedy = f"store radians; {remedy}"
-                if own:
-                    yield f"{place}: {listed(own)} jump{'s' * (len(own) == 1)} by {unit} as an angle, {where}: {remedy}"
-            if own := turns.quaternions:
-                remedy = f"with quaternions: {own} beside its key networks read products, the same for q and −q"
+                if numbers:
+                    jump = f"jump{'s' * (len(numbers) == 1)} by {unit} as an angle"
+                    yield f"{place}: {listed(numbers)} {jump}, {where}: {remedy}"
+            if numbers := turns.quaternions:
+                remedy = f"with quaternions: {numbers} beside its key networks read products, the same for q and −q"
                 yield (
-                    f"{place}: {listed([first + part for first in own for part in range(4)])} change sign as a "
-                    f"quaternion, {where}: {remedy if observed else 'give all rotations one sign'}"
+                    f"{place}: {listed([first + part for first in numbers for part in range(4)])} change sign as a "
+                    f"quaternion, {where}: {remedy if seen else 'give all rotations one sign'}"
                 )
 
     def _other_rates(self) -> Iterator[str]:
@@ -474,8 +479,8 @@ class _Inspector:
         recording = self.source.recording(name)
         steps = self.lengths[name] = recording.actions.shape[0] if recording.actions.shape else 0
         self.coincidences.begin(name, steps)
-        if own := rate(recording.attributes):
-            self.periods.setdefault("its attributes", {})[name] = 1 / own
+        if frequency := rate(recording.attributes):
+            self.periods.setdefault("its attributes", {})[name] = 1 / frequency
         for place, column in recording.columns():
             try:
                 check_steps(name, place, column, steps)
@@ -675,11 +680,11 @@ class _Coincidences:
         equal = self._equal.setdefault(place, np.ones(shape, dtype=bool))
         compared = self._compared.setdefault(place, np.zeros(len(SHIFTS), dtype=int))
         for at, shift in enumerate(SHIFTS):
-            own = rows[max(-shift, 0) : max(len(rows) - max(shift, 0), 0)]
-            ahead = commands[max(shift, 0) :][: len(own)]
-            compared[at] += len(own)
+            observed = rows[max(-shift, 0) : max(len(rows) - max(shift, 0), 0)]
+            ahead = commands[max(shift, 0) :][: len(observed)]
+            compared[at] += len(observed)
             for dimension in np.flatnonzero(equal[at].any(0)):
-                equal[at, :, dimension] &= (own == ahead[:, [dimension]]).all(0)
+                equal[at, :, dimension] &= (observed == ahead[:, [dimension]]).all(0)
 
     def notes(self, masks: Mapping[str, Sequence[str]], dimensions: Sequence[ControlDimension]) -> list[str]:
         """A line for each kind of coincidence, with a count and the first place."""
@@ -690,22 +695,22 @@ class _Coincidences:
 
     def paddings(self) -> dict[str, dict[str, np.ndarray]]:
         """By name of the few demonstrations with equal commands at an end: the stretch in words, and the command."""
-        found: dict[str, dict[str, np.ndarray]] = {}
+        stretches: dict[str, dict[str, np.ndarray]] = {}
         moving = [demo for demo in self._demos if len(demo.controls)]
         for end, where in enumerate(("first", "last")):
             steps = {demo.name: demo.rest(end, np.zeros(demo.controls.shape[1])) for demo in moving}
             padded = [demo for demo in moving if steps[demo.name] >= FEWEST]
             for demo in padded if len(padded) <= most_few(len(self._demos)) else ():
                 why = f"the {where} {steps[demo.name]} commands are the same, as padding is"
-                found.setdefault(demo.name, {})[why] = demo.controls[-end]
-        return found
+                stretches.setdefault(demo.name, {})[why] = demo.controls[-end]
+        return stretches
 
     def _idle(self, dimensions: Sequence[ControlDimension], padded: bool) -> Iterator[str]:
         """A line for the demonstrations that begin with a long idle stretch, and for those that end with one."""
         span = np.array([dimension.maximum - dimension.minimum for dimension in dimensions])
         moves = [place for place, dimension in enumerate(dimensions) if not dimension.values]
         for end, where in enumerate(("start", "end")):
-            found: dict[str, int] = {}
+            idle: dict[str, int] = {}
             for demo in self._demos:
                 if not len(demo.controls) or len(span) != demo.controls.shape[1] or (end and padded and demo.tail > 1):
                     continue
@@ -713,11 +718,11 @@ class _Coincidences:
                 if demo.controls[-end][moves].any():  # no velocity: what is seen has to rest, too
                     steps = min([steps, *(rests[end] for rests in demo.rests)])
                 if max(LONG, LONG_SHARE * demo.steps) <= steps < demo.steps:
-                    found[demo.name] = steps
-            if found:
-                name, steps = next(iter(found.items()))
+                    idle[demo.name] = steps
+            if idle:
+                name, steps = next(iter(idle.items()))
                 yield (
-                    f"nothing moves at the {where} of {len(found)} of {len(self._demos)} demonstrations, in {name} for "
+                    f"nothing moves at the {where} of {len(idle)} of {len(self._demos)} demonstrations, in {name} for "
                     f"{steps} steps: cut such stretches off, or an option may be the waiting"
                 )
 
@@ -728,9 +733,9 @@ class _Coincidences:
         """
         if place not in self._equal:
             return False
-        found = [self._controls(place, shift, varying)[0] for shift in (0, 1)]
+        copied = [self._controls(place, shift, varying)[0] for shift in (0, 1)]
         rest = set(range(self._equal[place].shape[1])) - set(still)
-        return bool(rest) and rest <= {*found[0], *found[1]}
+        return bool(rest) and rest <= {*copied[0], *copied[1]}
 
     def _controls(self, place: str, shift: int, varying: Sequence[int]) -> tuple[list[int], list[int]]:
         """The dimensions of an observation that equal controls ``shift`` steps later, and those control dimensions."""
@@ -738,17 +743,17 @@ class _Coincidences:
         if not self._compared[place][at]:
             return [], []
         equal = self._equal[place][at][:, list(varying)]
-        own, controls = np.flatnonzero(equal.any(1)).tolist(), np.flatnonzero(equal.any(0)).tolist()
-        return own, [varying[column] for column in controls]
+        observed, controls = np.flatnonzero(equal.any(1)).tolist(), np.flatnonzero(equal.any(0)).tolist()
+        return observed, [varying[column] for column in controls]
 
     def _observed(self, varying: Sequence[int]) -> Iterator[str]:
         for place in self._equal:
             for shift, when in SHIFTS.items():
-                own, controls = self._controls(place, shift, varying)
-                if own:
+                observed, controls = self._controls(place, shift, varying)
+                if observed:
                     effect = "tend to repeat it" if shift < 0 else "see what they have to predict"
                     yield (
-                        f"{place}: {listed(own)} = control {listed(controls)} {when}, in all {len(self._demos)} "
+                        f"{place}: {listed(observed)} = control {listed(controls)} {when}, in all {len(self._demos)} "
                         f"demonstrations, the first {self._demos[0].name}: policies {effect}"
                     )
 

@@ -114,10 +114,7 @@ def refuse_foreign(path: Path) -> None:
 
 
 def _top_names(path: Path) -> frozenset[str]:
-    """The names at the top of an HDF5 file; none of another file.
-
-    :raises DemonstrationsError: it holds robosuite's states alone.
-    """
+    """The names at the top of an HDF5 file; none of another file."""
     try:
         with h5py.File(path, "r") as file:
             names = frozenset(file)

@@ -1,7 +1,4 @@
-"""HDF5 files of ManiSkill, ACT and D4RL, read in blocks.
-
-Each pass over an array opens its file, because a folder can have more episodes than files may be open.
-"""
+"""HDF5 files of ManiSkill, ACT and D4RL, read in blocks."""
 
 from __future__ import annotations
 
@@ -19,7 +16,7 @@ from ddco_pyro.data.formats import EPISODE, TRAJECTORY
 from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError, dataset_at, datasets, member, natural, opened
 from ddco_pyro.data.pictures import block_steps
 from ddco_pyro.data.sources.metadata import inside
-from ddco_pyro.data.sources.recording import Column, Recording, joined, of_array, of_dataset
+from ddco_pyro.data.sources.recording import Column, Recording, as_vectors, joined, of_array, of_dataset
 
 BARE = "state"
 """Key of an observation array without a name."""
@@ -46,10 +43,7 @@ class _Source(ABC):
         """The file and the group of each demonstration by name, in order."""
 
     def recording(self, name: str) -> Recording:
-        """One demonstration.
-
-        :raises DemonstrationsError: a part is missing.
-        """
+        """One demonstration."""
         path, group = self._places[name]
         with opened(path) as file:
             return self._read(name, member(file, group, h5py.Group, ""))
@@ -173,20 +167,8 @@ def _number(file: Path) -> int:
 
 
 def _column(group: h5py.Group, key: str, name: str, part: slice = slice(None)) -> Column:
-    """A part of a dataset as a lazy column; one number per step becomes a vector."""
-    dataset = dataset_at(group, key, f"{name}: " if name else "")
-    known = of_dataset(dataset, f"{name}: {key}")
-    path, place, bare = Path(dataset.file.filename), dataset.name, dataset.ndim == 1
-    start, stop, _ = part.indices(len(dataset))
-    at_once = block_steps(dataset.shape[1:], dataset.dtype)
-
-    def blocks() -> Iterator[np.ndarray]:
-        with opened(path) as file:
-            for at in range(start, stop, at_once):
-                block = file[place][at : min(at + at_once, stop)]
-                yield block[:, None] if bare else block
-
-    return Column((max(stop - start, 0), *((1,) if bare else known.shape[1:])), known.dtype, blocks)
+    """A part of a dataset; one number per step becomes a vector."""
+    return as_vectors(of_dataset(dataset_at(group, key, f"{name}: " if name else ""), f"{name}: {key}", part))
 
 
 def _decoded(column: Column, where: str) -> Column:

@@ -98,10 +98,7 @@ class Jigsaws:
 
 
 def _segments(path: Path) -> list[tuple[int, int, str]]:
-    """The first frame, the last frame and the gesture of each segment in a transcription.
-
-    :raises DemonstrationsError: a row is something else.
-    """
+    """The first frame, the last frame and the gesture of each segment in a transcription."""
     segments = []
     for number, row in enumerate(filter(None, map(str.split, path.read_text().splitlines())), 1):
         if len(row) != 3 or not (row[0].isdigit() and row[1].isdigit()) or not 0 < int(row[0]) <= int(row[1]):

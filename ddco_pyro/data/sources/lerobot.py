@@ -331,10 +331,7 @@ class _Rows:
         return np.dtype(object) if pyarrow.types.is_nested(kind) else np.dtype(kind.to_pandas_dtype())
 
     def _numbers(self, values: Any, size: int, key: str, first: int) -> np.ndarray:
-        """The numbers of a column with ``size`` numbers in each row, flat; ``first`` is the number of the first row.
-
-        :raises DemonstrationsError: a row has more or fewer numbers, or is null.
-        """
+        """The numbers of a column with ``size`` numbers in each row, flat; ``first`` is the number of the first row."""
         row, rows = np.arange(len(values)), len(values)
         while pyarrow.types.is_nested(values.type):
             row = np.repeat(row, compute.list_value_length(values).fill_null(0).to_numpy())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import TypeAdapter, ValidationError
 
-from ddco_pyro.data.hdf5 import DAMAGE, Attribute, DemonstrationsError
+from ddco_pyro.data.hdf5 import DAMAGE, Attribute, DemonstrationsError, opened
 from ddco_pyro.data.memory import refuse_too_much
 from ddco_pyro.data.pictures import (
     PICTURE_DIMENSIONS,
@@ -98,7 +99,8 @@ class Recording:
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "actions", _discrete(self.actions))
+        whole = self.actions.dtype.kind in "iu"
+        object.__setattr__(self, "actions", as_vectors(self.actions) if whole else self.actions)
         object.__setattr__(self, "labels", {name: _flat(column) for name, column in self.labels.items()})
 
     @classmethod
@@ -186,10 +188,11 @@ def joined(parts: Mapping[str, np.ndarray], where: str) -> np.ndarray:
     return np.concatenate([array.reshape(steps, math.prod(array.shape[1:])) for array in parts.values()], axis=1)
 
 
-def _discrete(actions: Column) -> Column:
-    if len(actions.shape) != 1 or actions.dtype.kind not in "iu":
-        return actions
-    return replace(actions, shape=(*actions.shape, 1), blocks=lambda: (block[:, None] for block in actions.blocks()))
+def as_vectors(column: Column) -> Column:
+    """An array [T] as [T, 1]; any other unchanged."""
+    if len(column.shape) != 1:
+        return column
+    return replace(column, shape=(*column.shape, 1), blocks=lambda: (block[:, None] for block in column.blocks()))
 
 
 def _flat(labels: Column) -> Column:
@@ -198,27 +201,31 @@ def _flat(labels: Column) -> Column:
     return replace(labels, shape=labels.shape[:1], blocks=lambda: (block[:, 0] for block in labels.blocks()))
 
 
-def of_dataset(dataset: h5py.Dataset, where: str) -> Column:
-    """A column of a dataset in an open file; pictures have their channels last.
+def of_dataset(dataset: h5py.Dataset, where: str, part: slice = slice(None)) -> Column:
+    """A column of consecutive steps of a dataset; pictures have their channels last.
 
-    Reading the column raises :class:`DemonstrationsError` if the file is damaged.
+    Each pass opens the file unless it is open: a folder can have more files than may be open. Reading the column raises
+    :class:`DemonstrationsError` if the file is damaged.
 
     :raises DemonstrationsError: one step, or one HDF5 chunk, takes more memory than is allowed.
     """
-    length, at_once = len(dataset), block_steps(dataset.shape[1:], dataset.dtype)
-    shape = channels_last(dataset.shape, dataset.dtype)
-    path = os.path.abspath(dataset.file.filename)  # absolute for readers with another working directory
-    kept = Pictures(path, dataset.name, where, dataset.shape) if is_image(shape, dataset.dtype) else None
+    start, stop, _ = part.indices(len(dataset))
+    at_once = block_steps(dataset.shape[1:], dataset.dtype)
+    shape = channels_last((max(stop - start, 0), *dataset.shape[1:]), dataset.dtype)
+    path, place = os.path.abspath(dataset.file.filename), dataset.name  # absolute for readers in another folder
+    lazy = is_image(shape, dataset.dtype) and shape[0] == len(dataset)
+    kept = Pictures(path, place, where, dataset.shape) if lazy else None
     least = dataset.dtype.itemsize * max(math.prod(dataset.shape[1:]), math.prod(dataset.chunks or ()))
     refuse_too_much(least, f"{where}: to read one step", "store it in smaller steps or chunks")
 
     def read() -> Iterator[np.ndarray]:
-        for start in range(0, length, at_once):
-            try:
-                block = np.asarray(dataset[start : start + at_once])
-            except DAMAGE as error:
-                raise DemonstrationsError(f"{where} cannot be read ({error}); the file may be damaged") from error
-            yield turned(block)
+        with nullcontext(dataset.file) if dataset else opened(path) as file:
+            for at in range(start, stop, at_once):
+                try:
+                    block = np.asarray(file[place][at : min(at + at_once, stop)])
+                except DAMAGE as error:
+                    raise DemonstrationsError(f"{where} cannot be read ({error}); the file may be damaged") from error
+                yield turned(block)
 
     return Column(shape, dataset.dtype, read, kept=kept)
 
