@@ -42,7 +42,7 @@ from ddco_pyro.data.controls import (
     same,
 )
 from ddco_pyro.data.hdf5 import DemonstrationsError, outside_files
-from ddco_pyro.data.pictures import MOVED
+from ddco_pyro.data.pictures import MOVED, blocks
 from ddco_pyro.data.sources import Column, Source, open_source
 from ddco_pyro.data.sources.metadata import rate
 from ddco_pyro.data.sources.recording import UNKNOWN, label_names
@@ -497,14 +497,14 @@ class _Inspector:
         return {place for place, _ in recording.columns()}
 
     def _read_column(self, array: Field, column: Column, name: str) -> None:
-        """Feed an array to every statistic: in blocks if its steps are large, as those of pictures."""
+        """Feed an array to every statistic in blocks; one of narrow steps is held whole for those that need all steps."""
         place, step = array.place, 0
-        whole = place == "actions" or math.prod(array.shape) <= WIDEST
-        values = first = np.zeros((0, 0))
+        whole = column.array() if place == "actions" or math.prod(array.shape) <= WIDEST else None
+        first = np.zeros((0, 0))
         label = place.startswith("labels/")
         if not label:
             self.coincidences.begin_column(place)
-        for block in [column.array()] if whole else column.blocks():
+        for block in column.blocks() if whole is None else blocks(whole):
             if not len(block):
                 continue
             values = block.reshape(len(block), -1)
@@ -513,10 +513,11 @@ class _Inspector:
                 self.coincidences.add(values, step)
             array.add(values, name, step, first)
             step += len(values)
-        if label or not (whole and step):
+        if label or whole is None or not step:
             return
+        values = whole.reshape(len(whole), -1)
         if place == "actions":
-            self.controls[name] = block
+            self.controls[name] = whole
         if not array.image:
             self.coincidences.add_vectors(place, values)
         if array.dtype.kind == "f" and values.shape[1] <= MOST_DIMENSIONS:

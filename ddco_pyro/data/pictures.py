@@ -123,10 +123,7 @@ Observed = np.ndarray | Pictures
 
 
 def blocks(array: Observed) -> Iterator[np.ndarray]:
-    """An array [T, ...] in blocks of consecutive steps; an array in memory is a single block."""
-    if isinstance(array, np.ndarray):
-        yield array
-        return
+    """An array [T, ...] in blocks of consecutive steps."""
     at_once = block_steps(array.shape[1:], array.dtype)
     for first in range(0, len(array), at_once):
         yield array[first : first + at_once]
