@@ -497,7 +497,7 @@ class _Inspector:
         return {place for place, _ in recording.columns()}
 
     def _read_column(self, array: Field, column: Column, name: str) -> None:
-        """Feed an array to every statistic in blocks; one of narrow steps is held whole for those that need all steps."""
+        """Feed an array to every statistic: in blocks, and whole if its steps are narrow."""
         place, step = array.place, 0
         whole = column.array() if place == "actions" or math.prod(array.shape) <= WIDEST else None
         first = np.zeros((0, 0))
