@@ -1,166 +1,218 @@
-"""Jobs: processes that work side by side, each on a call of its own (joblib)."""
+"""Many calls side by side, in processes of this machine or of a dask cluster.
+
+Processes start and end here, and their signals are set here. ``torchrun`` alone starts others.
+"""
 
 from __future__ import annotations
 
 import gc
 import importlib
 import os
+import signal
 import sys
 import threading
+import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import as_completed
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache, partial
+from itertools import chain, islice
 from multiprocessing import get_context
-from typing import TypeVar
+from typing import Any, TypeVar
 
-import joblib
-from joblib import Parallel, delayed
-from joblib.externals.loky import ProcessPoolExecutor, get_reusable_executor
-
-from ddco_pyro.data.pictures import end_with_parent
 from ddco_pyro.errors import BadInput, Failed
+from ddco_pyro.events import Event, OnEvent
 
+Key = TypeVar("Key")
 Result = TypeVar("Result")
 
 ALL_CORES = -1
 """The number of ``jobs`` that stands for one for each core."""
 LONG = 1000
 """Gradient steps, at least, of a training that takes longer than starting a process."""
+CONNECT_SECONDS = 10
+"""Time for a dask scheduler to answer."""
 
-
-warnings.filterwarnings("ignore", ".*tasks (which were still|have been successfully)|A worker stopped", UserWarning)
-"""joblib says so of calls that an interruption ends, and of a process that it replaces."""
-
-_POOLED = threading.Event()  # :func:`pool` has been called
+warnings.filterwarnings("ignore", "A worker stopped", UserWarning)
+"""loky says so of a process that it replaces."""
 
 
 class BackendError(BadInput):
     """Work cannot be done by these processes or on this backend."""
 
 
-def check_jobs(jobs: int) -> None:
-    """Refuse what is no number of processes.
+@dataclass(frozen=True)
+class Workers:
+    """Processes that do calls: ``jobs`` of them here (-1: one for each core), or those of a dask ``scheduler``.
 
-    :raises BackendError: ``jobs`` is none.
+    :raises BackendError: ``jobs`` is not a number of processes.
     """
-    if jobs != ALL_CORES and jobs < 1:
-        raise BackendError(f"--jobs {jobs}: give a number of processes, or -1 for one on each core")
 
+    jobs: int = ALL_CORES
+    scheduler: str | None = None
 
-def useful_jobs(jobs: int, calls: int) -> int:
-    """The number of processes for so many calls, at most one for each call."""
-    return min(joblib.cpu_count() if jobs == ALL_CORES else jobs, calls)
+    def __post_init__(self) -> None:
+        if self.jobs != ALL_CORES and self.jobs < 1:
+            raise BackendError(f"--jobs {self.jobs}: give a number of processes, or -1 for one on each core")
 
+    def number(self, calls: int = sys.maxsize) -> int:
+        """The number of processes here for so many calls, at most one for each call."""
+        import joblib
 
-def pool(jobs: int, ordered: bool = False) -> Parallel:
-    """Processes for :func:`results`, best used in a ``with`` statement; they end soon after this one, however it ends.
+        return min(joblib.cpu_count() if self.jobs == ALL_CORES else self.jobs, calls)
 
-    :param ordered: whether results come in the order of the calls.
-    """
-    if jobs != 1:
-        _POOLED.set()
-    how = "generator" if ordered else "generator_unordered"
-    # one call at a time: each takes long, and each result is kept at once; no read-only maps of arrays
-    return Parallel(jobs, return_as=how, batch_size=1, max_nbytes=None, initializer=end_with_parent)
+    def check(self) -> None:
+        """Check that the scheduler and its workers answer.
 
-
-def end_pool() -> None:
-    """End the processes of :func:`pool`, which wait for more calls: two seconds sooner than at the end of this one."""
-    if _POOLED.is_set():
-        get_reusable_executor(reuse=True).shutdown(kill_workers=True)
-        _POOLED.clear()
+        :raises BackendError: dask is not installed, no scheduler answers, or the scheduler has no workers.
+        """
+        if self.scheduler is not None:
+            with _cluster(self.scheduler):
+                pass
 
 
 @contextmanager
-def importing(jobs: int, module: str) -> Iterator[None]:
-    """Inside, the processes of :func:`pool` import a module while this one goes on."""
-    number = useful_jobs(jobs, sys.maxsize)
-    imported = pool(number)(delayed(_import)(module) for _ in range(number if number > 1 else 0))
-    try:
-        yield
-    except BaseException:
-        imported.close()
-        raise
-    list(imported)
+def run_all(
+    calls: Mapping[Key, Callable[..., Result]],
+    workers: Workers,
+    dead: str,
+    on_event: OnEvent | None = None,
+    ordered: bool = False,
+    beside: int | None = None,
+    waiting: Mapping[Key, Event] | None = None,
+) -> Iterator[Iterator[tuple[Key, Result]]]:
+    """Inside, the key and the result of each call, as calls are completed.
 
-
-def _import(module: str) -> None:
-    importlib.import_module(module)
-
-
-def results(parallel: Parallel, calls: Iterable[Callable[[], Result]], dead: str) -> Iterator[Result]:
-    """The results of calls, as they are completed. Processes other than this one begin at once.
+    Other processes begin at once, and end with the block. Where this process is the only one, a call is made when its
+    result is asked for.
 
     :param dead: the message for a process that dies.
+    :param on_event: given to each call. Events of a call in another process are passed on once the call is completed.
+    :param ordered: whether results come in the order of the calls.
+    :param beside: the number of other calls that this process makes inside the block. This process then makes its
+        share of ``calls``, before the results of other processes come in order. None where this process only waits.
+    :param waiting: the event with which the wait for a call in another process begins; the event is passed on once.
     :raises Failed: a process died.
+    :raises BackendError: as :meth:`Workers.check`.
     """
-    return _sound(parallel([delayed(call)() for call in calls]), dead)
-
-
-def _sound(found: Iterable[Result], dead: str) -> Iterator[Result]:
-    """What is found.
-
-    :raises Failed: a process died.
-    """
+    number, announced = workers.number(len(calls) + (beside or 0)), waiting or {}
+    shares = workers.scheduler is None and (number <= 1 or beside is not None)
+    here = [*calls][number - 1 :: number] if calls and shares else []
+    given = () if on_event is None else (on_event,)
+    results = ((key, calls[key](*given)) for key in here)
+    if len(here) == len(calls):
+        yield results
+        return
     try:
-        yield from found
+        with _cluster(workers.scheduler) if workers.scheduler else processes(number - shares) as (submit, at_once):
+            left = ((submit(partial(_away, call, bool(given))), key) for key, call in calls.items() if key not in here)
+            futures = dict(islice(left, at_once))
+
+            def completed() -> Iterator[tuple[Key, Result]]:
+                while futures:
+                    future = next(iter(futures) if ordered or shares else as_completed(futures))
+                    key = futures.pop(future)
+                    if on_event and key in announced:
+                        on_event(announced[key])
+                    result, events = future.result()
+                    futures.update(islice(left, 1))
+                    for event in events:
+                        if on_event and event != announced.get(key):
+                            on_event(event)
+                    yield key, result
+
+            yield chain(results, completed())
     except BrokenProcessPool as error:
         raise Failed(dead) from error
 
 
-def end_with(parent: int) -> None:
-    """End this process where the process that waits for it is gone: another command may go on in the same folder."""
-    if os.getppid() != parent:
-        os._exit(1)
+def _away(call: Callable[..., Result], with_events: bool) -> tuple[Result, list[Event]]:
+    """The result and the events of a call in another process."""
+    events: list[Event] = []
+    return call(*[events.append][:with_events]), events
 
 
-# --- processes beside this one ----------------------------------------------------------------------------------------
-
-_EARLY: list[ProcessPoolExecutor] = []
+Submit = Callable[[Callable[[], Any]], "Future[Any]"]
+"""Has a call made by another process."""
 
 
 @contextmanager
-def early_process(*modules: str) -> Iterator[None]:
-    """Inside, a process is ready for :func:`beside`. On Linux it is a fork of this process after the imports.
+def _cluster(scheduler: str) -> Iterator[tuple[Submit, int]]:
+    """Submits calls to the workers of a dask scheduler; also the number of calls at a time.
 
-    Elsewhere its imports go on during those of this process: there a fork of a process with threads is not safe.
-
-    :param modules: what it imports.
+    :raises BackendError: as :meth:`Workers.check`.
     """
-    forks = sys.platform == "linux"
+    try:
+        from distributed import Client
+    except ImportError:
+        raise BackendError("--backend dask: dask is not installed; pip install 'ddco-pyro[dask]'") from None
+    try:
+        client = Client(scheduler, timeout=CONNECT_SECONDS)
+    except (OSError, ValueError) as error:
+        raise BackendError(
+            f"--scheduler {scheduler}: no dask scheduler answers there within {CONNECT_SECONDS} s; start one with: "
+            "dask scheduler"
+        ) from error
+    with client:
+        if not (cores := client.ncores()):
+            raise BackendError(f"--scheduler {scheduler}: has no workers; start some with: dask worker {scheduler}")
+        # a submitted call keeps its demonstrations in the scheduler's memory
+        yield client.get_executor(pure=False).submit, 2 * sum(cores.values())
+
+
+_OPEN: list[tuple[int, Submit]] = []
+"""The blocks of :func:`processes` around what is running: numbers of processes, and how calls are submitted."""
+
+
+@contextmanager
+def processes(number: int, *modules: str) -> Iterator[tuple[Submit, int]]:
+    """Inside, so many processes do the calls of :func:`run_all`; those of a block around this one, if they suffice.
+
+    They end with the block, or a moment after this process.
+
+    :param modules: what the processes import at once. On Linux they are forks of this process, made after these
+        imports: name modules only at the start of a command, where this process has no other threads.
+    """
+    import joblib
+    from joblib.externals.loky import ProcessPoolExecutor
+
+    if _OPEN and _OPEN[-1][0] >= number:
+        yield _OPEN[-1][1], sys.maxsize
+        return
+    forks = bool(modules) and sys.platform == "linux"
     if forks:
         gc.disable()  # nothing that is imported is garbage
         for module in modules:
             importlib.import_module(module)
-        gc.freeze()  # both processes share these pages
+        gc.freeze()  # all processes share these pages
         gc.enable()
-    executor = ProcessPoolExecutor(1, context=get_context("fork") if forks else None, initializer=end_with_parent)
-    _EARLY.append(executor)
+    context, threads = get_context("fork") if forks else None, str(max(1, joblib.cpu_count() // max(1, number)))
+    settings = {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", threads)}
+    executor = cache(lambda: ProcessPoolExecutor(number, None, None, None, context, end_with, (os.getpid(),), settings))
+    _OPEN.append((number, lambda call: executor().submit(call)))  # the first call starts the processes
+    here = _OPEN[-1]
     for module in modules:
-        executor.submit(importlib.import_module, module)  # the first of them starts the process
+        here[1](partial(importlib.import_module, module))
     try:
-        yield
+        yield here[1], sys.maxsize
     finally:
-        _EARLY.remove(executor)
-        executor.shutdown(kill_workers=True)
+        _OPEN.remove(here)
+        if executor.cache_info().currsize:
+            executor().shutdown(kill_workers=True)
 
 
-@contextmanager
-def beside(workers: int, calls: Iterable[Callable[[], Result]], dead: str) -> Iterator[Iterator[Result]]:
-    """Inside, other processes work on calls while this one does something else; the results, as they are completed.
+def end_with(parent: int) -> None:
+    """Have this process end a moment after its parent, even by kill -9. Ctrl-C is left to the parent."""
+    _OPEN.clear()  # a fork has those of its parent, and its handler of signals
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
-    :param dead: the message for a process that dies.
-    :raises Failed: a process died.
-    """
-    early = workers == 1 and bool(_EARLY)
-    executor = _EARLY[-1] if early else ProcessPoolExecutor(workers, initializer=end_with_parent)
-    try:
-        futures = [executor.submit(call) for call in calls]
-        yield _sound((future.result() for future in as_completed(futures)), dead)
-    except BrokenProcessPool as error:  # before it was given any call
-        raise Failed(dead) from error
-    finally:
-        if not early:
-            executor.shutdown(kill_workers=True)
+    def wait() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.1)
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()

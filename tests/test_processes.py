@@ -25,8 +25,9 @@ from random_demonstrations import of_states
 
 from ddco_pyro.data.files import only_one
 from ddco_pyro.errors import Failed
+from ddco_pyro.events import SeedFitted, UpdatesDone
 from ddco_pyro.fitting.fit import fit
-from ddco_pyro.jobs import beside, early_process, end_pool, pool, results
+from ddco_pyro.jobs import Workers, processes, run_all
 from ddco_pyro.spec import dump_spec
 from ddco_pyro.training import restarts as restarting
 from ddco_pyro.training.checkpoint import Progress, Restart
@@ -236,83 +237,115 @@ def test_more_processes_than_shards_are_refused(whole, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-# --- processes beside this one ----------------------------------------------------------------------------------------
+# --- many calls -------------------------------------------------------------------------------------------------------
 
 
-def test_a_process_is_ready_before_there_is_work_and_ends_with_it() -> None:
-    with early_process("json"):
-        with beside(1, [os.getpid, os.getpid], "dead") as results:
-            first = list(results)
-        with beside(1, [os.getpid], "dead") as results:
-            again = list(results)
-    with beside(2, [os.getpid], "dead") as results:
-        later = list(results)
-    assert len(set(first + again)) == 1
-    assert os.getpid() not in first + later
-    assert first[0] != later[0]
-    assert not alive(first[0])
-    assert not alive(later[0])
+def places(number, calls, **how):
+    """The processes that make so many calls, by call; how many are left."""
+    with run_all(dict.fromkeys(range(calls), os.getpid), Workers(number), "dead", **how) as results:
+        found = dict(results)
+    assert not any(alive(process) for process in found.values() if process != os.getpid())
+    return found
 
 
-def test_a_process_that_is_killed_is_one_line() -> None:
+def test_calls_are_made_here_or_in_other_processes_that_end_with_them() -> None:
+    here = os.getpid()
+    assert set(places(1, 3).values()) == {here}
+    assert places(4, 0) == places(4, 0, beside=1) == {}
+    assert set(places(4, 1).values()) == {here}
+    assert here not in places(2, 3).values()
+    assert [call for call, process in places(2, 5, beside=1).items() if process == here] == [1, 3]
+    assert [call for call, process in places(2, 5, beside=0).items() if process == here] == [1, 3]
+    assert list(places(3, 9, ordered=True)) == list(range(9))
+
+
+@pytest.mark.parametrize("modules", [(), ("json",)])
+def test_processes_that_are_there_make_the_calls_of_a_block(modules) -> None:
+    with processes(2, *modules):
+        with run_all(dict.fromkeys(range(9), os.getpid), Workers(2), "dead") as results:
+            first = {process for _, process in results}
+        with run_all({0: os.getpid}, Workers(2), "dead", beside=1) as results:
+            ((_, again),) = results
+        assert again in first
+        assert len(first) <= 2
+        assert all(alive(process) for process in first)
+        assert not {*places(3, 9).values()} & first  # too few of them are there
+    assert not any(alive(process) for process in first)
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_events_come_call_after_call_and_the_wait_is_announced_once(jobs) -> None:
+    def tell(number, on_event):  # pickled by value, as it is in no module
+        on_event(SeedFitted(number))
+        on_event(UpdatesDone(number, 0.5))
+
+    told, calls = [], {n: partial(tell, n) for n in range(3)}
+    waiting = {n: SeedFitted(n) for n in calls}
+    with run_all(calls, Workers(jobs), "dead", told.append, beside=1, waiting=waiting) as results:
+        order = [number for number, _ in results]
+    assert order == ([0, 1, 2] if jobs == 1 else [1, 0, 2])
+    assert told == [event for n in order for event in (SeedFitted(n), UpdatesDone(n, 0.5))]
+
+
+@pytest.mark.parametrize("modules", [(), ("json",)])
+def test_a_process_that_is_killed_is_one_line(modules) -> None:
     kill = partial(signal.raise_signal, signal.SIGKILL)
-    with beside(1, [kill], "a process was ended") as results, pytest.raises(Failed, match=r"^a process was ended$"):
+    with (
+        processes(1, *modules),
+        pytest.raises(Failed, match=r"^a process was ended$"),
+        run_all({"kill": kill}, Workers(2), "a process was ended", beside=1) as results,
+    ):
         next(results)
 
 
 def test_so_is_one_that_is_killed_before_there_is_work() -> None:
-    with early_process("json"):
-        with beside(1, [os.getpid], "dead") as results:
-            (process,) = results
+    with processes(1, "json"):
+        (process,) = places_of_one()
         os.kill(process, signal.SIGKILL)
         while alive(process):
             time.sleep(0.01)
-        ended = beside(1, [os.getpid], "a process was ended")
-        with pytest.raises(Failed, match=r"^a process was ended$"), ended as results:
-            next(results)
+        with pytest.raises(Failed, match=r"^a process was ended$"):
+            places_of_one()
+
+
+def places_of_one():
+    with run_all({0: os.getpid}, Workers(2), "a process was ended", beside=1) as results:
+        return [process for _, process in results]
+
+
+def test_an_error_ends_what_is_not_done() -> None:
+    began = time.monotonic()
+    with pytest.raises(ValueError), run_all({0: partial(time.sleep, 60)}, Workers(2), "dead", beside=1):  # noqa: PT011
+        raise ValueError
+    assert time.monotonic() - began < 30
 
 
 def test_a_process_ends_at_sigterm_whatever_this_one_does() -> None:
     before = signal.signal(signal.SIGTERM, signal.getsignal)
     try:
-        with early_process("json"), beside(1, [partial(signal.getsignal, signal.SIGTERM)], "dead") as results:
-            assert list(results) == [signal.SIG_DFL]
+        with (
+            processes(1, "json"),
+            run_all({0: partial(signal.getsignal, signal.SIGTERM)}, Workers(2), "", beside=1) as r,
+        ):
+            assert dict(r) == {0: signal.SIG_DFL}
     finally:
         signal.signal(signal.SIGTERM, before)
 
 
-def test_a_pool_that_has_nothing_to_do_is_ended() -> None:
-    with pool(2) as parallel:
-        (process,) = results(parallel, [os.getpid], "dead")
-    assert process != os.getpid()
-    assert alive(process)
-    end_pool()
-    assert not alive(process)
-    end_pool()  # there is none any more
-
-
 KILLED = """
 import os, signal
-from ddco_pyro.jobs import beside, early_process, pool, results
-{work}
-print(process, flush=True)
-os.kill(os.getpid(), signal.SIGKILL)
-"""
-WORK = {
-    "beside": """
-with early_process("json"), beside(1, [os.getpid], "dead") as found:
-    process = next(found)
+from ddco_pyro.jobs import Workers, processes, run_all
+with {before}run_all(dict.fromkeys(range(9), os.getpid), Workers(2), "dead"{how}) as results:
+    process = next(process for _, process in results if process != os.getpid())
     os.kill(process, 0)
     print(process, flush=True)
-    os.kill(os.getpid(), signal.SIGKILL)""",
-    "pool": "process = next(results(pool(2), [os.getpid] * 9, 'dead'))",
-    "episodes": "process = next(results(pool(2, ordered=True), [os.getpid] * 9, 'dead'))",
-}
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
 
 
-@pytest.mark.parametrize("work", WORK)
-def test_a_process_ends_with_the_one_that_is_killed_while_it_waits_for_work(tmp_path, work) -> None:
+@pytest.mark.parametrize(("before", "how"), [("processes(2, 'json'), ", ""), ("", ""), ("", ", beside=1")])
+def test_a_process_ends_with_the_one_that_is_killed_while_it_waits_for_work(tmp_path, before, how) -> None:
     with open(tmp_path / "process", "w") as file:
-        killed = subprocess.run([sys.executable, "-c", KILLED.format(work=WORK[work])], stdout=file)
+        killed = subprocess.run([sys.executable, "-c", KILLED.format(before=before, how=how)], stdout=file)
     assert killed.returncode == -signal.SIGKILL
     assert_ends(int((tmp_path / "process").read_text()), 10)

@@ -15,8 +15,8 @@ from command_line import call
 from killing import HANGS
 from selecting import Told, data_at, kept, spec_at
 
+from ddco_pyro.jobs import BackendError
 from ddco_pyro.selection import Workers, select
-from ddco_pyro.selection.folds import BackendError
 
 distributed = pytest.importorskip("distributed")
 
@@ -89,7 +89,7 @@ def test_the_command_runs_on_the_cluster(cluster, tmp_path):
 
 
 def test_a_scheduler_that_does_not_answer_is_one_line(tmp_path, monkeypatch):
-    monkeypatch.setattr("ddco_pyro.selection.folds.CONNECT_SECONDS", 0.5)
+    monkeypatch.setattr("ddco_pyro.jobs.CONNECT_SECONDS", 0.5)
     with pytest.raises(BackendError, match=r"^--scheduler tcp://127.0.0.1:9: no dask scheduler answers there within"):
         Workers(scheduler="tcp://127.0.0.1:9").check()
 

@@ -77,8 +77,6 @@ def main() -> None:
     """Run the command line; ends the process with 0, 1 or 2."""
     with _interruptible():
         status = _run()
-    if jobs := sys.modules.get("ddco_pyro.jobs"):
-        jobs.end_pool()
     if not ("ompl" in sys.modules or "--allow-code" in sys.argv):  # bindings may report what Python leaves
         gc.freeze()  # so that it goes with the process
     sys.exit(status)

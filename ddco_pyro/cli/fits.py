@@ -17,6 +17,7 @@ from ddco_pyro.cli import AllowCode, Overrides, RunPath, SpecPath, hint, out_fol
 from ddco_pyro.data.files import Output, check_outputs
 from ddco_pyro.errors import BadInput, Failed, command
 from ddco_pyro.events import Event
+from ddco_pyro.jobs import LONG, Workers, processes
 from ddco_pyro.logs import Logged, MakeLog, find_log
 from ddco_pyro.spec import Spec, SpecError, dump_spec, load_spec, spec_schema, user_code
 
@@ -25,11 +26,24 @@ if TYPE_CHECKING:
     from ddco_pyro.training.processes import Ranks
 
 
+TRAINING = ("ddco_pyro.fitting.fit", "sklearn.cluster")
+"""Modules of processes that train."""
+
+
 class Backend(StrEnum):
-    """Backends of ``select``."""
+    """Where ``select`` trains folds, and ``study`` does cells."""
 
     LOKY = "loky"
     DASK = "dask"
+
+    def workers(self, jobs: int, scheduler: str | None) -> Workers:
+        """The processes that the options ask for.
+
+        :raises BadInput: options contradict each other, or ``jobs`` is not a number of processes.
+        """
+        if (self is Backend.DASK) != (scheduler is not None):
+            raise BadInput("--backend dask and --scheduler tcp://HOST:PORT go together; give both or neither")
+        return Workers(jobs, scheduler)
 
 
 def check(
@@ -125,15 +139,12 @@ def _follow(ranks: Ranks) -> None:
 
 @contextmanager
 def _ready(spec: Spec, jobs: int) -> Iterator[None]:
-    """Inside, another process is ready to fit baselines, if it is of use."""
-    from ddco_pyro.jobs import LONG, check_jobs, early_process, useful_jobs
-
-    check_jobs(jobs)
-    own = spec.training
-    long = own.epochs is None or own.epochs >= LONG
-    short = own.restarts == 1 or own.optimizer.name == "em"
-    alone = short and own.device == "cpu" and useful_jobs(jobs, 1 + len(spec.compare_with)) == 2
-    with early_process("ddco_pyro.fitting.fit", "sklearn.cluster") if long and alone else nullcontext():
+    """Inside, other processes are ready to train beside the model, if they are of use."""
+    number = Workers(jobs).number(sys.maxsize if spec.demonstrations.leave_one_out else 1 + len(spec.compare_with)) - 1
+    long = spec.training.epochs is None or spec.training.epochs >= LONG
+    short = spec.training.restarts == 1 or spec.training.optimizer.name == "em"
+    useful = number > 0 and long and short and spec.training.device == "cpu"
+    with processes(number, *TRAINING) if useful else nullcontext():
         yield
 
 
@@ -212,31 +223,28 @@ def select(
     """
     number = [] if folds is None else [f"selection.folds={folds}"]
     loaded = load_spec(spec, [*overrides, *number], allow_code)
-    if (backend is Backend.DASK) != (scheduler is not None):
-        raise SpecError("--backend dask and --scheduler tcp://HOST:PORT go together; give both or neither")
-    from ddco_pyro.jobs import check_jobs, importing
-
-    check_jobs(jobs)
+    workers = backend.workers(jobs, scheduler)
+    ready = processes(workers.number(), *TRAINING) if scheduler is None and workers.number() > 1 else nullcontext()
     folder = out or Path("runs") / f"{spec.stem}-select-{time.strftime('%Y%m%d-%H%M%S')}"
-    with importing(1 if scheduler else jobs, "ddco_pyro.selection.folds"):
+    with ready:
         import ddco_pyro
         from ddco_pyro import selection
         from ddco_pyro.cli import console
-        from ddco_pyro.report import write_report
-        from ddco_pyro.selection.choice import table
 
-        workers = selection.Workers(jobs, scheduler)
         _check_folder(folder, spec, loaded)
         demos = selection.known_demonstrations(loaded)
         selection.check(loaded, workers, demos)  # before anything is collected, trained or written
-    early = ["--stop-early"] if stop_early else []
-    again = command("select", folder / "spec.yaml", "--out", folder, "--resume", *early, *_allowed(loaded))
-    with _continued(again, folder), console.Progress() as progress:
-        made = selection.select(loaded, folder, progress, workers, stop_early, demos, resume)
-        progress.end()
-        assert made.choice.chosen is not None  # or it would have failed
-        final = selection.final_spec(made.choice.chosen.candidate)
-        fitted = ddco_pyro.fit(final, made.demos, folder / "fit", progress, jobs, keep=False)
+        early = ["--stop-early"] if stop_early else []
+        again = command("select", folder / "spec.yaml", "--out", folder, "--resume", *early, *_allowed(loaded))
+        with _continued(again, folder), console.Progress() as progress:
+            made = selection.select(loaded, folder, progress, workers, stop_early, demos, resume)
+            progress.end()
+            assert made.choice.chosen is not None  # or it would have failed
+            final = selection.final_spec(made.choice.chosen.candidate)
+            fitted = ddco_pyro.fit(final, made.demos, folder / "fit", progress, jobs, keep=False)
+    from ddco_pyro.report import write_report
+    from ddco_pyro.selection.choice import table
+
     console.show(table(made.choice, "held-out log-likelihood by cross-validation, nats per step"))
     for note in made.choice.notes:
         console.say(f"note: {note}")

@@ -57,11 +57,9 @@ def study(
         return
     if len(files) > 1:
         raise BadInput(f"{files[1]}: one study at a time")
-    if (backend is Backend.DASK) != (scheduler is not None):
-        raise BadInput("--backend dask and --scheduler tcp://HOST:PORT go together; give both or neither")
+    workers = backend.workers(jobs, scheduler)
     from ddco_pyro.cli import console
     from ddco_pyro.drawing.page import Table
-    from ddco_pyro.selection import Workers
     from ddco_pyro.study.cells import Folder
     from ddco_pyro.study.declaration import Study
 
@@ -69,7 +67,6 @@ def study(
     folder = Folder(found, out or Path("runs/studies") / found.name)
     check_outputs([Output("--out", folder.path, "folder")], [files[0]])
     if action is Action.RUN:
-        workers = Workers(jobs, scheduler)
         workers.check()
         folder.state()  # or something is wrong with its data or files
         with console.Progress() as progress:

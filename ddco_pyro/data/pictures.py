@@ -5,9 +5,6 @@ from __future__ import annotations
 import math
 import multiprocessing
 import os
-import signal
-import threading
-import time
 from collections import deque
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -20,6 +17,7 @@ import numpy as np
 
 from ddco_pyro.data.hdf5 import DAMAGE, DemonstrationsError, opened
 from ddco_pyro.errors import BadInput, Failed
+from ddco_pyro.jobs import end_with
 
 BLOCK_BYTES = 16 * 2**20
 """Most bytes of an array that are read at a time in a pass over the whole array; one step at least."""
@@ -358,22 +356,8 @@ class Readers:
         while len(self._begun) <= self._processes and (job := next(self._planned, None)) is not None:
             if self._pool is None:
                 spawn = multiprocessing.get_context("spawn")
-                self._pool = ProcessPoolExecutor(self._processes, mp_context=spawn, initializer=end_with_parent)
+                self._pool = ProcessPoolExecutor(self._processes, spawn, end_with, (os.getpid(),))
             try:
                 self._begun.append((job.key, self._pool.submit(read, job)))
             except BrokenProcessPool as error:
                 raise Failed(DEAD) from error
-
-
-def end_with_parent() -> None:
-    """End this process within a second of its parent's end, even by kill -9, and ignore Ctrl-C."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # a fork has its parent's handler
-    parent = os.getppid()
-
-    def wait() -> None:
-        while os.getppid() == parent:
-            time.sleep(0.5)
-        os._exit(1)
-
-    threading.Thread(target=wait, daemon=True).start()

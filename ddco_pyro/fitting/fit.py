@@ -5,9 +5,8 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import math
-import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterable, Mapping
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -21,7 +20,7 @@ from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.memory import allowed
 from ddco_pyro.data.sources.recording import label_names
 from ddco_pyro.errors import path_of
-from ddco_pyro.events import Event, OnEvent, TrainingBegan, ignore
+from ddco_pyro.events import OnEvent, ignore
 from ddco_pyro.fitting.digest import record, recorded
 from ddco_pyro.fitting.evaluation import evaluate
 from ddco_pyro.fitting.fitted import Fit, left_out, load
@@ -36,8 +35,7 @@ from ddco_pyro.fitting.run import (
     write_history,
     write_model,
 )
-from ddco_pyro.inference import compile_all
-from ddco_pyro.jobs import LONG, BackendError, beside, check_jobs, useful_jobs
+from ddco_pyro.jobs import LONG, BackendError, Workers, run_all
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec, load_spec, with_overrides
 from ddco_pyro.training.data import demonstrations as read_demonstrations
@@ -47,7 +45,10 @@ from ddco_pyro.training.labels import used
 from ddco_pyro.training.networks import Dimensions, check_models, model_name, parameters
 from ddco_pyro.training.optimizers import optimizer_of
 from ddco_pyro.training.processes import Ranks
-from ddco_pyro.training.restarts import train_model
+from ddco_pyro.training.restarts import train_model, training_began
+
+ALONE = Workers(1)
+"""This process."""
 
 PACKAGES = ("ddco-pyro", "torch", "pyro-ppl", "numpy", "dm-control", "mujoco", "ompl", "scikit-learn")
 """Packages whose versions are in ``metrics.json``, where they are installed."""
@@ -82,9 +83,9 @@ def fit(
     :param out: the run folder, as ``ddco-pyro fit`` makes it, with a copy of demonstrations from memory; None to write
         nothing. An unfinished run is continued; a finished one is loaded.
     :param on_event: called with progress events (:mod:`ddco_pyro.events`), such as :class:`ddco_pyro.Progress`.
-    :param jobs: processes that train restarts, or baselines beside the model, -1 for one on each core; 1 for this
-        process alone. The result is the same for any number. In a script, more than one needs the usual
-        ``if __name__ == "__main__":``.
+    :param jobs: processes that train side by side: restarts, or the model, its baselines and the models without each
+        demonstration. -1 is one on each core, 1 this process alone. The result is the same for any number. In a script,
+        more than one needs the usual ``if __name__ == "__main__":``.
     :param resume: whether ``out`` may hold the finished run.
     :param keep: whether ``out`` has a copy of demonstrations from memory; False where the spec's file has them.
     :raises BackendError: there is no such number of jobs, or ``torchrun`` started too many processes.
@@ -95,8 +96,9 @@ def fit(
     :raises TrainingError: training stopped; the checkpoints stay.
     """
     spec, folder = spec if isinstance(spec, Spec) else load_spec(spec), None if out is None else path_of(out, "out")
-    check_jobs(jobs)
-    _check_shards(spec.training.shards)
+    workers = Workers(jobs)
+    if _check_shards(spec.training.shards) > 1:
+        workers = ALONE  # which trains with the others of torchrun
     allowed()  # or $DDCO_PYRO_MEMORY is wrong
     clock, given = Clock(), None
     with clock("demonstrations"):
@@ -140,11 +142,11 @@ def fit(
             models = check_models(spec, Dimensions.of(demos))
         short = spec.training.restarts == 1 or all(_over_all(*model) for model in models.values())
         baselines = dict(list(models.items())[1:])
-        return _fit_model(spec, demos, folder, on_event, jobs, clock, baselines, short)
+        return _fit_model(spec, demos, folder, on_event, workers, clock, baselines, short)
 
 
-def _check_shards(shards: int) -> None:
-    """Refuse processes of ``torchrun`` that have no part of a minibatch.
+def _check_shards(shards: int) -> int:
+    """The number of processes of ``torchrun``, of which each has a part of a minibatch.
 
     :raises BackendError: there are more of them than shards.
     """
@@ -153,6 +155,7 @@ def _check_shards(shards: int) -> None:
             f"torchrun started {processes} processes, but a minibatch is cut into training.shards={shards}; add "
             f"--set training.shards={processes} (results depend on the shards, not on the processes)"
         )
+    return processes
 
 
 def _fit_model(
@@ -160,7 +163,7 @@ def _fit_model(
     demos: Demonstrations,
     folder: Path | None,
     on_event: OnEvent,
-    jobs: int,
+    workers: Workers,
     clock: Clock,
     baselines: Mapping[str, tuple[Spec, Hierarchy]],
     short: bool = True,
@@ -180,22 +183,22 @@ def _fit_model(
         baseline: partial(_fit_baseline, its, demos, folder and folder / "baselines" / baseline, folder, baseline)
         for baseline, (its, _) in baselines.items()
     }
-    far = _shared(jobs, [name for name, model in baselines.items() if short and _worth_a_process(*model, demos)])
-    began = {name: TrainingBegan(name, its.training.epochs) for name, (its, _) in baselines.items()}
-    others = {name: fits[name] for name in far} if Ranks.here().size == 1 else {}
-    with _in_other_processes(others, began, jobs, on_event) as begun:
+    long = {name: fits[name] for name, model in baselines.items() if short and _worth_a_process(*model, demos)}
+    waiting = {name: training_began(its, name) for name, (its, _) in baselines.items()}
+    with run_all(long, workers, DEAD, on_event, beside=1, waiting=waiting) as fitted_beside:
         with clock("training"):
-            free = max(1, useful_jobs(jobs, sys.maxsize) - len(begun))
+            free = max(1, workers.number() - len(long))
             trained = train_model(spec, size, split["train"], on_event, checkpoints, split.get("valid"), name, free)
         hierarchy = trained.hierarchy
         if folder:
             write_history(folder, trained.history)
             write_model(folder, hierarchy)
         with clock("baselines"):
-            here = {name: fits[name](on_event, jobs) for name in fits if name not in begun}
-            by_name = {name: here[name] if name in here else begun[name]() for name in fits}
+            others = {name: fits[name](on_event, workers) for name in fits if name not in long} | dict(fitted_beside)
+            by_name = {name: replace(others[name], given=demos) for name in fits}
     with clock("training"):
-        apart = _leave_one_out(spec, size, demos, folder, on_event, jobs)
+        alone = workers if _worth_a_process(spec, hierarchy, demos) else ALONE
+        apart = _leave_one_out(spec, size, demos, folder, on_event, alone)
     fitted = Fit(spec, hierarchy, folder=folder, given=demos, beside=by_name, apart=apart)
     train, valid = len(trained.data.train), len(split.get("valid", ()))
     counts = {"train": train, "tune": len(split["train"]) - train, "valid": valid, "left_out": bool(apart)}
@@ -240,25 +243,30 @@ def _leave_one_out(
     demos: Demonstrations,
     folder: Path | None,
     on_event: OnEvent,
-    jobs: int,
+    workers: Workers,
 ) -> dict[str, Hierarchy]:
     """The model trained without each demonstration, by its name, each kept in the run folder as soon as it is done."""
-    models: dict[str, Hierarchy] = {}
     if not spec.demonstrations.leave_one_out:
-        return models
+        return {}
     places = left_out(folder, demos) if folder else {}
-    for name in demos.names:
-        place = places.get(name)
-        if place and has_model(place):
-            models[name] = read_model(place, spec)
-            continue
-        others = demos.select(other for other in demos.names if other != name)
-        checkpoints = place / "checkpoints" if place else None
-        event = f"{model_name(spec)} without {name}"
-        models[name] = train_model(spec, size, others, on_event, checkpoints, None, event, jobs).hierarchy
-        if place:
-            write_model(place, models[name])
-    return models
+    calls = {name: partial(_train_without, spec, size, demos, name, places.get(name)) for name in demos.names}
+    with run_all(calls, workers, DEAD, on_event, beside=0) as trained:
+        models = dict(trained)
+    return {name: models[name] for name in demos.names}
+
+
+def _train_without(
+    spec: Spec, size: Dimensions, demos: Demonstrations, name: str, folder: Path | None, on_event: OnEvent
+) -> Hierarchy:
+    """Train without a demonstration, or read the model where that is done."""
+    if folder and has_model(folder):
+        return read_model(folder, spec)
+    others = demos.select(other for other in demos.names if other != name)
+    checkpoints, event = folder and folder / "checkpoints", f"{model_name(spec)} without {name}"
+    model = train_model(spec, size, others, on_event, checkpoints, None, event).hierarchy
+    if folder:
+        write_model(folder, model)
+    return model
 
 
 def _fit_baseline(
@@ -268,9 +276,9 @@ def _fit_baseline(
     above: Path | None,
     name: str,
     on_event: OnEvent,
-    jobs: int = 1,
+    workers: Workers = ALONE,
 ) -> Fit:
-    """Fit a baseline, or load it where that is done.
+    """Fit a baseline, or load it where that is done; without demonstrations, which another process need not send back.
 
     :param above: the run folder of the model that it is compared with.
     """
@@ -279,17 +287,17 @@ def _fit_baseline(
         record(folder, demos, recorded(above))
         if is_finished(folder):
             return load(folder, allow_code=True)
-    return _fit_model(spec, demos, folder, on_event, jobs, Clock(), {}, name=name)
+    return replace(_fit_model(spec, demos, folder, on_event, workers, Clock(), {}, name=name), given=None)
 
 
-# --- baselines in other processes -------------------------------------------------------------------------------------
+# --- in other processes -----------------------------------------------------------------------------------------------
 
 LITTLE = 256e6
 """Bytes of demonstrations, at most, that another process gets a copy of."""
 
 DEAD = (
-    "a process that trained a baseline was ended from outside (too little memory?); what was trained is kept in a run "
-    "folder: continue with the same command, with --jobs 1 if memory was short"
+    "a process that trained beside the model was ended from outside (too little memory?); what was trained is kept in "
+    "a run folder: continue with the same command, with --jobs 1 if memory was short"
 )
 
 
@@ -305,46 +313,3 @@ def _worth_a_process(spec: Spec, networks: Hierarchy, demos: Demonstrations) -> 
     steps = math.inf if own.epochs is None else own.epochs * batches
     sizes = [array.nbytes if isinstance(array, np.ndarray) else math.inf for array in arrays]
     return device_of(own).type == "cpu" and sum(sizes) < LITTLE and steps >= LONG
-
-
-def _shared(jobs: int, names: Sequence[str]) -> list[str]:
-    """The baselines that other processes fit. This process fits the model, then its share of the baselines."""
-    processes = useful_jobs(jobs, 1 + len(names))
-    return [name for number, name in enumerate(names) if number % processes != processes - 1]
-
-
-@contextmanager
-def _in_other_processes(
-    fits: Mapping[str, Callable[[OnEvent], Fit]], began: Mapping[str, TrainingBegan], jobs: int, on_event: OnEvent
-) -> Iterator[Mapping[str, Callable[[], Fit]]]:
-    """Inside, other processes fit baselines.
-
-    :param began: the event with which the training of each begins; it is passed on when the wait begins.
-    :returns: for each of the baselines, a function that waits for the fit and then passes its events on.
-    """
-    if not fits:
-        yield {}
-        return
-    compile_all()
-    calls = [partial(_with_events, name, fit) for name, fit in fits.items()]
-    with beside(useful_jobs(jobs, 1 + len(fits)) - 1, calls, DEAD) as left:
-        done: dict[str, tuple[Fit, list[Event]]] = {}
-
-        def wait(name: str) -> Fit:
-            on_event(began[name])
-            while name not in done:
-                found, fitted, events = next(left)
-                done[found] = fitted, events
-            fitted, events = done[name]
-            for event in events:
-                if not isinstance(event, TrainingBegan):
-                    on_event(event)
-            return fitted
-
-        yield {name: partial(wait, name) for name in fits}
-
-
-def _with_events(name: str, fit: Callable[[OnEvent], Fit]) -> tuple[str, Fit, list[Event]]:
-    """A baseline's name, its fit without demonstrations, and its events, in another process."""
-    events: list[Event] = []
-    return name, replace(fit(events.append), given=None), events

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 
 from ddco_pyro.data.files import only_one
@@ -14,7 +15,7 @@ from ddco_pyro.fitting.fit import fit as fit_again
 from ddco_pyro.fitting.fitted import Fit, load
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.fitting.run import is_finished
-from ddco_pyro.jobs import pool, results, useful_jobs
+from ddco_pyro.jobs import Workers, processes, run_all
 from ddco_pyro.metrics import Metrics, Seeds, SuccessOfSeeds
 from ddco_pyro.spec import Spec, user_code, with_overrides
 
@@ -51,12 +52,10 @@ def repeat(first: Fit, seeds: int, on_event: OnEvent = ignore, jobs: int = 1) ->
     allow_code = bool(user_code(first.spec))
     with only_one(folder):
         places = {seed: folder / "seeds" / str(seed) for seed in numbers[1:]}
-        left = {seed: place for seed, place in places.items() if not is_finished(place)}
-        for _ in range(len(places) - len(left)):
-            on_event(SeedFitted(len(places)))
-        calls = [partial(_again, first.spec, seed, place) for seed, place in left.items()]
-        with pool(useful_jobs(jobs, max(1, len(calls)))) as parallel:
-            for _ in results(parallel, calls, DEAD):
+        calls = {seed: partial(_again, first.spec, seed, place) for seed, place in places.items()}
+        left = {seed: call for seed, call in calls.items() if not is_finished(places[seed])}
+        with run_all(left, Workers(jobs), DEAD) as fitted:
+            for _ in chain(places.keys() - left, fitted):
                 on_event(SeedFitted(len(places)))
         every = [first, *(load(place, allow_code) for place in places.values())]
         first.metrics.seeds = over_seeds(numbers, [fit.metrics for fit in every])
@@ -79,9 +78,10 @@ def roll_out_repetitions(first: Fit, on_event: OnEvent = ignore, jobs: int = -1)
     if seeds is None or rollouts is None:
         return
     each = [rollouts]
-    for again in first.repetitions:
-        alone = replace(again, spec=with_overrides(again.spec, {"rollout.policies": []}))  # scripts have no seeds
-        each.append(roll_out(alone, rollouts.episodes, 0, on_event, jobs, resume=True))
+    with processes(Workers(jobs).number(rollouts.episodes)):
+        for again in first.repetitions:
+            alone = replace(again, spec=with_overrides(again.spec, {"rollout.policies": []}))  # scripts have no seeds
+            each.append(roll_out(alone, rollouts.episodes, 0, on_event, jobs, resume=True))
     rates = {name: [one.success_rates[name].rate for one in each] for name in each[-1].success_rates}
     pairs = [dict(one.worth or ()) for one in each]
     worth = {

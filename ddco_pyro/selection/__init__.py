@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from ddco_pyro.data.demonstrations import Demonstrations
@@ -16,11 +17,12 @@ from ddco_pyro.errors import Failed
 from ddco_pyro.events import CandidateGivenUp, FoldScored, OnEvent, SelectionBegan, ignore
 from ddco_pyro.fitting.digest import record
 from ddco_pyro.fitting.run import claimed
+from ddco_pyro.jobs import Workers, processes, run_all
 from ddco_pyro.selection import choice as choosing
 from ddco_pyro.selection import folds as dividing
 from ddco_pyro.selection import grid
 from ddco_pyro.selection.choice import STOP_RULE, Choice
-from ddco_pyro.selection.folds import Folds, Score, Workers
+from ddco_pyro.selection.folds import DEAD, Folds, Score
 from ddco_pyro.selection.grid import Candidate
 from ddco_pyro.spec import Spec, with_overrides
 from ddco_pyro.training import data
@@ -123,13 +125,15 @@ def _score_all(
     done = {pair: score for pair, score in kept.items() if score is not None}
     on_event(SelectionBegan(len(pairs), len(done)))
     running = list(candidates)
-    with workers.pool() as pool:
+    with processes(workers.number(len(pairs))):
         for numbers in [[fold] for fold in range(count)] if stop_early else [list(range(count))]:
             pending = [(one, fold) for fold in numbers for one in running if (one.number, fold) not in done]
-            for score in dividing.scores(pool, folds, pending) if pending else ():
-                dividing.keep_score(folder, score)
-                done[score.candidate, score.fold] = score
-                on_event(FoldScored(candidates[score.candidate].name, score.fold, score.failed))
+            calls = {(one.number, fold): partial(dividing.score, folds, one, fold) for one, fold in pending}
+            with run_all(calls, workers, DEAD) as scores:
+                for pair, score in scores:
+                    dividing.keep_score(folder, score)
+                    done[pair] = score
+                    on_event(FoldScored(candidates[score.candidate].name, score.fold, score.failed))
             if stop_early:
                 numbers_running = {one.number for one in running}
                 seen = [s for s in done.values() if s.fold <= numbers[-1] and s.candidate in numbers_running]

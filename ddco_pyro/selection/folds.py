@@ -5,30 +5,25 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
-from joblib import Parallel, parallel_config
 
-from ddco_pyro import jobs
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import Damaged, json_text, write_text
 from ddco_pyro.errors import BadInput, Failed
 from ddco_pyro.fitting.fitted import Fit
-from ddco_pyro.inference import compile_all
 from ddco_pyro.inference.threads import one_thread
-from ddco_pyro.jobs import ALL_CORES, BackendError
 from ddco_pyro.metrics import Record, read_record
 from ddco_pyro.selection.grid import Candidate
 from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.restarts import train_model
 
-CONNECT_SECONDS = 10
-"""Time for a dask scheduler to answer."""
+DEAD = (
+    "a process that trained a fold was ended from outside (too little memory?); finished folds are kept: "
+    "continue with --resume, with fewer --jobs if memory was short"
+)
 
 
 class FoldError(BadInput):
@@ -176,75 +171,3 @@ def kept_score(folder: Path, candidate: int, fold: int) -> Score | None:
     if (score.candidate, score.fold) != (candidate, fold) or {*lengths} != {len(score.names)} or 0 in score.steps:
         raise Damaged(path, "is not the score of this candidate and fold", remedy)
     return score
-
-
-@dataclass(frozen=True)
-class Workers:
-    """Processes that train folds: ``jobs`` of them here (-1: one for each core), or those of a dask ``scheduler``.
-
-    :raises BackendError: ``jobs`` is not a number of processes.
-    """
-
-    jobs: int = ALL_CORES
-    scheduler: str | None = None
-
-    def __post_init__(self) -> None:
-        jobs.check_jobs(self.jobs)
-
-    @contextmanager
-    def pool(self) -> Iterator[Parallel]:
-        """Processes for :func:`scores`.
-
-        :raises BackendError: dask is not installed, no scheduler answers, or the scheduler has no workers.
-        """
-        with ExitStack() as stack:
-            if self.scheduler is not None:
-                stack.enter_context(_client(self.scheduler))
-                stack.enter_context(parallel_config(backend="dask"))
-            else:
-                compile_all()
-            yield stack.enter_context(jobs.pool(self.jobs))
-
-    def check(self) -> None:
-        """Check that the scheduler and its workers answer.
-
-        :raises BackendError: as :meth:`pool`.
-        """
-        if self.scheduler is not None:
-            with _client(self.scheduler):
-                pass
-
-
-@contextmanager
-def _client(scheduler: str) -> Iterator[None]:
-    try:
-        from distributed import Client
-    except ImportError:
-        raise BackendError("--backend dask: dask is not installed; pip install 'ddco-pyro[dask]'") from None
-    try:
-        client = Client(scheduler, timeout=CONNECT_SECONDS)
-    except (OSError, ValueError) as error:
-        raise BackendError(
-            f"--scheduler {scheduler}: no dask scheduler answers there within {CONNECT_SECONDS} s; start one with: "
-            "dask scheduler"
-        ) from error
-    with client:
-        if not client.ncores():
-            raise BackendError(f"--scheduler {scheduler}: has no workers; start some with: dask worker {scheduler}")
-        yield
-
-
-def scores(pool: Parallel, folds: Folds, pending: Sequence[tuple[Candidate, int]]) -> Iterator[Score]:
-    """The score of each (candidate, fold), in the order in which they finish.
-
-    :raises Failed: a process died.
-    """
-    # The demonstrations are bound into the function. As an argument, dask would store them with one worker and lose
-    # them with the worker.
-    calls = [partial(score, folds, candidate, fold) for candidate, fold in pending]
-    yield from jobs.results(
-        pool,
-        calls,
-        "a process that trained a fold was ended from outside (too little memory?); finished folds are kept: "
-        "continue with --resume, with fewer --jobs if memory was short",
-    )

@@ -14,6 +14,7 @@ from ddco_pyro.data.hdf5 import opened
 from ddco_pyro.data.sources.robomimic import Parts, parts_of
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
+from ddco_pyro.jobs import Workers, processes
 from ddco_pyro.simulation.episodes import run_episodes, summarize
 from ddco_pyro.simulation.task import Task, find_task, package_of, version_of
 from ddco_pyro.spec import DemonstrationsSpec
@@ -79,7 +80,8 @@ def collect(
     if path.exists():
         return path
     at_once = EPISODES_WITH_PICTURES if task.seen_by_cameras(observed) else spec.count
-    with parts_of(path, _identity(task, task_name, spec, observed), wait=True, at_most=1) as parts:
+    identity = _identity(task, task_name, spec, observed)
+    with processes(Workers().number(at_once)), parts_of(path, identity, wait=True, at_most=1) as parts:
         if parts is None:
             return path
         seeds = range(spec.seed + len(parts.done), spec.seed + spec.count)

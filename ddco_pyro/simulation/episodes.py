@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from ddco_pyro.data.demonstrations import Demonstration
+from ddco_pyro.jobs import Workers, run_all
 from ddco_pyro.simulation.task import Observation, Policy, Task, find_task
 from ddco_pyro.statistics import mean, rate
 
@@ -187,19 +188,16 @@ def run_episodes(
     jobs: int = -1,
     observed: Collection[str] = (),
     keep: Collection[str] | None = None,
-) -> Iterable[Episode]:
+) -> Iterator[Episode]:
     """Episodes of each seed in turn, from parallel processes; the first ``film`` of them have frames.
 
     :param task: the task's name for :func:`ddco_pyro.simulation.task.find_task`.
     :param observed: see :func:`run_episode`, also for ``keep``.
     :raises Failed: a process died.
     """
-    from ddco_pyro.jobs import pool, results
-
-    calls = [
-        partial(_run_named, task, policy, seed, number < film, observed, keep) for number, seed in enumerate(seeds)
-    ]
-    return results(pool(jobs, ordered=True), calls, DEAD)
+    calls = {seed: partial(_run_named, task, policy, seed, seed in seeds[:film], observed, keep) for seed in seeds}
+    with run_all(calls, Workers(jobs), DEAD, ordered=True) as episodes:
+        yield from (episode for _, episode in episodes)
 
 
 DEAD = (

@@ -21,7 +21,6 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ddco_pyro import jobs
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import Busy, json_text, only_one, write_text
 from ddco_pyro.data.hdf5 import natural
@@ -35,8 +34,8 @@ from ddco_pyro.fitting.digest import Digest, digest, recorded
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.inference.threads import one_thread
+from ddco_pyro.jobs import Workers, processes, run_all
 from ddco_pyro.metrics import Record, read_record, read_table
-from ddco_pyro.selection.folds import Workers
 from ddco_pyro.simulation.collect import collect
 from ddco_pyro.simulation.episodes import run_episodes
 from ddco_pyro.spec import DemonstrationsSpec, Spec, SpecError, parse_spec, with_overrides
@@ -313,19 +312,20 @@ class Folder:
         self.path.mkdir(parents=True, exist_ok=True)
         cells, state = self.cells(self.first), None
         there = Folder(replace(self.study, path=self.study.path.resolve()), self.path.resolve())  # wherever workers are
-        with workers.pool() as pool:
+        with processes(workers.number(len(cells))):
             while state is None or len(cells) > len(state.cells):
                 before = self._state(cells)
                 on_event(StudyBegan(len(cells), len(before.done)))
-                calls = [partial(there.do, cell) for number, cell in enumerate(cells) if number not in before.done]
-                for cell, failed in jobs.results(pool, calls, DEAD) if calls else ():
-                    on_event(CellDone(str(cell), failed))
+                calls = {n: partial(there.do, cell) for n, cell in enumerate(cells) if n not in before.done}
+                with run_all(calls, workers, DEAD) as done:
+                    for number, failed in done:
+                        on_event(CellDone(str(cells[number]), failed))
                 state = self._state(cells)
                 cells = list(self.state().cells)  # development, once done, adds those of the test
         return state
 
-    def do(self, cell: Cell) -> tuple[Cell, str]:
-        """Do a cell on one thread and keep its results; also returns why it failed.
+    def do(self, cell: Cell) -> str:
+        """Do a cell on one thread and keep its results; returns why it failed.
 
         A cell that another process works on is left to it.
         """
@@ -333,7 +333,7 @@ class Folder:
         try:
             with only_one(folder):
                 if (kept := self.kept(cell)) is not None and not kept.failed:  # another process has done it
-                    return cell, ""
+                    return ""
                 if self.place(cell).exists() and kept is None:  # of other defaults
                     shutil.rmtree(folder / "fit", ignore_errors=True)
                 done = Done(depends=self.depends(cell), values={})
@@ -347,9 +347,9 @@ class Folder:
                     done = done.model_copy(update={"failed": reason})
                 done = done.model_copy(update={"seconds": time.perf_counter() - began})
                 write_text(self.place(cell), json_text({"cell": asdict(cell), **done.model_dump()}))
-                return cell, done.failed
+                return done.failed
         except Busy:
-            return cell, ""
+            return ""
 
     def _measured(self, cell: Cell, folder: Path) -> dict[str, Any]:
         """The measures of a cell."""

@@ -10,7 +10,6 @@ changes the result.
 from __future__ import annotations
 
 import math
-import os
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
@@ -24,7 +23,6 @@ import torch
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import (
-    EpochEnded,
     OnEvent,
     RestartDiverged,
     RestartStopped,
@@ -35,7 +33,7 @@ from ddco_pyro.events import (
 from ddco_pyro.inference.engines import STEPS, TRAJECTORIES, EngineCheck, compare_engines
 from ddco_pyro.inference.paths import segment
 from ddco_pyro.inference.threads import one_thread
-from ddco_pyro.jobs import end_with, pool, results, useful_jobs
+from ddco_pyro.jobs import Workers, processes, run_all
 from ddco_pyro.model.batch import encode, refuse_unusable
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.seeding import seeded
@@ -83,18 +81,22 @@ def train_model(
     :raises DemonstrationsError: a number is too large for networks.
     :raises TrainingError: a log-likelihood is not finite, or the engines disagree.
     """
-    budget = spec.training
     with one_thread():
         split = tuning_split(spec, dimensions, demos)
         trainer = Trainer(spec, dimensions, *split, checkpoints, on_event, jobs)
         if held_out is not None:
             refuse_unusable(held_out, trainer.hierarchy.encoder, trainer.hierarchy.scaling)
         trainer.check_engines()
-        epochs = None if budget.epochs is None else budget.epochs * budget.restarts
-        on_event(TrainingBegan(name or model_name(spec), epochs))
+        on_event(training_began(spec, name))
         trainer.run()
     on_event(TrainingEnded(name or model_name(spec)))
     return trainer
+
+
+def training_began(spec: Spec, name: str | None = None) -> TrainingBegan:
+    """The event with which the training of a model begins."""
+    epochs, restarts = spec.training.epochs, spec.training.restarts
+    return TrainingBegan(name or model_name(spec), None if epochs is None else epochs * restarts)
 
 
 class Trainer:
@@ -124,7 +126,7 @@ class Trainer:
         jobs: int = 1,
     ) -> None:
         self.spec, self.checkpoints, self.on_event, self.ranks = spec, checkpoints, on_event, Ranks.here()
-        self.jobs = useful_jobs(jobs, spec.training.restarts)
+        self.jobs = Workers(jobs).number(spec.training.restarts)
         self.hierarchy = build_hierarchy(spec, dimensions)
         encoder, scaling = self.hierarchy.encoder, self.hierarchy.scaling
         encoder.fit(train)
@@ -175,6 +177,22 @@ class Trainer:
         """
         self.restarts = [self._begun(number) for number in range(self.spec.training.restarts)]
         self.ranks.share(self.data)
+        with processes(self.jobs):
+            self._run_rungs()
+        self.ranks.share(None)
+        if (why := self.restarts[self.best].progress.diverged) is not None:
+            raise TrainingError(why)
+        if len(self.restarts) > 1 and self.hierarchy.depth:
+            from sklearn.metrics import normalized_mutual_info_score
+
+            found = {n: self._segments(n) for n, restart in enumerate(self.restarts) if "best" in restart.states}
+            own = found.pop(self.best)
+            self.agreement = {n: float(normalized_mutual_info_score(own, other)) for n, other in found.items()}
+        self.hierarchy.load_state_dict(self.restarts[self.best].states["best"])
+        return self.hierarchy.place(device_of(self.spec.training)).eval()
+
+    def _run_rungs(self) -> None:
+        """Train and stop restarts by successive halving, then train the last one, or ones, to the end."""
         left, epochs = list(range(len(self.restarts))), self.spec.training.halving
         worse: list[int] = []  # the best first
         while epochs is not None and len(left) > 1:
@@ -190,17 +208,6 @@ class Trainer:
             again = next(number for number in worse if number in self.stopped)
             del self.stopped[again]
             self._train([again], None)
-        self.ranks.share(None)
-        if (why := self.restarts[self.best].progress.diverged) is not None:
-            raise TrainingError(why)
-        if len(self.restarts) > 1 and self.hierarchy.depth:
-            from sklearn.metrics import normalized_mutual_info_score
-
-            found = {n: self._segments(n) for n, restart in enumerate(self.restarts) if "best" in restart.states}
-            own = found.pop(self.best)
-            self.agreement = {n: float(normalized_mutual_info_score(own, other)) for n, other in found.items()}
-        self.hierarchy.load_state_dict(self.restarts[self.best].states["best"])
-        return self.hierarchy.place(device_of(self.spec.training)).eval()
 
     @property
     def best(self) -> int:
@@ -317,28 +324,16 @@ class Trainer:
                 del left[0]
         if not left:
             return
-        with pool(min(self.jobs, len(left))) as parallel:
-            calls = [
-                partial(_train_apart, self.data, self.restarts[n], until, self._path(n), os.getpid()) for n in left
-            ]
-            for restart in results(parallel, calls, DEAD):
-                before = self.restarts[restart.progress.restart].progress
+        calls = {n: partial(train, self.data, self.restarts[n], until, math.inf, self._path(n)) for n in left}
+        with run_all(calls, Workers(self.jobs), DEAD, self.on_event) as trained:
+            for _, restart in trained:
                 self._keep(restart)
-                for row in restart.progress.history[len(before.history) :]:
-                    self.on_event(EpochEnded(**row))
 
     def _keep(self, restart: Restart) -> None:
         number, why = restart.progress.restart, restart.progress.diverged
         self.restarts[number] = restart
         if why is not None and len(self.restarts) > 1:
             self.on_event(RestartDiverged(number, why))
-
-
-def _train_apart(
-    data: TrainingData, restart: Restart, until: int | None, checkpoint: Path | None, parent: int
-) -> Restart:
-    """Train a restart in a process of its own, which ends with the process that waits for it."""
-    return train(data, restart, until, math.inf, checkpoint, lambda event: end_with(parent))
 
 
 def follow(ranks: Ranks) -> None:
