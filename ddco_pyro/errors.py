@@ -19,6 +19,13 @@ class Failed(RuntimeError):
     """A failure with valid input: one line with the problem, the place and the remedy (exit status 1)."""
 
 
+def reason(error: Exception) -> str:
+    """Why something failed, in one line; what is no user-facing error is said to be unexpected."""
+    message = " ".join(str(error).split())
+    expected = isinstance(error, BadInput | Failed | OSError)
+    return message if expected else f"unexpected {type(error).__name__}: {message}"
+
+
 def check_whole(name: str, given: Any, least: int = 0) -> None:
     """Refuse a setting that is not a whole number from ``least`` on; numpy's are.
 

@@ -40,6 +40,18 @@ warnings.filterwarnings("ignore", "A worker stopped", UserWarning)
 """loky says so of a process that it replaces."""
 
 
+def from_outside(doing: str, fewer: str = "--jobs") -> str:
+    """The message for a process that died.
+
+    :param doing: its part of the work.
+    :param fewer: the setting for the number of processes.
+    """
+    return (
+        f"a process that {doing} was ended from outside (too little memory?); what is done is kept in its folder: "
+        f"continue with the same command and --out, with fewer {fewer} if memory was short"
+    )
+
+
 class BackendError(BadInput):
     """Work cannot be done by these processes or on this backend."""
 
@@ -78,7 +90,7 @@ class Workers:
 def run_all(
     calls: Mapping[Key, Callable[..., Result]],
     workers: Workers,
-    dead: str,
+    doing: str,
     on_event: OnEvent | None = None,
     ordered: bool = False,
     beside: int | None = None,
@@ -89,7 +101,7 @@ def run_all(
     Other processes begin at once, and end with the block. Where this process is the only one, a call is made when its
     result is asked for.
 
-    :param dead: the message for a process that dies.
+    :param doing: what a call does, for the error.
     :param on_event: given to each call. Events of a call in another process are passed on once the call is completed.
     :param ordered: whether results come in the order of the calls.
     :param beside: the number of other calls that this process makes inside the block. This process then makes its
@@ -126,7 +138,7 @@ def run_all(
 
             yield chain(results, completed())
     except BrokenProcessPool as error:
-        raise Failed(dead) from error
+        raise Failed(from_outside(doing)) from error
 
 
 def _away(call: Callable[..., Result], with_events: bool) -> tuple[Result, list[Event]]:

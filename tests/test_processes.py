@@ -242,7 +242,7 @@ def test_more_processes_than_shards_are_refused(whole, tmp_path):
 
 def places(number, calls, **how):
     """The processes that make so many calls, by call; how many are left."""
-    with run_all(dict.fromkeys(range(calls), os.getpid), Workers(number), "dead", **how) as results:
+    with run_all(dict.fromkeys(range(calls), os.getpid), Workers(number), "worked", **how) as results:
         found = dict(results)
     assert not any(alive(process) for process in found.values() if process != os.getpid())
     return found
@@ -262,9 +262,9 @@ def test_calls_are_made_here_or_in_other_processes_that_end_with_them() -> None:
 @pytest.mark.parametrize("modules", [(), ("json",)])
 def test_processes_that_are_there_make_the_calls_of_a_block(modules) -> None:
     with processes(2, *modules):
-        with run_all(dict.fromkeys(range(9), os.getpid), Workers(2), "dead") as results:
+        with run_all(dict.fromkeys(range(9), os.getpid), Workers(2), "worked") as results:
             first = {process for _, process in results}
-        with run_all({0: os.getpid}, Workers(2), "dead", beside=1) as results:
+        with run_all({0: os.getpid}, Workers(2), "worked", beside=1) as results:
             ((_, again),) = results
         assert again in first
         assert len(first) <= 2
@@ -281,7 +281,7 @@ def test_events_come_call_after_call_and_the_wait_is_announced_once(jobs) -> Non
 
     told, calls = [], {n: partial(tell, n) for n in range(3)}
     waiting = {n: SeedFitted(n) for n in calls}
-    with run_all(calls, Workers(jobs), "dead", told.append, beside=1, waiting=waiting) as results:
+    with run_all(calls, Workers(jobs), "worked", told.append, beside=1, waiting=waiting) as results:
         order = [number for number, _ in results]
     assert order == ([0, 1, 2] if jobs == 1 else [1, 0, 2])
     assert told == [event for n in order for event in (SeedFitted(n), UpdatesDone(n, 0.5))]
@@ -292,8 +292,8 @@ def test_a_process_that_is_killed_is_one_line(modules) -> None:
     kill = partial(signal.raise_signal, signal.SIGKILL)
     with (
         processes(1, *modules),
-        pytest.raises(Failed, match=r"^a process was ended$"),
-        run_all({"kill": kill}, Workers(2), "a process was ended", beside=1) as results,
+        pytest.raises(Failed, match=r"^a process that worked was ended from outside"),
+        run_all({"kill": kill}, Workers(2), "worked", beside=1) as results,
     ):
         next(results)
 
@@ -304,18 +304,18 @@ def test_so_is_one_that_is_killed_before_there_is_work() -> None:
         os.kill(process, signal.SIGKILL)
         while alive(process):
             time.sleep(0.01)
-        with pytest.raises(Failed, match=r"^a process was ended$"):
+        with pytest.raises(Failed, match=r"^a process that worked was ended from outside"):
             places_of_one()
 
 
 def places_of_one():
-    with run_all({0: os.getpid}, Workers(2), "a process was ended", beside=1) as results:
+    with run_all({0: os.getpid}, Workers(2), "worked", beside=1) as results:
         return [process for _, process in results]
 
 
 def test_an_error_ends_what_is_not_done() -> None:
     began = time.monotonic()
-    with pytest.raises(ValueError), run_all({0: partial(time.sleep, 60)}, Workers(2), "dead", beside=1):  # noqa: PT011
+    with pytest.raises(ValueError), run_all({0: partial(time.sleep, 60)}, Workers(2), "worked", beside=1):  # noqa: PT011
         raise ValueError
     assert time.monotonic() - began < 30
 
@@ -335,7 +335,7 @@ def test_a_process_ends_at_sigterm_whatever_this_one_does() -> None:
 KILLED = """
 import os, signal
 from ddco_pyro.jobs import Workers, processes, run_all
-with {before}run_all(dict.fromkeys(range(9), os.getpid), Workers(2), "dead"{how}) as results:
+with {before}run_all(dict.fromkeys(range(9), os.getpid), Workers(2), "worked"{how}) as results:
     process = next(process for _, process in results if process != os.getpid())
     os.kill(process, 0)
     print(process, flush=True)

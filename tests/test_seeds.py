@@ -20,6 +20,7 @@ import ddco_pyro
 from ddco_pyro.data.demonstrations import DemonstrationsError
 from ddco_pyro.drawing import words
 from ddco_pyro.evaluation import verdicts
+from ddco_pyro.events import TrainingBegan
 from ddco_pyro.metrics import Rollouts, Seeds
 from ddco_pyro.spec import load_spec, with_overrides
 
@@ -226,6 +227,19 @@ def test_a_run_has_the_models_without_one_and_goes_on_with_them(run, tmp_path):
     unchanged = ddco_pyro.fit(run.spec, out=run.folder).metrics
     assert {path: path.stat().st_mtime_ns for path in before} == before
     assert unchanged.model_copy(update={"seconds": {}}) == run.metrics.model_copy(update={"seconds": {}})
+
+
+@pytest.mark.slow
+def test_fits_without_a_demonstration_are_the_same_side_by_side(run, tmp_path, monkeypatch):
+    monkeypatch.setattr("ddco_pyro.fitting.fit.LONG", 0)
+    told = []
+    again = ddco_pyro.fit(few_spec(), planted(), tmp_path / "run", told.append, jobs=2)
+    assert again.metrics.model_copy(update={"seconds": {}}) == run.metrics.model_copy(update={"seconds": {}})
+    for path in run.folder.rglob("*.safetensors"):
+        assert (tmp_path / "run" / path.relative_to(run.folder)).read_bytes() == path.read_bytes(), path
+    began = [event.model for event in told if isinstance(event, TrainingBegan) and " without " in event.model]
+    assert [name for name in began if name.startswith("ddco")] == [f"ddco without demo_{n}" for n in (1, 3, 0, 2)]
+    assert len(began) == 8
 
 
 def test_what_masks_hold_out_cannot_be_trained_with():

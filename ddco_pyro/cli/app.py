@@ -21,7 +21,7 @@ from typing import Annotated, Any
 import typer
 
 from ddco_pyro.cli import NARROW, demos, fits, runs, starting, study
-from ddco_pyro.errors import BadInput, Failed
+from ddco_pyro.errors import BadInput, Failed, reason
 
 app = typer.Typer(
     add_completion=False,
@@ -146,7 +146,5 @@ def _explain(error: Exception) -> tuple[int, list[str]]:
         return 2, [f"{error.format_message().rstrip('.')}; see {command} --help"]
     if isinstance(error, BadInput):
         return 2, str(error).splitlines()
-    message = " ".join(str(error).split())
-    if isinstance(error, Failed | OSError):
-        return 1, [message]
-    return 1, [f"unexpected {type(error).__name__}: {message}; --debug shows where it comes from"]
+    expected = isinstance(error, Failed | OSError)
+    return 1, [reason(error) if expected else f"{reason(error)}; --debug shows where it comes from"]

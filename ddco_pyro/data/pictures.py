@@ -17,7 +17,7 @@ import numpy as np
 
 from ddco_pyro.data.hdf5 import DAMAGE, DemonstrationsError, opened
 from ddco_pyro.errors import BadInput, Failed
-from ddco_pyro.jobs import end_with
+from ddco_pyro.jobs import end_with, from_outside
 
 BLOCK_BYTES = 16 * 2**20
 """Most bytes of an array that are read at a time in a pass over the whole array; one step at least."""
@@ -273,11 +273,6 @@ def shifted(frames: np.ndarray, down: int, right: int) -> np.ndarray:
 
 # --- prefetching ------------------------------------------------------------------------------------------------------
 
-DEAD = (
-    "a process that read pictures was ended from outside (too little memory?); what was trained is kept in a run "
-    "folder: continue with the same command, with fewer training.workers if memory was short"
-)
-
 Read = dict[str, np.ndarray]
 """Pictures by observation, [N, T, H, W, C]."""
 
@@ -349,7 +344,7 @@ class Readers:
         try:
             return future.result()
         except BrokenProcessPool as error:
-            raise Failed(DEAD) from error
+            raise Failed(from_outside("read pictures", "training.workers")) from error
 
     def _prefetch(self) -> None:
         """Submit planned jobs until one more than there are processes is under way."""
@@ -360,4 +355,4 @@ class Readers:
             try:
                 self._begun.append((job.key, self._pool.submit(read, job)))
             except BrokenProcessPool as error:
-                raise Failed(DEAD) from error
+                raise Failed(from_outside("read pictures", "training.workers")) from error

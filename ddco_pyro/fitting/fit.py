@@ -185,7 +185,7 @@ def _fit_model(
     }
     long = {name: fits[name] for name, model in baselines.items() if short and _worth_a_process(*model, demos)}
     waiting = {name: training_began(its, name) for name, (its, _) in baselines.items()}
-    with run_all(long, workers, DEAD, on_event, beside=1, waiting=waiting) as fitted_beside:
+    with run_all(long, workers, "trained a baseline", on_event, beside=1, waiting=waiting) as fitted_beside:
         with clock("training"):
             free = max(1, workers.number() - len(long))
             trained = train_model(spec, size, split["train"], on_event, checkpoints, split.get("valid"), name, free)
@@ -250,7 +250,7 @@ def _leave_one_out(
         return {}
     places = left_out(folder, demos) if folder else {}
     calls = {name: partial(_train_without, spec, size, demos, name, places.get(name)) for name in demos.names}
-    with run_all(calls, workers, DEAD, on_event, beside=0) as trained:
+    with run_all(calls, workers, "trained without a demonstration", on_event, beside=0) as trained:
         models = dict(trained)
     return {name: models[name] for name in demos.names}
 
@@ -294,11 +294,6 @@ def _fit_baseline(
 
 LITTLE = 256e6
 """Bytes of demonstrations, at most, that another process gets a copy of."""
-
-DEAD = (
-    "a process that trained beside the model was ended from outside (too little memory?); what was trained is kept in "
-    "a run folder: continue with the same command, with --jobs 1 if memory was short"
-)
 
 
 def _over_all(spec: Spec, networks: Hierarchy) -> bool:

@@ -19,8 +19,6 @@ from ddco_pyro.jobs import Workers, processes, run_all
 from ddco_pyro.metrics import Metrics, Seeds, SuccessOfSeeds
 from ddco_pyro.spec import Spec, user_code, with_overrides
 
-DEAD = "a process that repeated the fit was ended from outside (too little memory?); the same command goes on"
-
 
 def check_seeds(spec: Spec, seeds: int) -> None:
     """Refuse a number of training seeds that a fit cannot be repeated with.
@@ -54,7 +52,7 @@ def repeat(first: Fit, seeds: int, on_event: OnEvent = ignore, jobs: int = 1) ->
         places = {seed: folder / "seeds" / str(seed) for seed in numbers[1:]}
         calls = {seed: partial(_again, first.spec, seed, place) for seed, place in places.items()}
         left = {seed: call for seed, call in calls.items() if not is_finished(places[seed])}
-        with run_all(left, Workers(jobs), DEAD) as fitted:
+        with run_all(left, Workers(jobs), "repeated the fit") as fitted:
             for _ in chain(places.keys() - left, fitted):
                 on_event(SeedFitted(len(places)))
         every = [first, *(load(place, allow_code) for place in places.values())]

@@ -22,7 +22,7 @@ from ddco_pyro.selection import choice as choosing
 from ddco_pyro.selection import folds as dividing
 from ddco_pyro.selection import grid
 from ddco_pyro.selection.choice import STOP_RULE, Choice
-from ddco_pyro.selection.folds import DEAD, Folds, Score
+from ddco_pyro.selection.folds import Folds, Score
 from ddco_pyro.selection.grid import Candidate
 from ddco_pyro.spec import Spec, with_overrides
 from ddco_pyro.training import data
@@ -129,7 +129,7 @@ def _score_all(
         for numbers in [[fold] for fold in range(count)] if stop_early else [list(range(count))]:
             pending = [(one, fold) for fold in numbers for one in running if (one.number, fold) not in done]
             calls = {(one.number, fold): partial(dividing.score, folds, one, fold) for one, fold in pending}
-            with run_all(calls, workers, DEAD) as scores:
+            with run_all(calls, workers, "trained a fold") as scores:
                 for pair, score in scores:
                     dividing.keep_score(folder, score)
                     done[pair] = score

@@ -12,18 +12,13 @@ import numpy as np
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import Damaged, json_text, write_text
-from ddco_pyro.errors import BadInput, Failed
+from ddco_pyro.errors import BadInput, Failed, reason
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.metrics import Record, read_record
 from ddco_pyro.selection.grid import Candidate
 from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.restarts import train_model
-
-DEAD = (
-    "a process that trained a fold was ended from outside (too little memory?); finished folds are kept: "
-    "continue with --resume, with fewer --jobs if memory was short"
-)
 
 
 class FoldError(BadInput):
@@ -138,11 +133,8 @@ def score(folds: Folds, candidate: Candidate, fold: int) -> Score:
             raise Failed(f"the held-out log-likelihood of {', '.join(bad)} is not finite")
         steps, converged = trained.summary["spent"]["gradient_steps"], trained.summary["converged"]
         result = replace(empty, log_likelihood=values, gradient_steps=steps, converged=converged)
-    except (BadInput, Failed) as error:
-        result = replace(empty, failed=str(error))
     except Exception as error:  # other folds go on, and the reason is shown
-        reason = f"unexpected {type(error).__name__}: {' '.join(str(error).split())}"
-        result = replace(empty, failed=reason, final=False)
+        result = replace(empty, failed=reason(error), final=isinstance(error, BadInput | Failed))
     return replace(result, seconds=time.perf_counter() - start)
 
 

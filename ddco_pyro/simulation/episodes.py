@@ -196,14 +196,8 @@ def run_episodes(
     :raises Failed: a process died.
     """
     calls = {seed: partial(_run_named, task, policy, seed, seed in seeds[:film], observed, keep) for seed in seeds}
-    with run_all(calls, Workers(jobs), DEAD, ordered=True) as episodes:
+    with run_all(calls, Workers(jobs), "ran episodes", ordered=True) as episodes:
         yield from (episode for _, episode in episodes)
-
-
-DEAD = (
-    "a process that ran episodes was ended from outside (too little memory?); what is done is kept: do the same again, "
-    "with fewer --jobs if memory was short"
-)
 
 
 def _run_named(task: str, *how: Any) -> Episode:

@@ -27,7 +27,7 @@ from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.inspection import inspect
 from ddco_pyro.data.sources import open_source
 from ddco_pyro.data.starting import starting_spec
-from ddco_pyro.errors import BadInput, Failed
+from ddco_pyro.errors import BadInput, reason
 from ddco_pyro.evaluation.agreement import MATCHED, UNMATCHED
 from ddco_pyro.events import CellDone, OnEvent, StudyBegan, ignore
 from ddco_pyro.fitting.digest import Digest, digest, recorded
@@ -317,7 +317,7 @@ class Folder:
                 before = self._state(cells)
                 on_event(StudyBegan(len(cells), len(before.done)))
                 calls = {n: partial(there.do, cell) for n, cell in enumerate(cells) if n not in before.done}
-                with run_all(calls, workers, DEAD) as done:
+                with run_all(calls, workers, "did a cell") as done:
                     for number, failed in done:
                         on_event(CellDone(str(cells[number]), failed))
                 state = self._state(cells)
@@ -340,11 +340,8 @@ class Folder:
                 try:
                     with one_thread():
                         done = done.model_copy(update=self._measured(cell, folder))
-                except (BadInput, Failed) as error:
-                    done = done.model_copy(update={"failed": str(error)})
                 except Exception as error:  # other cells go on, and the reason is shown
-                    reason = f"unexpected {type(error).__name__}: {' '.join(str(error).split())}"
-                    done = done.model_copy(update={"failed": reason})
+                    done = done.model_copy(update={"failed": reason(error)})
                 done = done.model_copy(update={"seconds": time.perf_counter() - began})
                 write_text(self.place(cell), json_text({"cell": asdict(cell), **done.model_dump()}))
                 return done.failed
@@ -421,12 +418,6 @@ class Folder:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 world.collect(cell.task, seeds, count, path)
         return path
-
-
-DEAD = (
-    "a process that did a cell was ended from outside (too little memory?); finished cells are kept: the same command "
-    "goes on, with fewer --jobs if memory was short"
-)
 
 
 def _mean(values: Sequence[float]) -> float | None:

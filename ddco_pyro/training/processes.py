@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 from torch import distributed
 
 from ddco_pyro.errors import Failed
+from ddco_pyro.jobs import from_outside
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -26,10 +27,7 @@ class LostProcess(Failed):
     """A process that trained together with this one has ended."""
 
     def __init__(self) -> None:
-        super().__init__(
-            "a process that trained together with this one was ended from outside (too little memory?); what was "
-            "trained is kept in a run folder: continue with the same command, with fewer processes if memory was short"
-        )
+        super().__init__(from_outside("trained together with this one", "processes"))
 
 
 @dataclass(frozen=True)

@@ -53,11 +53,6 @@ from ddco_pyro.training.stages import StageEnd, plan
 SHORT = 10.0
 """Seconds of training here before other processes start, which takes seconds itself."""
 
-DEAD = (
-    "a process that trained a restart was ended from outside (too little memory?); what was trained is kept in a run "
-    "folder: continue with the same command, with fewer --jobs if memory was short"
-)
-
 
 class OtherDevice(BadInput):
     """A restart was begun on another kind of device than it is to be continued on."""
@@ -325,7 +320,7 @@ class Trainer:
         if not left:
             return
         calls = {n: partial(train, self.data, self.restarts[n], until, math.inf, self._path(n)) for n in left}
-        with run_all(calls, Workers(self.jobs), DEAD, self.on_event) as trained:
+        with run_all(calls, Workers(self.jobs), "trained a restart", self.on_event) as trained:
             for _, restart in trained:
                 self._keep(restart)
 
