@@ -35,6 +35,7 @@ from ddco_pyro.fitting.run import (
     write_history,
     write_model,
 )
+from ddco_pyro.inference import compile_all
 from ddco_pyro.jobs import LONG, BackendError, Workers, run_all
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec, load_spec, with_overrides
@@ -185,6 +186,8 @@ def _fit_model(
     }
     long = {name: fits[name] for name, model in baselines.items() if short and _worth_a_process(*model, demos)}
     waiting = {name: training_began(its, name) for name, (its, _) in baselines.items()}
+    if long:
+        compile_all()
     with run_all(long, workers, "trained a baseline", on_event, beside=1, waiting=waiting) as fitted_beside:
         with clock("training"):
             free = max(1, workers.number() - len(long))

@@ -17,6 +17,7 @@ from ddco_pyro.errors import Failed
 from ddco_pyro.events import CandidateGivenUp, FoldScored, OnEvent, SelectionBegan, ignore
 from ddco_pyro.fitting.digest import record
 from ddco_pyro.fitting.run import claimed
+from ddco_pyro.inference import compile_all
 from ddco_pyro.jobs import Workers, processes, run_all
 from ddco_pyro.selection import choice as choosing
 from ddco_pyro.selection import folds as dividing
@@ -125,6 +126,7 @@ def _score_all(
     done = {pair: score for pair, score in kept.items() if score is not None}
     on_event(SelectionBegan(len(pairs), len(done)))
     running = list(candidates)
+    compile_all()
     with processes(workers.number(len(pairs))):
         for numbers in [[fold] for fold in range(count)] if stop_early else [list(range(count))]:
             pending = [(one, fold) for fold in numbers for one in running if (one.number, fold) not in done]

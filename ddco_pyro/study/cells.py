@@ -33,6 +33,7 @@ from ddco_pyro.events import CellDone, OnEvent, StudyBegan, ignore
 from ddco_pyro.fitting.digest import Digest, digest, recorded
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.fitted import Fit
+from ddco_pyro.inference import compile_all
 from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.jobs import Workers, processes, run_all
 from ddco_pyro.metrics import Record, read_record, read_table
@@ -309,6 +310,7 @@ class Folder:
         :raises Failed: a process died.
         """
         self.study.world()  # or something is wrong with it
+        compile_all()
         self.path.mkdir(parents=True, exist_ok=True)
         cells, state = self.cells(self.first), None
         there = Folder(replace(self.study, path=self.study.path.resolve()), self.path.resolve())  # wherever workers are
