@@ -6,7 +6,7 @@ import json
 import sys
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -137,15 +137,13 @@ def _follow(ranks: Ranks) -> None:
         follow(ranks)
 
 
-@contextmanager
-def _ready(spec: Spec, jobs: int) -> Iterator[None]:
-    """Inside, other processes are ready to train beside the model, if they are of use."""
+def _ready(spec: Spec, jobs: int) -> AbstractContextManager[object]:
+    """A block inside which other processes are ready to train beside the model, if they are of use."""
     number = Workers(jobs).number(sys.maxsize if spec.demonstrations.leave_one_out else 1 + len(spec.compare_with)) - 1
     long = spec.training.epochs is None or spec.training.epochs >= LONG
     short = spec.training.restarts == 1 or spec.training.optimizer.name == "em"
     useful = number > 0 and long and short and spec.training.device == "cpu"
-    with processes(number, *TRAINING) if useful else nullcontext():
-        yield
+    return processes(number, *TRAINING) if useful else nullcontext()
 
 
 def _fit_and_report(
