@@ -477,9 +477,12 @@ def test_refused_with_the_key_path_and_one_line(overrides: dict[str, Any], messa
 
 
 def test_every_problem_has_its_line() -> None:
-    message = refusal({"seed": "a", "hierarchy.levels.0.count": 0, "traning": {}})
+    both = {"name": "em", "warmup": 2, "schedule": "cosine"}
+    message = refusal({"seed": "a", "hierarchy.levels.0.count": 0, "traning": {}, "training.optimizer": both})
     assert message.splitlines() == [
         "hierarchy.levels.0.count: must be at least 1, got 0",
+        "training.optimizer.warmup: em takes no gradient steps and would not use it; leave it out",
+        "training.optimizer.schedule: em takes no gradient steps and would not use it; leave it out",
         "seed: must be a whole number, got 'a'",
         "traning: unknown key; did you mean training?",
     ]

@@ -4,11 +4,21 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, TypeVar, get_args
+from typing import Annotated, Any, Literal, Self, TypeVar, get_args
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, WrapValidator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    TypeAdapter,
+    ValidationError,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
+    model_validator,
+)
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails, PydanticCustomError
 
@@ -41,6 +51,9 @@ class Importable:
 
 TaskName = Annotated[Text, Importable(TASKS)]
 
+Problems = Iterable[tuple[str, str]]
+"""Pairs of a key path, relative to a part of the spec, and the problem there."""
+
 
 class Model(BaseModel):
     """A part of the spec: frozen, without unknown keys, with strict types."""
@@ -48,6 +61,16 @@ class Model(BaseModel):
     model_config = ConfigDict(
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
     )
+
+    def problems(self) -> Problems:
+        """The settings that do not go together."""
+        return ()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if problems := tuple(self.problems()):
+            raise invalid(*problems)
+        return self
 
 
 def bare(key: str, allowed: Any) -> BeforeValidator:
@@ -57,16 +80,17 @@ def bare(key: str, allowed: Any) -> BeforeValidator:
     )
 
 
-def nested(kinds: tuple[type, ...], validate: Callable[[Any], Any], text: str, names: tuple[str, ...] = ()) -> Any:
-    """A validator for a union of a simple and a nested type.
+def nested(kinds: tuple[type, ...], inner: Any, text: str, names: tuple[str, ...] = ()) -> WrapValidator:
+    """A validator for a union of a simple type and ``inner``.
 
-    Values of ``kinds`` are validated as the nested type alone, so that an error names the key inside. Of other invalid
+    Values of ``kinds`` are validated as ``inner`` alone, so that an error names the key inside. Of other invalid
     values the error says that they must be ``text``, and suggests the nearest of ``names``.
     """
+    adapter: TypeAdapter[Any] = TypeAdapter(inner, config=None if isinstance(inner, type) else Model.model_config)
 
-    def choose(value: Any, validate_simple: Callable[[Any], Any]) -> Any:
+    def choose(value: Any, validate_simple: ValidatorFunctionWrapHandler) -> Any:
         if isinstance(value, kinds):
-            return validate(value)
+            return adapter.validate_python(value)
         try:
             return validate_simple(value)
         except ValidationError:
@@ -163,8 +187,8 @@ def in_words(error: ErrorDetails) -> str:
 
 def show(value: Any) -> str:
     """A value as YAML has it, cut to 60 characters."""
-    text = {None: "null", True: "true", False: "false"}.get(value) if value is None or isinstance(value, bool) else None
-    text = text or repr(value)
+    words = {None: "null", True: "true", False: "false"}
+    text = words[value] if value is None or isinstance(value, bool) else repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 

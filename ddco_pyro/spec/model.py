@@ -5,16 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import (
-    Field,
-    SerializerFunctionWrapHandler,
-    TypeAdapter,
-    field_validator,
-    model_serializer,
-    model_validator,
-)
+from pydantic import Field, SerializerFunctionWrapHandler, field_validator, model_serializer
 
-from ddco_pyro.spec.base import Count, Emission, Items, Model, Text, bare, invalid, nested
+from ddco_pyro.spec.base import Count, Emission, Items, Model, Problems, Text, bare, nested
 from ddco_pyro.spec.networks import LinearSpec, MlpSpec, Network, NetworkSpec, PolicySpec
 from ddco_pyro.spec.settings import LearnedStd
 from ddco_pyro.spec.training import OptimizerSpec
@@ -22,16 +15,12 @@ from ddco_pyro.spec.training import OptimizerSpec
 HEADS = ("linear", "mlp")
 """The networks that can read a trunk."""
 
-Reader = tuple[str, Network]
-"""Key of a network and its settings."""
-
 ALWAYS: Literal["always"] = "always"
 """The termination of options that end after every step, ψ = 1."""
 
-_NETWORK: TypeAdapter[NetworkSpec] = TypeAdapter(NetworkSpec)
 Termination = Annotated[
     NetworkSpec | Literal["always"],
-    nested((Mapping, Network), _NETWORK.validate_python, "a network, such as {network: linear}, or always"),
+    nested((Mapping, Network), NetworkSpec, "a network, such as {network: linear}, or always"),
 ]
 
 
@@ -51,35 +40,16 @@ class LevelSpec(Model):
     """The options' termination conditions, ψ: one network for each option. ``always``: ψ = 1, every option ends after
     every step; a single such level is a memoryless mixture of experts, with the meta-policy as its gate."""
 
-    @model_validator(mode="after")
-    def _heads(self) -> LevelSpec:
-        if self.trunk is not None:
-            _check_readers(*self._own)
-        return self
-
     @property
     def lasts(self) -> bool:
         """Whether options can be active for more than one step."""
         return self.termination != ALWAYS
 
     @property
-    def readers(self) -> tuple[Reader, ...]:
-        """The networks that read the observations or the hierarchy's trunk."""
-        return self._own if self.trunk is None else (("trunk", self.trunk),)
-
-    @property
-    def _own(self) -> tuple[Reader, ...]:
-        networks = (("policy", self.policy), ("termination", self.termination))
-        return tuple((key, network) for key, network in networks if isinstance(network, Network))
-
-
-def _check_readers(*heads: Reader) -> None:
-    for place, head in heads:
-        if head.network not in HEADS:
-            text = f"reads the trunk: use one of {', '.join(HEADS)}, got {head.network!r}"
-            raise invalid((f"{place}.network", text))
-        if head.inputs:
-            raise invalid((f"{place}.inputs", "the trunk reads the observations; give inputs there"))
+    def networks(self) -> dict[str, Network]:
+        """The networks of the level by their key."""
+        networks = {"trunk": self.trunk, "policy": self.policy, "termination": self.termination}
+        return {key: network for key, network in networks.items() if isinstance(network, Network)}
 
 
 class HierarchySpec(Model):
@@ -99,23 +69,12 @@ class HierarchySpec(Model):
 
         :param level: 1 for the lowest.
         """
-        own = self.levels[level - 1]
-        return (self.trunk or own.trunk or own.policy).reads
+        options = self.levels[level - 1]
+        return (self.trunk or options.trunk or options.policy).reads
 
     @field_validator("levels")
     @classmethod
-    def _consistent(cls, levels: tuple[LevelSpec, ...]) -> tuple[LevelSpec, ...]:
-        problems = []
-        first: dict[str, int] = {}
-        for index, level in enumerate(levels):
-            if level.name in first:
-                text = f"{level.name!r} is also the name of level {first[level.name]}; give each level its own"
-                problems.append((f"{index}.name", text))
-            first.setdefault(level.name, index)
-        if levels[0].policy.emits not in ((), ("control",)):
-            problems.append(("0.policy.emits", "the lowest level emits the control and nothing else; leave it out"))
-        if problems:
-            raise invalid(*problems)
+    def _selecting_below(cls, levels: tuple[LevelSpec, ...]) -> tuple[LevelSpec, ...]:
         policies = [_emitting(level.policy, "options" if index else "control") for index, level in enumerate(levels)]
         pairs = zip(levels, policies, strict=True)
         return tuple(level.model_copy(update={"policy": policy}) for level, policy in pairs)
@@ -125,17 +84,29 @@ class HierarchySpec(Model):
     def _selecting(cls, policy: PolicySpec) -> PolicySpec:
         return _emitting(policy, "options")
 
-    @model_validator(mode="after")
-    def _heads(self) -> HierarchySpec:
-        if self.trunk is not None:
-            levels = (level.readers for level in self.levels)
-            named = ((f"levels.{index}.{at}", head) for index, own in enumerate(levels) for at, head in own)
-            _check_readers(*named, ("meta_policy", self.meta_policy))
-            for index, level in enumerate(self.levels):
-                if level.trunk is not None and level.trunk.shared:
-                    text = "all options share the hierarchy's trunk; put these layers there"
-                    raise invalid((f"levels.{index}.trunk.shared", text))
-        return self
+    def problems(self) -> Problems:
+        first: dict[str, int] = {}
+        for index, level in enumerate(self.levels):
+            if first.setdefault(level.name, index) < index:
+                text = f"{level.name!r} is also the name of level {first[level.name]}; give each level its own"
+                yield f"levels.{index}.name", text
+        if self.levels[0].policy.emits != ("control",):
+            yield "levels.0.policy.emits", "the lowest level emits the control and nothing else; leave it out"
+        heads: dict[str, Network] = {"meta_policy": self.meta_policy} if self.trunk else {}
+        for index, level in enumerate(self.levels):
+            heads |= {
+                f"levels.{index}.{key}": network
+                for key, network in level.networks.items()
+                if (self.trunk if level.trunk is None or key == "trunk" else level.trunk)
+            }
+            if self.trunk and level.trunk and level.trunk.shared:
+                text = "all options share the hierarchy's trunk; put these layers there"
+                yield f"levels.{index}.trunk.shared", text
+        for place, head in heads.items():
+            if head.network not in HEADS:
+                yield f"{place}.network", f"reads the trunk: use one of {', '.join(HEADS)}, got {head.network!r}"
+            elif head.inputs:
+                yield f"{place}.inputs", "the trunk reads the observations; give inputs there"
 
 
 def _emitting(policy: PolicySpec, default: Emission) -> PolicySpec:
@@ -182,19 +153,17 @@ class BaselineSpec(Model):
         expert = LevelSpec(name="expert", count=self.count, policy=self.policy, termination=ALWAYS)
         return HierarchySpec(levels=(expert,), meta_policy=self.meta_policy or MlpSpec())
 
-    @model_validator(mode="after")
-    def _settings_apply(self) -> BaselineSpec:
+    def problems(self) -> Problems:
         network = self.policy.network
         if self.kind == "flat_equal" and not self.policy.hidden_sizes:
             text = f"flat_equal widens hidden layers, and network {network!r} has none; give it some"
-            raise invalid(("policy", f"{text}, such as {{network: mlp, hidden: [64]}}"))
+            yield "policy", f"{text}, such as {{network: mlp, hidden: [64]}}"
         if self.kind == "per_timestep" and network not in (*HEADS, "per_timestep"):
             text = f"per_timestep has a perceptron for each step: use one of {', '.join(HEADS)}"
-            raise invalid(("policy.network", f"{text}, got {network!r}, or say kind: flat"))
-        given = [key for key in _OF_A_MIXTURE if key in self.model_fields_set]
-        if given and self.kind != "mixture":
-            raise invalid(*((key, f"is a setting of mixture, not of {self.kind}; leave it out") for key in given))
-        return self
+            yield "policy.network", f"{text}, got {network!r}, or say kind: flat"
+        for key in _OF_A_MIXTURE:
+            if key in self.model_fields_set and self.kind != "mixture":
+                yield key, f"is a setting of mixture, not of {self.kind}; leave it out"
 
     @model_serializer(mode="wrap")
     def _without_foreign_keys(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:

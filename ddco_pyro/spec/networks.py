@@ -7,8 +7,7 @@ bounds are declared here alone, so that a spec and its schema are read without i
 from __future__ import annotations
 
 import re
-from collections import Counter
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias, get_args
 
 from pydantic import (
     AfterValidator,
@@ -24,7 +23,7 @@ from pydantic import (
 )
 
 from ddco_pyro.errors import nearest
-from ddco_pyro.spec.base import Count, Emission, Importable, Items, Model, Share, Text, invalid, tag_of
+from ddco_pyro.spec.base import Count, Emission, Importable, Items, Model, Problems, Share, Text, invalid, tag_of
 
 USER_DEFINED = "module:Class"
 _USER_DEFINED_PATTERN = r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$"
@@ -77,13 +76,10 @@ class Network(Model):
                 raise invalid(*((key, f"does not apply to network {name!r}; leave it out") for key in foreign))
         return data
 
-    @field_validator("emits")
-    @classmethod
-    def _distinct(cls, emits: tuple[Emission, ...]) -> tuple[Emission, ...]:
-        for name, times in Counter(emits).items():
-            if times > 1:
-                raise invalid(("", f"{name!r} is given twice; keep one"))
-        return emits
+    def problems(self) -> Problems:
+        for name in get_args(Emission):
+            if self.emits.count(name) > 1:
+                yield "emits", f"{name!r} is given twice; keep one"
 
     @model_serializer(mode="wrap")
     def _without_empty(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -147,12 +143,11 @@ class ConvSpec(MlpSpec):
     standardize: bool = False
     """Whether each picture is shifted and scaled to mean 0 and standard deviation 1 over its pixels and channels."""
 
-    @model_validator(mode="after")
-    def _one_kind_of_layers(self) -> ConvSpec:
-        twice = [key for key in ("filters", "kernel") if self.layers and key in self.model_fields_set]
-        if twice:
-            raise invalid(*((key, "each of layers has its own; leave it out") for key in twice))
-        return self
+    def problems(self) -> Problems:
+        yield from super().problems()
+        for key in ("filters", "kernel"):
+            if self.layers and key in self.model_fields_set:
+                yield key, "each of layers has its own; leave it out"
 
     @model_serializer(mode="wrap")
     def _without_empty(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:

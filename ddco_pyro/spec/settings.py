@@ -6,19 +6,26 @@ import re
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import BeforeValidator, Field, TypeAdapter, model_validator
+from pydantic import BeforeValidator, Field
 
-from ddco_pyro.spec.base import Count, Items, Model, Positive, Seed, Share, TaskName, Text, bare, invalid, nested, show
+from ddco_pyro.spec.base import (
+    Count,
+    Items,
+    Model,
+    Positive,
+    Problems,
+    Seed,
+    Share,
+    TaskName,
+    Text,
+    bare,
+    invalid,
+    nested,
+    show,
+)
 
 LabelNames = Annotated[Items[Text], Field(min_length=1)]
-Labels = Annotated[
-    Text | LabelNames,
-    nested(
-        (list, tuple),
-        TypeAdapter(LabelNames, config=Model.model_config).validate_python,
-        "a name, or a list with a name for each level",
-    ),
-]
+Labels = Annotated[Text | LabelNames, nested((list, tuple), LabelNames, "a name, or a list with a name for each level")]
 
 
 class DemonstrationsSpec(Model):
@@ -112,21 +119,19 @@ class ObservationSpec(Model):
     augment: AugmentSpec | None = None
     """Data augmentation in training; null: none."""
 
-    @model_validator(mode="after")
-    def _settings_apply(self) -> ObservationSpec:
+    def problems(self) -> Problems:
         if self.crop is not None and 0 in self.crop[2:]:
-            raise invalid(("crop", "is top, left, height, width; height and width must be at least 1"))
+            yield "crop", "is top, left, height, width; height and width must be at least 1"
         if self.key == STEP and self.differences:
-            raise invalid(("differences", f"{STEP} grows by the same at each step; leave it out"))
+            yield "differences", f"{STEP} grows by the same at each step; leave it out"
         turned = [*self.angles, *(first + place for first in self.quaternions for place in range(4))]
         for key in ("angles", "quaternions"):
             if getattr(self, key) and self.key == STEP:
-                raise invalid((key, f"{STEP} is no angle; leave it out"))
-            if getattr(self, key) and len(set(turned)) < len(turned):
-                raise invalid((key, "name a number twice; each is part of one angle or quaternion"))
+                yield key, f"{STEP} is no angle; leave it out"
+            elif getattr(self, key) and len(set(turned)) < len(turned):
+                yield key, "name a number twice; each is part of one angle or quaternion"
         if self.key == STEP and self.augment:
-            raise invalid(("augment", f"{STEP} is computed and has no versions; leave it out"))
-        return self
+            yield "augment", f"{STEP} is computed and has no versions; leave it out"
 
     def turned(self, size: int) -> int:
         """For vectors: numbers of a step of ``size`` numbers, with angles and quaternions in their place."""
@@ -160,27 +165,18 @@ class LearnedStd(Model):
     """Whether σ depends on the observations: the policy's network outputs σ beside the mean. Each option, and a flat
     policy, has its own σ."""
 
-    @model_validator(mode="after")
-    def _one_of_both(self) -> LearnedStd:
+    def problems(self) -> Problems:
         if self.per_option and self.per_state:
-            raise invalid(("per_option", "per_state gives each option its own σ already; leave per_option out"))
-        return self
+            yield "per_option", "per_state gives each option its own σ already; leave per_option out"
 
 
-Std = Annotated[
-    Positive | LearnedStd, nested((Mapping,), LearnedStd.model_validate, "a positive number or {learn: true}")
-]
+Std = Annotated[Positive | LearnedStd, nested((Mapping,), LearnedStd, "a positive number or {learn: true}")]
 
 ScaleName = Literal["standardize", "none"]
 Scales = Annotated[Items[Positive], Field(min_length=1)]
 Scale = Annotated[
     ScaleName | Scales,
-    nested(
-        (list, tuple),
-        TypeAdapter(Scales, config=Model.model_config).validate_python,
-        "standardize, none, or a list of positive numbers",
-        get_args(ScaleName),
-    ),
+    nested((list, tuple), Scales, "standardize, none, or a list of positive numbers", get_args(ScaleName)),
 ]
 
 Kind = Literal["auto", "gaussian", "student", "clipped", "hurdle", "binary", "categorical"]
@@ -216,6 +212,23 @@ class PartSpec(Model):
     freedom: Freedom | None = None
     """As ``control.freedom``; null: the same."""
 
+    def problems(self) -> Problems:
+        if isinstance(self.scale, tuple) and len(self.scale) != len(self.dims):
+            yield "scale", f"has {len(self.scale)} numbers, but the part has {len(self.dims)} dimensions"
+        for setting in ("scale", "std"):
+            if self.kind in DISCRETE and getattr(self, setting) is not None:
+                yield setting, f"does not apply to kind: {self.kind}; leave it out"
+        if self.bounds is not None and self.kind not in ("clipped", "hurdle"):
+            yield "bounds", "are for kind: clipped or hurdle"
+        if self.bounds is not None and self.bounds[0] >= self.bounds[1]:
+            yield "bounds", "must be a lower and a higher number"
+        if self.freedom is not None and self.kind != "student":
+            yield "freedom", "is for kind: student"
+        if self.value is not None and self.kind != "hurdle":
+            yield "value", "is for kind: hurdle"
+        elif self.value is not None and self.bounds and not self.bounds[0] < self.value < self.bounds[1]:
+            yield "value", "must lie between the bounds"
+
 
 class ControlSpec(Model):
     """The distribution of the control."""
@@ -241,36 +254,18 @@ class ControlSpec(Model):
         stds = {"control.std": self.std} | {f"control.parts.{n}.std": part.std for n, part in enumerate(self.parts)}
         return {path: std for path, std in stds.items() if isinstance(std, LearnedStd)}
 
-    @model_validator(mode="after")
-    def _disjoint(self) -> ControlSpec:
+    def problems(self) -> Problems:
         if self.freedom != 4.0 and "student" not in (self.kind, *(part.kind for part in self.parts)):
-            raise invalid(("freedom", "is for kind: student"))
+            yield "freedom", "is for kind: student"
         dimensions: dict[int, str] = {}
         for number, part in enumerate(self.parts):
             if part.name in [other.name for other in self.parts[:number]]:
-                raise invalid((f"parts.{number}.name", f"{part.name!r} is the name of another part too"))
+                yield f"parts.{number}.name", f"{part.name!r} is the name of another part too"
             for dimension in part.dims:
                 if dimension in dimensions:
                     where = f"control dimension {dimension} is in {dimensions[dimension]!r} already"
-                    raise invalid((f"parts.{number}.dims", where))
+                    yield f"parts.{number}.dims", where
                 dimensions[dimension] = part.name
-            if isinstance(part.scale, tuple) and len(part.scale) != len(part.dims):
-                problem = f"has {len(part.scale)} numbers, but the part has {len(part.dims)} dimensions"
-                raise invalid((f"parts.{number}.scale", problem))
-            for setting in ("scale", "std"):
-                if part.kind in DISCRETE and getattr(part, setting) is not None:
-                    raise invalid((f"parts.{number}.{setting}", f"does not apply to kind: {part.kind}; leave it out"))
-            if part.bounds is not None and part.kind not in ("clipped", "hurdle"):
-                raise invalid((f"parts.{number}.bounds", "are for kind: clipped or hurdle"))
-            if part.bounds is not None and part.bounds[0] >= part.bounds[1]:
-                raise invalid((f"parts.{number}.bounds", "must be a lower and a higher number"))
-            if part.freedom is not None and part.kind != "student":
-                raise invalid((f"parts.{number}.freedom", "is for kind: student"))
-            if part.value is not None and part.kind != "hurdle":
-                raise invalid((f"parts.{number}.value", "is for kind: hurdle"))
-            if part.value is not None and part.bounds and not part.bounds[0] < part.value < part.bounds[1]:
-                raise invalid((f"parts.{number}.value", "must lie between the bounds"))
-        return self
 
 
 class InferenceSpec(Model):
@@ -319,11 +314,9 @@ class PathSpec(Model):
     numbers: str | None = None
     """Which of its numbers, as a Python slice such as ``3:6``; null: the first three, or both of two."""
 
-    @model_validator(mode="after")
-    def _is_slice(self) -> PathSpec:
+    def problems(self) -> Problems:
         if self.numbers is not None and not SLICE.fullmatch(self.numbers):
-            raise invalid(("", f"must be a slice such as 3:6 after the key, got {show(self.numbers)}"))
-        return self
+            yield "", f"must be a slice such as 3:6 after the key, got {show(self.numbers)}"
 
     def __str__(self) -> str:
         return self.key if self.numbers is None else f"{self.key}[{self.numbers}]"

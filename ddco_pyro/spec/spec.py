@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, Self
 
 from pydantic import Field, ValidationError, model_validator
 
 from ddco_pyro.errors import nearest
-from ddco_pyro.spec.base import Emission, Items, Model, Seed, SpecError, TaskName, invalid, lines, show
+from ddco_pyro.spec.base import Emission, Items, Model, Problems, Seed, SpecError, TaskName, invalid, lines, show
 from ddco_pyro.spec.model import Baseline, HierarchySpec, LevelSpec
 from ddco_pyro.spec.networks import foreign_keys
 from ddco_pyro.spec.settings import (
@@ -77,62 +77,53 @@ class Spec(Model):
         return list(dict.fromkeys([*self.observed, *filter(None, versions)]))
 
     @model_validator(mode="after")
-    def _mixture_alone(self) -> Spec:
-        """A mixture in place of a hierarchy becomes that hierarchy."""
-        alone = self.baseline
-        if alone is None or alone.kind != "mixture" or self.hierarchy is not None:
-            return self
-        if alone.count is None:
-            raise invalid(("baseline.count", "missing; give the number of experts of the mixture"))
-        if alone.levels:
-            raise invalid(("baseline.levels", "is for a mixture in compare_with; leave it out"))
-        return self.model_copy(update={"hierarchy": alone.as_hierarchy, "baseline": None})
-
-    @model_validator(mode="after")
-    def _linear_by_em(self) -> Spec:
-        """Linear networks are trained by EM, where the spec does not say otherwise."""
-        training = self.training
+    def _consistent(self) -> Self:
+        """A mixture in place of a hierarchy becomes that hierarchy; EM trains linear networks by default."""
+        spec, baseline, training = self, self.baseline, self.training
+        if baseline and baseline.kind == "mixture" and self.hierarchy is None:
+            if baseline.count is None:
+                raise invalid(("baseline.count", "missing; give the number of experts of the mixture"))
+            if baseline.levels:
+                raise invalid(("baseline.levels", "is for a mixture in compare_with; leave it out"))
+            spec = spec.model_copy(update={"hierarchy": baseline.as_hierarchy, "baseline": None})
         versions = any(observation.augment and observation.augment.versions for observation in self.observations)
-        if training.optimizer.name == "em" or training.takes_gradient_steps or versions or not self._is_linear:
-            return self
-        optimizer = training.optimizer.model_copy(update={"name": "em"})
-        return self.model_copy(update={"training": training.model_copy(update={"optimizer": optimizer})})
+        if not (training.optimizer.name == "em" or training.takes_gradient_steps or versions) and spec._is_linear:
+            optimizer = training.optimizer.model_copy(update={"name": "em"})
+            spec = spec.model_copy(update={"training": training.model_copy(update={"optimizer": optimizer})})
+        if problems := list(spec.problems()) or list(_grid_problems(spec)):
+            raise invalid(*problems)
+        return spec
 
     @property
     def _is_linear(self) -> bool:
         """Whether every network is declared ``linear`` or constant."""
         if self.hierarchy is None:
-            alone = self.baseline
-            return alone is not None and alone.kind == "flat" and alone.policy.network == "linear"
-        if self.hierarchy.trunk is not None or any(level.trunk is not None for level in self.hierarchy.levels):
-            return False
-        networks = [network for level in self.hierarchy.levels for _, network in level.readers]
-        return all(network.network == "linear" for network in (*networks, self.hierarchy.meta_policy))
+            baseline = self.baseline
+            return baseline is not None and baseline.kind == "flat" and baseline.policy.network == "linear"
+        trunks = (self.hierarchy.trunk, *(level.trunk for level in self.hierarchy.levels))
+        networks = [network for level in self.hierarchy.levels for network in level.networks.values()]
+        return not any(trunks) and all(n.network == "linear" for n in (*networks, self.hierarchy.meta_policy))
 
-    @model_validator(mode="after")
-    def _consistent(self) -> Spec:
+    def problems(self) -> Problems:
         checks = (self._choices, self._baselines, self._observed, self._labelled, self._durations, self._segments)
-        problems = [problem for check in checks for problem in check()]
-        if problems or (problems := list(_grid_problems(self))):
-            raise invalid(*problems)
-        return self
+        return (problem for check in checks for problem in check())
 
-    def _choices(self) -> Iterator[tuple[str, str]]:
+    def _choices(self) -> Problems:
         if self.demonstrated_task is None and self.demonstrations.path is None:
             yield "task", "missing; name a task, or give a file in demonstrations.path"
         if self.hierarchy is None and self.baseline is None:
             yield "hierarchy", "missing; declare a hierarchy, or a baseline in its place"
         if self.hierarchy is not None and self.baseline is not None:
             yield "baseline", "stands beside hierarchy; keep one of the two (compare_with takes baselines to compare)"
-        alone = self.baseline
-        if alone and alone.kind == "flat_equal" and "hidden" not in alone.policy.model_fields_set:
+        baseline = self.baseline
+        if baseline and baseline.kind == "flat_equal" and "hidden" not in baseline.policy.model_fields_set:
             yield "baseline", "flat_equal takes its size from a hierarchy; list it in compare_with there, or say flat"
-        if alone and alone.optimizer:
+        if baseline and baseline.optimizer:
             yield "baseline.optimizer", "is for baselines in compare_with; give it in training.optimizer"
-        if alone and alone.std:
+        if baseline and baseline.std:
             yield "baseline.std", "is for baselines in compare_with; give it in control.std"
 
-    def _baselines(self) -> Iterator[tuple[str, str]]:
+    def _baselines(self) -> Problems:
         known = [level.name for level in self._levels]
         for number, baseline in enumerate(self.compare_with):
             place, optimizer = f"compare_with.{number}", baseline.optimizer
@@ -155,17 +146,15 @@ class Spec(Model):
         if self.compare_with and not self.demonstrations.validates:
             yield "compare_with", "needs held-out demonstrations to compare on; raise demonstrations.valid_fraction"
 
-    def _observed(self) -> Iterator[tuple[str, str]]:
+    def _observed(self) -> Problems:
         keys = [observation.key for observation in self.observations]
         for index, key in enumerate(keys):
             if key in keys[:index]:
                 yield f"observations.{index}.key", f"{key!r} is given twice; keep one"
         for index, observation in enumerate(self.observations):
             if self.training.optimizer.name == "em" and observation.augment and observation.augment.versions:
-                yield (
-                    f"observations.{index}.augment.versions",
-                    "em sees all demonstrations at once, as they are; leave it out",
-                )
+                text = "em sees all demonstrations at once, as they are; leave it out"
+                yield f"observations.{index}.augment.versions", text
         if not self.observed:
             yield "observations", f"{STEP} alone says nothing about the state; name an observation beside it"
         for key in dict.fromkeys(path.key for path in self.report.trajectory or ()):
@@ -174,7 +163,7 @@ class Spec(Model):
                 text = f"there is no observation {key!r}{nearest(key, self.observed)}; there is: {there}"
                 yield "report.trajectory", text
 
-    def _labelled(self) -> Iterator[tuple[str, str]]:
+    def _labelled(self) -> Problems:
         names, known = self.demonstrations.labels, [level.name for level in self._levels]
         if known and isinstance(names, tuple) and len(names) != len(known):
             text = f"must have a name for each of {len(known)} levels, or be one name for all, got {show([*names])}"
@@ -191,7 +180,7 @@ class Spec(Model):
             text = f"no policy selects the options of {name!r}; let the policies above emit options"
             yield "training.labels.level", text
 
-    def _durations(self) -> Iterator[tuple[str, str]]:
+    def _durations(self) -> Problems:
         duration, levels = self.training.duration, len(self._levels)
         if duration is None:
             return
@@ -200,7 +189,7 @@ class Spec(Model):
         elif isinstance(duration.mean, tuple) and len(duration.mean) != levels:
             yield "training.duration.mean", f"has {len(duration.mean)} numbers, but the number of levels is {levels}"
 
-    def _segments(self) -> Iterator[tuple[str, str]]:
+    def _segments(self) -> Problems:
         if self.training.upper_levels != "segments":
             return
         for number, emits in enumerate(self._emitted[1:], start=1):
@@ -223,7 +212,7 @@ def _no_level(name: str, known: list[str]) -> str:
     return f"there is no level {name!r}{nearest(name, known)}; there is: {', '.join(known)}"
 
 
-def _grid_problems(spec: Spec) -> Iterator[tuple[str, str]]:
+def _grid_problems(spec: Spec) -> Problems:
     """The problems of the spec with each single value of its grid."""
     data = _given(spec)
     for path, values in spec.selection.grid.items():

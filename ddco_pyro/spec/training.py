@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, get_args
 
-from pydantic import ConfigDict, Field, TypeAdapter, model_validator
+from pydantic import ConfigDict, Field
 
-from ddco_pyro.spec.base import Count, Items, Model, Positive, Seed, Share, Text, invalid, nested
+from ddco_pyro.spec.base import Count, Fraction, Items, Model, Positive, Problems, Seed, Share, Text, nested
 
 
 class RidgeSpec(Model):
@@ -46,11 +46,9 @@ class OptimizerSpec(Model):
     """L2 penalty; for ``adamw`` the decoupled weight decay: every weight shrinks by ``lr`` × this in a step.
     Models that ``em`` trains have ridges instead."""
 
-    @model_validator(mode="after")
-    def _momentum_has_its_optimizer(self) -> OptimizerSpec:
+    def problems(self) -> Problems:
         if self.name != "momentum" and self.momentum != type(self).model_fields["momentum"].default:
-            raise invalid(("momentum", f"is for name: momentum, and {self.name} does not use it; leave it out"))
-        return self
+            yield "momentum", f"is for name: momentum, and {self.name} does not use it; leave it out"
 
 
 class LabelsSpec(Model):
@@ -78,11 +76,7 @@ class DurationSpec(Model):
 
     mean: Annotated[
         Duration | Durations,
-        nested(
-            (list, tuple),
-            TypeAdapter(Durations, config=Model.model_config).validate_python,
-            "a number of steps, at least 1, or a list of them",
-        ),
+        nested((list, tuple), Durations, "a number of steps, at least 1, or a list of them"),
     ]
     """Mean duration of an option in steps, 1 / E[ψ]; a list has one number for each level, lowest first. Levels above
     the lowest count terminated options of the level below instead of steps."""
@@ -93,6 +87,7 @@ class DurationSpec(Model):
 
 Start = Literal["vq", "vq_controls", "equal_parts", "cuts", "mixture", "random"]
 Starts = Annotated[Items[Start], Field(min_length=1)]
+STARTS = get_args(Start)
 
 
 class TrainingSpec(Model):
@@ -100,12 +95,7 @@ class TrainingSpec(Model):
 
     initialize: Annotated[
         Start | Starts,
-        nested(
-            (list, tuple),
-            TypeAdapter(Starts, config=Model.model_config).validate_python,
-            f"one of {', '.join(map(repr, get_args(Start)))}, or a list of them",
-            get_args(Start),
-        ),
+        nested((list, tuple), Starts, f"one of {', '.join(map(repr, STARTS))}, or a list of them", STARTS),
     ] = "vq"
     """``vq``: vector quantisation of the observations that the options' policies read (SM 2.2). ``vq_controls``: vector
     quantisation of these observations and the controls. ``equal_parts``: each demonstration cut into k parts of equal
@@ -126,7 +116,7 @@ class TrainingSpec(Model):
     epochs: Count | None = 800
     """Budget of passes over the training demonstrations, all stages together; every model has the same budget. A stage
     may take an even share of the remaining budget. Null: no limit except ``patience``."""
-    average: Annotated[float, Field(gt=0, lt=1)] | None = None
+    average: Fraction | None = None
     """Decay per gradient step of an exponential moving average of the weights, which is evaluated and kept in place of
     the last weights; null: the last weights."""
     batch_size: Count = 16
@@ -169,16 +159,6 @@ class TrainingSpec(Model):
         given = self.optimizer.model_fields_set - {"ridge"} or {"average", "clip_gradient"} & self.model_fields_set
         return bool(given) and self.optimizer.name != "em"
 
-    @model_validator(mode="after")
-    def _em_has_no_gradient_steps(self) -> TrainingSpec:
-        if self.optimizer.name == "em":
-            unused = [name for name in ("average", "clip_gradient") if getattr(self, name) is not None]
-            unused += ["optimizer.warmup"] if self.optimizer.warmup else []
-            unused += ["optimizer.schedule"] if self.optimizer.schedule != "constant" else []
-            if unused:
-                raise invalid((unused[0], "em takes no gradient steps and would not use it; leave it out"))
-        return self
-
     def start(self, restart: int) -> Start:
         """The kind of initialisation that a restart begins from (``initialize``)."""
         kinds = self.starts
@@ -189,25 +169,23 @@ class TrainingSpec(Model):
         """The kinds of initialisation, one or more."""
         return self.initialize if isinstance(self.initialize, tuple) else (self.initialize,)
 
-    @model_validator(mode="after")
-    def _starts_apply(self) -> TrainingSpec:
+    def problems(self) -> Problems:
+        if self.optimizer.name == "em":
+            steps = self.optimizer
+            unused = {"average": self.average, "clip_gradient": self.clip_gradient, "optimizer.warmup": steps.warmup}
+            for key, value in (unused | {"optimizer.schedule": steps.schedule != "constant"}).items():
+                if value:
+                    yield key, "em takes no gradient steps and would not use it; leave it out"
         if len(self.starts) > self.restarts:
             text = f"has {len(self.starts)} kinds, but training.restarts is {self.restarts}; give as many restarts"
-            raise invalid(("initialize", text))
+            yield "initialize", text
         if "mixture" in self.starts and self.lower_levels == "frozen":
-            raise invalid(("lower_levels", "mixture trains all levels together in the end; say fine_tuned"))
-        return self
-
-    @model_validator(mode="after")
-    def _ends(self) -> TrainingSpec:
+            yield "lower_levels", "mixture trains all levels together in the end; say fine_tuned"
         if self.epochs is None and self.patience is None:
-            raise invalid(("epochs", "epochs and training.patience are both null; give one of them"))
+            yield "epochs", "epochs and training.patience are both null; give one of them"
         if self.epochs is None and self.optimizer.schedule == "cosine":
-            raise invalid(("optimizer.schedule", "cosine ends at training.epochs, which is null"))
+            yield "optimizer.schedule", "cosine ends at training.epochs, which is null"
         if self.upper_levels == "segments" and not self.layerwise:
-            raise invalid(("upper_levels", "segments needs the lowest level discovered first; say layerwise: true"))
+            yield "upper_levels", "segments needs the lowest level discovered first; say layerwise: true"
         if self.labels is not None and not self.labels.hold and "random" in self.starts:
-            raise invalid(
-                ("labels.hold", "false uses labels in initialisation alone, and that is random; say vq there")
-            )
-        return self
+            yield "labels.hold", "false uses labels in initialisation alone, and that is random; say vq there"
