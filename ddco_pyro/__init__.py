@@ -6,20 +6,24 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from ddco_pyro import encoding, inference
-    from ddco_pyro.acting.controller import Controller
-    from ddco_pyro.acting.monitor import Monitor
-    from ddco_pyro.cli.console import Progress
-    from ddco_pyro.comparison import compare
-    from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-    from ddco_pyro.estimator import OptionSegmenter
-    from ddco_pyro.exporting import export
-    from ddco_pyro.fitting.fit import fit
-    from ddco_pyro.fitting.fitted import Fit, load
-    from ddco_pyro.inference.marginal import EliminatedAHMM
-    from ddco_pyro.segmenting import segment
-    from ddco_pyro.selection import select
-    from ddco_pyro.spec import Spec, load_spec
+    from ddco_pyro import encoding as encoding
+    from ddco_pyro import inference as inference
+    from ddco_pyro.acting.controller import Controller as Controller
+    from ddco_pyro.acting.monitor import Monitor as Monitor
+    from ddco_pyro.cli.console import Progress as Progress
+    from ddco_pyro.comparison import compare as compare
+    from ddco_pyro.data.demonstrations import Demonstration as Demonstration
+    from ddco_pyro.data.demonstrations import Demonstrations as Demonstrations
+    from ddco_pyro.estimator import OptionSegmenter as OptionSegmenter
+    from ddco_pyro.exporting import export as export
+    from ddco_pyro.fitting.fit import fit as fit
+    from ddco_pyro.fitting.fitted import Fit as Fit
+    from ddco_pyro.fitting.fitted import load as load
+    from ddco_pyro.inference.marginal import EliminatedAHMM as EliminatedAHMM
+    from ddco_pyro.segmenting import segment as segment
+    from ddco_pyro.selection import select as select
+    from ddco_pyro.spec import Spec as Spec
+    from ddco_pyro.spec import load_spec as load_spec
 
 _PLACES = {
     "Controller": "acting.controller",
@@ -41,26 +45,7 @@ _PLACES = {
 }
 _ROOMS = ("encoding", "inference")
 
-__all__ = [
-    "Controller",
-    "Demonstration",
-    "Demonstrations",
-    "EliminatedAHMM",
-    "Fit",
-    "Monitor",
-    "OptionSegmenter",
-    "Progress",
-    "Spec",
-    "compare",
-    "encoding",
-    "export",
-    "fit",
-    "inference",
-    "load",
-    "load_spec",
-    "segment",
-    "select",
-]
+__all__ = [*_PLACES, *_ROOMS]
 
 
 def __getattr__(name: str) -> Any:

@@ -78,7 +78,7 @@ def main() -> None:
     with _interruptible():
         status = _run()
     if not ("ompl" in sys.modules or "--allow-code" in sys.argv):  # bindings may report what Python leaves
-        gc.freeze()  # so that it goes with the process
+        gc.freeze()  # a last search for garbage would take a second
     sys.exit(status)
 
 

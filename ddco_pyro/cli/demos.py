@@ -40,12 +40,10 @@ def collect(
     from ddco_pyro.cli import console
     from ddco_pyro.simulation.collect import collect as record
 
-    own = loaded.demonstrations.path
-    kept = out or (Path(own) if own else None)
-    check_outputs([Output("--out", kept, "file")] if kept else [], [spec])
+    file = out or loaded.demonstrations.file
+    check_outputs([Output("--out", file, "file")] if file else [], [spec])
     with console.Progress() as progress:
-        path = record(loaded.demonstrated_task, loaded.demonstrations, kept, progress, loaded.observed)
-    print(path)
+        print(record(loaded.demonstrated_task, loaded.demonstrations, file, progress, loaded.observed))
 
 
 def inspect(

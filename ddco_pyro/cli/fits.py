@@ -7,13 +7,12 @@ import sys
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ddco_pyro.cli import AllowCode, Overrides, RunPath, SpecPath, hint, out_folder, written
+from ddco_pyro.cli import AllowCode, Backend, Level, Overrides, RunPath, Scheduler, SpecPath, hint, out_folder, written
 from ddco_pyro.data.files import Output, check_outputs
 from ddco_pyro.errors import BadInput, Failed, command
 from ddco_pyro.events import Event
@@ -28,22 +27,6 @@ if TYPE_CHECKING:
 
 TRAINING = ("ddco_pyro.fitting.fit", "sklearn.cluster")
 """Modules of processes that train."""
-
-
-class Backend(StrEnum):
-    """Where ``select`` trains folds, and ``study`` does cells."""
-
-    LOKY = "loky"
-    DASK = "dask"
-
-    def workers(self, jobs: int, scheduler: str | None) -> Workers:
-        """The processes that the options ask for.
-
-        :raises BadInput: options contradict each other, or ``jobs`` is not a number of processes.
-        """
-        if (self is Backend.DASK) != (scheduler is not None):
-            raise BadInput("--backend dask and --scheduler tcp://HOST:PORT go together; give both or neither")
-        return Workers(jobs, scheduler)
 
 
 def check(
@@ -211,7 +194,7 @@ def select(
     resume: Annotated[bool, typer.Option("--resume", help="Continue the unfinished selection in --out.")] = False,
     stop_early: Annotated[bool, typer.Option("--stop-early", help="Give hopeless candidates up.")] = False,
     backend: Annotated[Backend, typer.Option(help="Where folds are trained: loky (here) or dask.")] = Backend.LOKY,
-    scheduler: Annotated[str | None, typer.Option(help="Address of the dask scheduler, tcp://HOST:PORT.")] = None,
+    scheduler: Scheduler = None,
     allow_code: AllowCode = False,
 ) -> None:
     """Choose among the candidates of the spec's grid by cross-validation; then fit the chosen one to all the data.
@@ -257,7 +240,7 @@ def merge(
         tuple[int, int] | None,
         typer.Option(help="Numbers of the two options; by default those that act most alike.", show_default=False),
     ] = None,
-    level: Annotated[str | None, typer.Option(help="Name of their level; by default the lowest.")] = None,
+    level: Level = None,
     out: Annotated[Path | None, written(out_folder, "The run folder; by default RUN-merged.")] = None,
     jobs: Annotated[int, typer.Option(help="Processes that train restarts; -1 is one for each core.")] = -1,
     allow_code: AllowCode = False,
@@ -288,8 +271,8 @@ def merge(
 
 def _check_folder(folder: Path, spec: Path, loaded: Spec) -> None:
     """Check that the folder of a fit or a selection may be written."""
-    own = loaded.demonstrations.path
-    check_outputs([Output("--out", folder, "folder")], [spec, *([Path(own)] if own else [])])
+    file = loaded.demonstrations.file
+    check_outputs([Output("--out", folder, "folder")], [spec, *([file] if file else [])])
 
 
 @contextmanager

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import typer
 
-from ddco_pyro.cli import BRACKET, AllowCode, AllowExternal, Overrides, RunPath, out_file, out_folder, written
+from ddco_pyro.cli import BRACKET, AllowCode, AllowExternal, Level, Overrides, RunPath, out_file, out_folder, written
 from ddco_pyro.data.files import Output, check_outputs
 from ddco_pyro.errors import BadInput, command
 
@@ -102,7 +102,7 @@ def name(
         str | None,
         typer.Argument(metavar="[NAMES]", help="The names of options 1 to k, with commas between.", show_default=False),
     ] = None,
-    level: Annotated[str | None, typer.Option(help="Name of their level; by default the lowest.")] = None,
+    level: Level = None,
     allow_code: AllowCode = False,
 ) -> None:
     """Name the options of a level in RUN/names.yaml; without NAMES, show the options with their shares and lengths."""
@@ -118,8 +118,7 @@ def name(
         raise BadInput(f"{run}: has no {f'level {level!r}' if fitted.names else 'options'}; name another")
     console.show(use_table(fitted, [level] if level else None))
     if names is not None:
-        allowed = ["--allow-code"] if allow_code else []
-        print(f"{run / 'names.yaml'}: show them with: {command('report', run, *allowed)}")
+        print(f"{run / 'names.yaml'}: show them with: {command('report', run, *['--allow-code'] * allow_code)}")
 
 
 def _check_run(run: Path, *names: str) -> None:
@@ -328,8 +327,8 @@ def _writer(place: Output, asked: Asked, settings: Mapping[str, Any]) -> Writer:
     except ModuleNotFoundError as error:
         raise BadInput(f"{place.option} needs {error.name}; install it with: pip install {error.name}") from None
     more = {option.name: settings[option.name] for option in form.more}
-    made: Writer = getattr(found, kind)(place.option, place.path, asked, **more)
-    return made
+    writer: Writer = getattr(found, kind)(place.option, place.path, asked, **more)
+    return writer
 
 
 def _missing_labels(fit: Fit, source: Source) -> str:

@@ -9,8 +9,7 @@ from typing import Annotated
 
 import typer
 
-from ddco_pyro.cli import AllowCode, out_folder, written
-from ddco_pyro.cli.fits import Backend
+from ddco_pyro.cli import AllowCode, Backend, Scheduler, out_folder, written
 from ddco_pyro.data.files import Output, check_outputs, write_text
 from ddco_pyro.errors import BadInput, Failed, command
 
@@ -41,7 +40,7 @@ def study(
     studies: Annotated[Path, typer.Option(help="The folder of the studies that render quotes.")] = Path("studies"),
     jobs: Annotated[int, typer.Option(help="Processes that do cells; -1 is one for each core.")] = -1,
     backend: Annotated[Backend, typer.Option(help="Where cells are done: loky (here) or dask.")] = Backend.LOKY,
-    scheduler: Annotated[str | None, typer.Option(help="Address of the dask scheduler, tcp://HOST:PORT.")] = None,
+    scheduler: Scheduler = None,
     check: Annotated[
         bool, typer.Option("--check", help="With render: change nothing, and fail if a page differs.")
     ] = False,
@@ -63,8 +62,8 @@ def study(
     from ddco_pyro.study.cells import Folder
     from ddco_pyro.study.declaration import Study
 
-    found = Study.load(files[0], allow_code)
-    folder = Folder(found, out or Path("runs/studies") / found.name)
+    declared = Study.load(files[0], allow_code)
+    folder = Folder(declared, out or Path("runs/studies") / declared.name)
     check_outputs([Output("--out", folder.path, "folder")], [files[0]])
     if action is Action.RUN:
         workers.check()

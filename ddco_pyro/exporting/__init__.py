@@ -63,12 +63,20 @@ def export(fit: Fit, folder: str | Path, onnx: bool = False) -> Exported:
     folder = Path(folder)
     if folder.exists() and not folder.is_dir():
         raise BadInput(f"{folder}: is a file; choose another --out")
-    others = sorted(path.name for path in folder.iterdir() if path.name not in FILES) if folder.exists() else []
-    if others:
-        raise BadInput(f"{folder}: holds what was not exported, such as {others[0]}; choose another --out")
+    refuse_others(folder, FILES, "--out")
     with whole_folder(folder) as temporary:
         forms = _write(fit, temporary, onnx)
         return _compare(temporary, forms)
+
+
+def refuse_others(folder: Path, names: set[str], option: str) -> None:
+    """Refuse to replace a folder.
+
+    :param names: of the files that an export writes.
+    :raises BadInput: the folder holds other files.
+    """
+    if folder.exists() and (others := sorted({path.name for path in folder.iterdir()} - names)):
+        raise BadInput(f"{folder}: holds what was not exported, such as {others[0]}; choose another {option}")
 
 
 def write_numpy(fit: Fit, folder: Path) -> bool:
@@ -109,8 +117,7 @@ def _write(fit: Fit, folder: Path, onnx: bool) -> list[str]:
 
 def _compare(folder: Path, forms: list[str]) -> Exported:
     """Replay the recorded episodes with each form in the folder."""
-    with np.load(folder / "check.npz") as file:
-        episodes = {name: file[name] for name in file.files}
+    episodes = runner.read_arrays(folder / "check.npz")
     allowed = float(episodes["tolerance"])
     replayed = {}
     for form in forms:

@@ -110,23 +110,15 @@ def _networks(hierarchy: Hierarchy) -> tuple[dict[str, Any], Arrays]:
     networks |= {f"trunk_{number}": level.trunk for number, level in enumerate(levels) if level.trunk is not None}
     networks |= {} if hierarchy.trunk is None else {"trunk": hierarchy.trunk}
     forms = {name: form for name, network in networks.items() if (form := network.numpy_form()) is not None}
-    facts = {name: about for name, (about, _) in forms.items()}
-    arrays |= {f"{name}.{key}": array for name, (_, each) in forms.items() for key, array in each.items()}
+    for name, (_, parameters) in forms.items():
+        arrays |= {f"{name}.{key}": array for key, array in parameters.items()}
     callers = [
         {
-            "network": facts.get(f"caller_{number}"),
             "logits": caller.sizes[0],
             "choices": caller.options,
             "hybrid": caller.emits_control and caller.emits_options,
         }
-        for number, caller in enumerate(hierarchy.callers())
+        for caller in hierarchy.callers()
     ]
-    terminations = [facts.get(f"end_{number}") for number in range(len(levels))]
-    trunks = [facts.get(f"trunk_{number}") for number in range(len(levels))]
-    return {
-        "callers": callers,
-        "terminations": terminations,
-        "trunks": trunks,
-        "trunk": facts.get("trunk"),
-        "numpy": len(forms) == len(networks),
-    }, arrays
+    facts = {name: about for name, (about, _) in forms.items()}
+    return {"networks": facts, "callers": callers, "numpy": len(forms) == len(networks)}, arrays

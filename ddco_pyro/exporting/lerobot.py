@@ -11,7 +11,8 @@ from safetensors.numpy import save_file
 
 from ddco_pyro.data.files import whole_folder, write_text
 from ddco_pyro.errors import BadInput
-from ddco_pyro.exporting import write_numpy
+from ddco_pyro.exporting import refuse_others, write_numpy
+from ddco_pyro.exporting.runner import read_arrays
 from ddco_pyro.fitting.fitted import Fit
 
 FILES = {"config.json", "model.safetensors", "policy_preprocessor.json", "policy_postprocessor.json"}
@@ -25,14 +26,13 @@ def export_policy(fit: Fit, folder: Path) -> None:
 
     :raises BadInput: numpy cannot evaluate the networks, or the folder holds other files.
     """
-    if folder.exists() and (others := sorted({path.name for path in folder.iterdir()} - FILES)):
-        raise BadInput(f"{folder}: holds what was not exported, such as {others[0]}; choose another --lerobot")
+    refuse_others(folder, FILES, "--lerobot")
     with tempfile.TemporaryDirectory() as made:
         if not write_numpy(fit, Path(made)):
             raise BadInput(f"{fit.place}: has networks that numpy cannot evaluate; export with --out, for torch")
         about = json.loads((Path(made) / "controller.json").read_text(encoding="utf-8"))
-        with np.load(Path(made) / "weights.npz", allow_pickle=False) as file:
-            weights = {name.replace(".", "/"): np.ascontiguousarray(file[name]) for name in file.files}
+        arrays = read_arrays(Path(made) / "weights.npz")
+    weights = {name.replace(".", "/"): np.ascontiguousarray(array) for name, array in arrays.items()}
     step = about["step"] and about["step"]["key"]
     inputs = {
         "observation." + spec["key"].replace("/", "."): {
@@ -57,5 +57,5 @@ def export_policy(fit: Fit, folder: Path) -> None:
     with whole_folder(folder) as temporary:
         save_file(weights, temporary / "model.safetensors")
         write_text(temporary / "config.json", json.dumps(config, indent=4) + "\n")
-        for name, each in steps.items():
-            write_text(temporary / f"{name}.json", json.dumps({"name": name, "steps": each}, indent=2) + "\n")
+        for name, processors in steps.items():
+            write_text(temporary / f"{name}.json", json.dumps({"name": name, "steps": processors}, indent=2) + "\n")

@@ -10,19 +10,18 @@ from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.outputs import Outputs
 
 
-def named(said: Outputs) -> dict[str, Tensor]:
+def named(outputs: Outputs) -> dict[str, Tensor]:
     """Network outputs by the names of the runner, each [N, T, ...].
 
     ``selection_d``: log-probabilities [K, 1 + k]. ``control_d``: the numbers of the control [K, size]. Both belong to
     the callers of level d, of which the last is the meta-policy. ``termination_d``: ψ [k].
     """
-    outputs = {}
-    for level, caller in enumerate(said.callers):
-        if caller.selection is not None:
-            outputs[f"selection_{level}"] = caller.selection
-        if caller.numbers is not None:
-            outputs[f"control_{level}"] = caller.numbers
-    return outputs | {f"termination_{d}": log[..., 1].double().exp() for d, log in enumerate(said.termination)}
+    tensors: dict[str, Tensor | None] = {
+        f"termination_{d}": log[..., 1].double().exp() for d, log in enumerate(outputs.termination)
+    }
+    for level, caller in enumerate(outputs.callers):
+        tensors |= {f"selection_{level}": caller.selection, f"control_{level}": caller.numbers}
+    return {name: tensor for name, tensor in tensors.items() if tensor is not None}
 
 
 class StepProgram(nn.Module):
@@ -46,9 +45,9 @@ class StepProgram(nn.Module):
         states = {name: tuple(next(tensors) for _ in state) for name, state in self.state.items()}
         vectors = self.hierarchy.encoder.standardized(features.reshape(1, 1, -1))
         pictures = {key: image.reshape(1, 1, *image.shape) for key, image in zip(self.keys, images, strict=True)}
-        said, states = self.hierarchy.advance(Inputs(vectors, pictures, step), states)
-        outputs = {name: values[0, 0] for name, values in named(said).items()}
-        return outputs, [tensor for state in states.values() for tensor in state]
+        outputs, states = self.hierarchy.advance(Inputs(vectors, pictures, step), states)
+        at_step = {name: values[0, 0] for name, values in named(outputs).items()}
+        return at_step, [tensor for state in states.values() for tensor in state]
 
     def forward(self, features: Tensor, step: Tensor, *rest: Tensor) -> tuple[Tensor, ...]:
         """The outputs, in the order of ``names``, and the next state."""

@@ -51,8 +51,8 @@ def record(controller: Controller, hierarchy: Hierarchy) -> dict[str, np.ndarray
         arrays |= {f"observation_{episode}_{key}": obs for key, obs in seen.items()}
         arrays[f"controls_{episode}"] = np.stack([control for control, _ in acted])
         arrays[f"choices_{episode}"] = np.array([choices for _, choices in acted], dtype=int).reshape(steps, -1)
-        said = _said(hierarchy, hierarchy.encoder.inputs([seen]))
-        arrays |= {f"{name}_{episode}": values for name, values in said.items()}
+        outputs = _at_once(hierarchy, hierarchy.encoder.inputs([seen]))
+        arrays |= {f"{name}_{episode}": values for name, values in outputs.items()}
     return arrays
 
 
@@ -68,59 +68,56 @@ def tolerance(hierarchy: Hierarchy, episodes: Mapping[str, np.ndarray]) -> float
         inputs = hierarchy.encoder.inputs([runner.seen(episodes, number)])
         vectors = {key: vector.double() for key, vector in inputs.vectors.items()}
         try:
-            said = _said(exact, replace(inputs, vectors=vectors))
+            outputs = _at_once(exact, replace(inputs, vectors=vectors))
         except RuntimeError:  # torch does not mix types
             return runner.TOLERANCE
-        recorded = {name: episodes[f"{name}_{number}"] for name in said}
-        for rounded in (recorded, _said_stepwise(hierarchy, inputs)):
-            largest = max(largest, *(runner.difference({}, name, rounded[name], said[name]) for name in said))
+        recorded = {name: episodes[f"{name}_{number}"] for name in outputs}
+        for rounded in (recorded, _stepwise(hierarchy, inputs)):
+            largest = max(largest, *(runner.difference({}, name, rounded[name], outputs[name]) for name in outputs))
     return float(np.clip(ROUNDINGS * largest, runner.TOLERANCE, MOST))
 
 
-def _said(hierarchy: Hierarchy, inputs: Inputs) -> runner.Outputs:
+def _at_once(hierarchy: Hierarchy, inputs: Inputs) -> runner.Outputs:
     """The outputs at every step, [T, ...], from one pass over the episode, as in training."""
     with torch.no_grad():
         return _arrays(hierarchy(inputs))
 
 
-def _said_stepwise(hierarchy: Hierarchy, inputs: Inputs) -> runner.Outputs:
+def _stepwise(hierarchy: Hierarchy, inputs: Inputs) -> runner.Outputs:
     """The outputs at every step, [T, ...], from one call for each step, as in a controller."""
-    each: list[runner.Outputs] = []
+    steps: list[runner.Outputs] = []
     states: States | None = None
     with torch.no_grad():
         for step in inputs.chunks(1):
-            said, states = hierarchy.advance(step, states)
-            each.append(_arrays(said))
-    return {name: np.concatenate([one[name] for one in each]) for name in each[0]}
+            outputs, states = hierarchy.advance(step, states)
+            steps.append(_arrays(outputs))
+    return {name: np.concatenate([step[name] for step in steps]) for name in steps[0]}
 
 
-def _arrays(said: Outputs) -> runner.Outputs:
+def _arrays(outputs: Outputs) -> runner.Outputs:
     """The outputs for one episode by the runner's names, [T, ...]."""
-    return {name: values[0].numpy() for name, values in named(said).items()}
+    return {name: values[0].numpy() for name, values in named(outputs).items()}
 
 
 def _episode(encoder: ObservationEncoder, steps: int, random: np.random.Generator) -> dict[str, np.ndarray]:
     """Random observations with the mean and spread of the training data, and of its differences where they are used."""
     observations: dict[str, np.ndarray] = {}
-    at = 0
-    for spec, size in zip(encoder.specs, encoder.sizes, strict=True):
+    ends = np.cumsum(encoder.sizes)[:-1]
+    means, stds = np.split(encoder.mean.numpy(), ends), np.split(encoder.std.numpy(), ends)
+    for spec, mean, std in zip(encoder.specs, means, stds, strict=True):
         if spec.key == STEP:
-            at += size
             continue
         shape = encoder.shapes[spec.key]
-        mean, std = (statistic[at : at + size].numpy() for statistic in (encoder.mean, encoder.std))
         length = int(np.prod(shape))
         if spec.angles or spec.quaternions:
             observations[spec.key] = _turning(spec, mean, std, random, (steps, *shape))
-            at += size
             continue
         values = mean[:length] + std[:length] * random.normal(size=(steps, length))
         if spec.differences:
-            own = slice(length, 2 * length)
-            differences = mean[own] + std[own] * random.normal(size=values.shape)
+            behind = slice(length, 2 * length)
+            differences = mean[behind] + std[behind] * random.normal(size=values.shape)
             values = _walk(values[0], differences, mean[:length], std[:length])
         observations[spec.key] = values.reshape(steps, *shape)
-        at += size
     return observations | {key: _pictures(steps, encoder.shapes[key], random) for key in encoder.images}
 
 
@@ -130,8 +127,8 @@ def _turning(
     """Random observations [T, ...] of this shape: angles of a turn, unit quaternions, other numbers as in training."""
     values = random.uniform(-np.pi, np.pi, (shape[0], int(np.prod(shape[1:]))))
     quaternions = [[first + place for place in range(4)] for first in spec.quaternions]
-    for own in quaternions:
-        values[:, own] /= np.linalg.norm(values[:, own], axis=1, keepdims=True)
+    for four in quaternions:
+        values[:, four] /= np.linalg.norm(values[:, four], axis=1, keepdims=True)
     rest = np.delete(np.arange(values.shape[1]), [*spec.angles, *np.ravel(quaternions).astype(int)])
     values[:, rest] = mean[: len(rest)] + std[: len(rest)] * random.normal(size=(shape[0], len(rest)))
     return values.reshape(shape)

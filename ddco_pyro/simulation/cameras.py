@@ -56,8 +56,9 @@ class Encoded:
         return specs.Array((self.features,), np.float32, name)
 
 
-class Watched(dm_env.Environment):
-    """An environment with the pictures of ``cameras`` as further observations."""
+@dm_env.Environment.register
+class Watched:
+    """A dm_env environment with the pictures of ``cameras`` as further observations."""
 
     def __init__(self, environment: dm_env.Environment, cameras: Mapping[str, Camera | Encoded]) -> None:
         self._environment, self._cameras = environment, dict(cameras)
@@ -81,19 +82,3 @@ class Watched(dm_env.Environment):
         """The spec of each observation."""
         pictures = {name: camera.spec(name) for name, camera in self._cameras.items()}
         return {**self._environment.observation_spec(), **pictures}
-
-    def action_spec(self) -> Any:
-        """See the wrapped environment."""
-        return self._environment.action_spec()
-
-    def reward_spec(self) -> Any:
-        """See the wrapped environment."""
-        return self._environment.reward_spec()
-
-    def discount_spec(self) -> Any:
-        """See the wrapped environment."""
-        return self._environment.discount_spec()
-
-    def close(self) -> None:
-        """End the simulation."""
-        self._environment.close()

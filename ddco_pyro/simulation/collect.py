@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +22,9 @@ from ddco_pyro.spec import DemonstrationsSpec
 
 def cache_folder() -> Path:
     """``$DDCO_PYRO_CACHE``, or ``ddco-pyro`` in the user's cache folder."""
-    own = os.environ.get("DDCO_PYRO_CACHE")
-    general = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(own) if own else Path(general) / "ddco-pyro"
+    if folder := os.environ.get("DDCO_PYRO_CACHE"):
+        return Path(folder)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ddco-pyro"
 
 
 SIMULATORS = ("mujoco", "dm-control")
@@ -85,8 +85,8 @@ def collect(
         if parts is None:
             return path
         seeds = range(spec.seed + len(parts.done), spec.seed + spec.count)
-        for some in _slices(seeds, at_once):
-            for episode in run_episodes(task_name, spec.supervisor, some, observed=observed):
+        for first in range(0, len(seeds), at_once):
+            for episode in run_episodes(task_name, spec.supervisor, seeds[first : first + at_once], observed=observed):
                 parts.add(episode.record.recording())
                 on_event(DemonstrationsDone(len(parts.done), spec.count))
         attributes = {"task": task.name, "policy": spec.supervisor, "supervisor": json.dumps(_summary(task, parts))}
@@ -106,10 +106,6 @@ def _refuse_others(path: Path, task: Task, spec: DemonstrationsSpec) -> None:
             raise BadInput(
                 f"{path}: is there already and does not hold these demonstrations; choose another --out or remove it"
             )
-
-
-def _slices(seeds: Sequence[int], size: int) -> Iterator[Sequence[int]]:
-    return (seeds[first : first + size] for first in range(0, len(seeds), size))
 
 
 def _summary(task: Task, parts: Parts) -> dict[str, Any]:

@@ -124,10 +124,12 @@ def _run(
         policies.reset_all(seeds)
         steps = [environment.reset() for environment in environments]
         logs = [_Log() for _ in seeds]
-        while not all(step.last() for step in steps):
+        while True:
             if film:
                 for log, environment in zip(logs, environments, strict=True):
                     log.frames.append(task.frame(environment))
+            if all(step.last() for step in steps):
+                break
             controls = policies.act_all([step.observation for step in steps])
             intended = getattr(policies, "all_intended", controls)
             annotations = getattr(policies, "all_annotations", [{}] * len(seeds))
@@ -135,9 +137,6 @@ def _run(
                 if not step.last():
                     logs[n].add(step.observation, keep, intended[n], policies.all_choices[n], annotations[n])
                     steps[n] = environments[n].step(controls[n])
-        if film:
-            for log, environment in zip(logs, environments, strict=True):
-                log.frames.append(task.frame(environment))
         outcomes = [task.measured(environment) for environment in environments]
     finally:
         for environment in environments:
@@ -163,8 +162,8 @@ class _Log:
         choices: Sequence[int],
         labels: Mapping[str, int],
     ) -> None:
-        kept = observation.keys() if keep is None else observation.keys() & set(keep)
-        self.observations.append({key: np.array(observation[key]) for key in kept})
+        keys = observation.keys() if keep is None else observation.keys() & set(keep)
+        self.observations.append({key: np.array(observation[key]) for key in keys})
         self.controls.append(np.array(control, dtype=np.float64))
         self.choices.append(np.array(choices, dtype=int))
         self.labels.append(dict(labels))
@@ -172,9 +171,9 @@ class _Log:
     def episode(self, seed: int, outcome: dict[str, float]) -> Episode:
         record = Demonstration(
             name=f"demo_{seed}",
-            observations={key: np.stack([each[key] for each in self.observations]) for key in self.observations[0]},
+            observations={key: np.stack([step[key] for step in self.observations]) for key in self.observations[0]},
             actions=np.stack(self.controls),
-            labels={key: np.array([each[key] for each in self.labels]) for key in self.labels[0]},
+            labels={key: np.array([step[key] for step in self.labels]) for key in self.labels[0]},
             attributes={"seed": seed, **outcome},
         )
         return Episode(seed, record, outcome, np.stack(self.choices), self.frames)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BeforeValidator, Field
@@ -51,6 +52,11 @@ class DemonstrationsSpec(Model):
     labels: Labels | None = None
     """Ground-truth labels in the file, with which discovered options are compared: one name for all levels, or a list
     with a name for each level, lowest first. Steps labelled −1 are ignored."""
+
+    @property
+    def file(self) -> Path | None:
+        """The HDF5 file; None where the spec names none."""
+        return Path(self.path) if self.path else None
 
     @property
     def validates(self) -> bool:

@@ -42,12 +42,12 @@ def dimensions(spec: Spec, demos: Demonstrations | None = None) -> Dimensions:
         size = Dimensions(shapes, environment.action_spec().shape[0], task.steps)
     finally:
         environment.close()
-    own = spec.demonstrations
-    collected = Path(own.path) if own.path else cache_path(task, spec.demonstrated_task, own, spec.observed)
-    if not collected.exists():
+    sought = spec.demonstrations
+    file = sought.file or cache_path(task, spec.demonstrated_task, sought, spec.observed)
+    if not file.exists():
         return size
-    known = Dimensions.of(Demonstrations.read(collected, (), (), own.exclude))
-    return replace(size, constant=known.constant, control=known.control)
+    collected = Dimensions.of(Demonstrations.read(file, (), (), sought.exclude))
+    return replace(size, constant=collected.constant, control=collected.control)
 
 
 def parts(spec: Spec, demos: Demonstrations) -> dict[str, Demonstrations]:
@@ -89,15 +89,15 @@ def refuse_unfit(spec: Spec, demos: Demonstrations) -> None:
         _, why = reading(observed.shape[1:], observed.dtype)
         if why:
             raise DemonstrationsError(f"obs/{key} {why}")
-    own = spec.training
-    if own.tune_fraction > 0 or own.optimizer.name != "em" or spec.compare_with:  # or one is enough
+    training = spec.training
+    if training.tune_fraction > 0 or training.optimizer.name != "em" or spec.compare_with:  # or one is enough
         check_trained(parts(spec, demos)["train"].names)
 
 
 def in_file(spec: Spec) -> bool:
     """Whether the demonstrations are read from a file; otherwise they are collected in a task."""
-    path = spec.demonstrations.path
-    return spec.demonstrated_task is None or (path is not None and Path(path).exists())
+    file = spec.demonstrations.file
+    return spec.demonstrated_task is None or (file is not None and file.exists())
 
 
 def known_demonstrations(spec: Spec) -> Demonstrations | None:
@@ -111,14 +111,12 @@ def demonstrations(spec: Spec, on_event: OnEvent = ignore) -> Demonstrations:
     :raises DemonstrationsError: the file is missing or damaged, lacks an observation or label that the spec names, or
         a fit to it takes more memory than is allowed.
     """
-    own = spec.demonstrations
-    if in_file(spec):
-        path = Path(str(own.path))
-    else:
-        kept = Path(own.path) if own.path else None
-        path = collect(str(spec.demonstrated_task), own, kept, on_event, spec.observed)
+    sought = spec.demonstrations
+    path = sought.file
+    if path is None or not in_file(spec):
+        path = collect(str(spec.demonstrated_task), sought, path, on_event, spec.observed)
     _refuse_what_cannot_be_read(spec, path)
-    return Demonstrations.read(path, spec.trained_with, _labels(spec), own.exclude)
+    return Demonstrations.read(path, spec.trained_with, _labels(spec), sought.exclude)
 
 
 def outline(spec: Spec) -> Demonstrations:
@@ -126,7 +124,8 @@ def outline(spec: Spec) -> Demonstrations:
 
     :raises DemonstrationsError: as :func:`demonstrations`, except for values of observations.
     """
-    path = Path(str(spec.demonstrations.path))
+    path = spec.demonstrations.file
+    assert path is not None  # the demonstrations are in a file
     _refuse_what_cannot_be_read(spec, path)
     controls = Demonstrations.read(path, (), _labels(spec), spec.demonstrations.exclude)
     with open_robomimic(path) as source:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.spec import LevelSpec, Spec, SpecError
+from ddco_pyro.spec import Spec, SpecError
 from ddco_pyro.training.data import parts, tuning_split
 from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.stages import Stage
@@ -42,21 +42,26 @@ class Labels:
 
         :raises SpecError: the demonstrations to train with have no labels, or there are more labels than options.
         """
-        own = spec.training.labels
-        if own is None or spec.hierarchy is None:
+        labels = spec.training.labels
+        if labels is None or spec.hierarchy is None:
             return None
-        number, level = next(item for item in enumerate(spec.hierarchy.levels, 1) if item[1].name == own.level)
-        used = (*train, *tune)[: own.count]
-        values = _known(demo.labels[own.source] for demo in used)
-        if not _known(demo.labels[own.source] for demo in used[: len(train)]):
+        number, level = next(item for item in enumerate(spec.hierarchy.levels, 1) if item[1].name == labels.level)
+        used = (*train, *tune)[: labels.count]
+        values = _distinct(demo.labels[labels.source] for demo in used)
+        if not _distinct(demo.labels[labels.source] for demo in used[: len(train)]):
             raise SpecError(
-                f"training.labels: labels/{own.source} is -1 at every step of the demonstrations to train with that "
+                f"training.labels: labels/{labels.source} is -1 at every step of the demonstrations to train with that "
                 "have labels; raise training.labels.count, or leave training.labels out"
             )
-        _refuse_too_many(own.source, values, level, number)
+        if len(values) > level.count:
+            raise SpecError(
+                f"training.labels: labels/{labels.source} has {len(values)} labels from 0 on "
+                f"({', '.join(map(str, values))}), but level {level.name!r} has {level.count} options; raise "
+                f"hierarchy.levels.{number - 1}.count, or say -1 for labels that are no option"
+            )
         names = tuple(demo.name for demo in used)
-        each = (choices(part, own.source, values, names) for part in (train, tune))
-        return cls(number, own.hold, values, names, *each)
+        options = (choices(part, labels.source, values, names) for part in (train, tune))
+        return cls(number, labels.hold, values, names, *options)
 
     def matter_in(self, stage: Stage) -> bool:
         """Whether a stage of training uses the labels."""
@@ -74,18 +79,9 @@ def used(spec: Spec, demos: Demonstrations) -> Labels | None:
     return Labels.of(spec, *tuning_split(spec, Dimensions.of(demos), parts(spec, demos)["train"]))
 
 
-def _known(labels: Any) -> tuple[int, ...]:
+def _distinct(labels: Iterable[np.ndarray]) -> tuple[int, ...]:
     """The distinct labels, sorted, without -1."""
     return tuple(sorted({int(value) for array in labels for value in np.unique(array) if value >= 0}))
-
-
-def _refuse_too_many(name: str, values: tuple[int, ...], level: LevelSpec, number: int) -> None:
-    if len(values) > level.count:
-        raise SpecError(
-            f"training.labels: labels/{name} has {len(values)} labels from 0 on ({', '.join(map(str, values))}), but "
-            f"level {level.name!r} has {level.count} options; raise hierarchy.levels.{number - 1}.count, or say -1 for "
-            "labels that are no option"
-        )
 
 
 def choices(demos: Demonstrations, name: str, values: tuple[int, ...], labelled: tuple[str, ...]) -> Tensor:

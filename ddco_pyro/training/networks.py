@@ -173,9 +173,9 @@ def check_models(spec: Spec, dimensions: Dimensions) -> dict[str, tuple[Spec, Hi
 def named_baselines(spec: Spec) -> dict[str, BaselineSpec]:
     """The spec's baselines (``compare_with``) by name, numbered from the second model of one name on."""
     names: dict[str, BaselineSpec] = {}
-    own = spec.baseline.name if spec.baseline else None
+    alone = spec.baseline.name if spec.baseline else None
     for baseline in spec.compare_with:
-        before = (baseline.name == own) + sum(other.name == baseline.name for other in names.values())
+        before = (baseline.name == alone) + sum(other.name == baseline.name for other in names.values())
         names[f"{baseline.name}_{before + 1}" if before else baseline.name] = baseline
     return names
 
@@ -187,8 +187,8 @@ def baseline_spec(spec: Spec, baseline: BaselineSpec, dimensions: Dimensions) ->
 
     :raises SpecError: the network of a ``flat_equal`` does not fit the observations.
     """
-    own = baseline.optimizer.model_dump(exclude_unset=True) if baseline.optimizer else {}
-    optimizer = {f"training.optimizer.{key}": value for key, value in own.items()}
+    settings = baseline.optimizer.model_dump(exclude_unset=True) if baseline.optimizer else {}
+    optimizer = {f"training.optimizer.{key}": value for key, value in settings.items()}
     model = baseline.model_dump(exclude_unset=True, exclude={"optimizer", "std"})
     std = baseline.std.model_dump(exclude_unset=True) if baseline.std else {}
     stds = {path: {"floor": old.floor} | std for path, old in spec.control.learned_stds.items() if std}

@@ -59,7 +59,7 @@ def learning_rate(spec: OptimizerSpec, epoch: int, cap: int | None) -> float:
 
 
 def _uncompiled(kind: type[torch.optim.Optimizer]) -> Callable[..., torch.optim.Optimizer]:
-    """The same optimiser without the decorators that import torch's compiler, which takes seconds."""
+    """The same optimiser without the decorators that import torch's compiler, which takes six CPU seconds."""
     names = ("add_param_group", "load_state_dict", "state_dict", "zero_grad")
     plain = {name: inspect.unwrap(getattr(kind, name)) for name in names}
     return type(kind.__name__, (kind,), {**plain, "step": torch.no_grad()(inspect.unwrap(kind.step))})
@@ -95,7 +95,7 @@ NOTHING = 1e-9
 """L-BFGS has converged where a step gains less, in nats per step of the demonstrations."""
 
 _LISTS = ("old_dirs", "old_stps", "ro")
-_KEPT = ("n_iter", "func_evals", "d", "t", "H_diag", "prev_flat_grad", "prev_loss")
+_NUMBERS = ("n_iter", "func_evals", "d", "t", "H_diag", "prev_flat_grad", "prev_loss")
 
 
 class QuasiNewton:
@@ -117,7 +117,7 @@ class QuasiNewton:
             tolerance_change=0.0, line_search_fn="strong_wolfe",
         )  # fmt: skip
         self._batch: Batch | None = None
-        self._known: list[tuple[Tensor, float, float, list[Tensor]]] = []
+        self._evaluated: list[tuple[Tensor, float, float, list[Tensor]]] = []
 
     def converged(self, roughly: bool = False) -> bool:
         """Whether the last step gained less than :data:`NOTHING`."""
@@ -132,42 +132,40 @@ class QuasiNewton:
         loss, value = self._evaluate()
         self._optimizer.step(lambda: self._evaluate()[0])
         self.gain = loss - self._evaluate()[0]
-        self._known = self._known[-1:]
+        self._evaluated = self._evaluated[-1:]
         self.model.load_state_dict(self._exact.state_dict())
         return value
 
     def _evaluate(self) -> tuple[float, float]:
-        """The loss, its gradient in the parameters, and the log-likelihood; what is known is not computed again."""
+        """The loss and the log-likelihood, with the gradient in the parameters; nothing is computed twice."""
         assert self._batch is not None  # a step has begun
         weights = nn.utils.parameters_to_vector(self._parameters).detach()
-        number = next((n for n, known in enumerate(self._known) if torch.equal(known[0], weights)), None)
-        if number is None:
+        evaluation = next((before for before in self._evaluated if torch.equal(before[0], weights)), None)
+        if evaluation is None:
             self._optimizer.zero_grad()
             with torch.enable_grad():
                 value = self._backward(self._exact, self._batch)
             gradients = [p.grad + self._decay * p.detach() for p in self._parameters if p.grad is not None]
             loss = 0.5 * self._decay * float(weights @ weights) - value / self._batch.steps
-            known = weights, loss, value, gradients
-        else:
-            known = self._known.pop(number)
-        self._known.append(known)
-        for parameter, gradient in zip(self._parameters, known[3], strict=True):
+            evaluation = weights, loss, value, gradients
+        self._evaluated = [before for before in self._evaluated if before is not evaluation] + [evaluation]
+        for parameter, gradient in zip(self._parameters, evaluation[3], strict=True):
             parameter.grad = gradient.clone()
-        return known[1], known[2]
+        return evaluation[1:3]
 
     def states(self) -> dict[str, Tensor]:
-        """What a checkpoint keeps: the weights in float64, and the optimiser's history."""
-        own = self._optimizer.state[self._parameters[0]]
-        lists = {name: torch.stack([torch.as_tensor(one) for one in own[name]]) for name in _LISTS if own.get(name)}
-        numbers = {name: torch.as_tensor(own[name]).clone() for name in _KEPT if own.get(name) is not None}
+        """For a checkpoint: the weights in float64, and the optimiser's history."""
+        history = self._optimizer.state[self._parameters[0]]
+        lists = {name: torch.stack([*map(torch.as_tensor, history[name])]) for name in _LISTS if history.get(name)}
+        numbers = {name: torch.as_tensor(history[name]).clone() for name in _NUMBERS if history.get(name) is not None}
         weights = nn.utils.parameters_to_vector(self._parameters).detach()
         return {"weights": weights, "gain": torch.tensor(self.gain).double(), **lists, **numbers}
 
     def load_states(self, states: Mapping[str, Tensor]) -> None:
-        """Go on from what :meth:`states` kept."""
+        """Go on from the :meth:`states` of a checkpoint."""
         nn.utils.vector_to_parameters(states["weights"], self._parameters)
         self.gain = float(states["gain"])
-        own = self._optimizer.state[self._parameters[0]]
-        own |= {name: list(states.get(name, ())) for name in _LISTS}
-        own |= {name: states[name].clone() for name in _KEPT if name in states}
-        own["n_iter"] = int(own["n_iter"])
+        history = self._optimizer.state[self._parameters[0]]
+        history |= {name: list(states.get(name, ())) for name in _LISTS}
+        history |= {name: states[name].clone() for name in _NUMBERS if name in states}
+        history["n_iter"] = int(history["n_iter"])

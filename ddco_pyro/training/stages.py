@@ -55,17 +55,17 @@ def plan(spec: Spec, depth: int, restart: int = 0) -> list[Stage]:
     layerwise = training.layerwise and not mixed
     together = training.upper_levels == "segments" and depth > 1 and not mixed
     for level in range(1, 2 if together else depth + 1):
-        own = _memoryless(level) if mixed else (f"levels.{level - 1}.",)
-        own = own if level > 1 else ("trunk.", *own)
+        networks = _memoryless(level) if mixed else (f"levels.{level - 1}.",)
+        networks = networks if level > 1 else ("trunk.", *networks)
         if kind != "random":
             name = f"{_CLAMPING[kind]}-{level}"
             if level == depth and not layerwise and _meta_policy_selects(spec):
-                trained = (*own, "meta_policy.")
+                trained = (*networks, "meta_policy.")
                 stages.append(Stage(name, None, level, trained, selecting=True, memoryless=mixed))
             else:
-                stages.append(Stage(name, level, level, own, memoryless=mixed))
+                stages.append(Stage(name, level, level, networks, memoryless=mixed))
         if layerwise:
-            stages.append(Stage(f"level-{level}", level, None, own))
+            stages.append(Stage(f"level-{level}", level, None, networks))
     if together:
         upper = (*(f"levels.{level}." for level in range(1, depth)), "meta_policy.")
         stages.append(Stage("segments", None, None, upper, from_constants=True))

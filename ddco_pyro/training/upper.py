@@ -121,11 +121,11 @@ def improved(pieces: Sequence[Piece], constants: Constants) -> tuple[float, Cons
     selected = [torch.full_like(table, PSEUDO) for table in constants.selection]
     ended = [torch.stack([PSEUDO * (psi < 1), torch.full_like(psi, PSEUDO)], -1) for psi in constants.termination]
     for tables, lengths in pieces:
-        found = fused.posteriors(constants.within(tables), lengths)
-        value += float(found.value.sum())
-        for total, counts in zip(selected, found.tables.selection, strict=True):
+        posterior = fused.posteriors(constants.within(tables), lengths)
+        value += float(posterior.value.sum())
+        for total, counts in zip(selected, posterior.tables.selection, strict=True):
             total += counts.sum((0, 1))[:, 1:]
-        for total, counts in zip(ended, found.tables.termination[1:], strict=True):
+        for total, counts in zip(ended, posterior.tables.termination[1:], strict=True):
             total += counts.sum((0, 1))
     selection = tuple(total / total.sum(-1, keepdim=True) for total in selected)
     return value, Constants(selection, tuple(total[:, 1] / total.sum(-1) for total in ended))

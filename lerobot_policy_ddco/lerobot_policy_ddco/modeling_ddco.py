@@ -14,14 +14,9 @@ from lerobot_policy_ddco.configuration_ddco import DDCOConfig
 from lerobot_policy_ddco.runner import NumpyNetworks, Runner
 
 
-class _Networks(NumpyNetworks):
-    def __init__(self, weights: dict[str, np.ndarray], about: dict[str, Any]) -> None:
-        self._weights, self._about, self._after = weights, about, []
-
-
 class _Controller(Runner):
     def __init__(self, weights: dict[str, np.ndarray], about: dict[str, Any], seed: int) -> None:
-        self.about, self._networks = about, _Networks(weights, about)
+        self.about, self._networks = about, NumpyNetworks(weights, about)
         self.reset(seed)
 
 
