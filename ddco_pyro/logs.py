@@ -13,6 +13,7 @@ import math
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
+from pkgutil import resolve_name
 from types import ModuleType
 from typing import Any, Protocol, Self
 
@@ -90,27 +91,22 @@ def find_log(name: str, allow_code: bool = False) -> MakeLog:
     """
     if name in LOGS:
         make, package = LOGS[name]
-        return partial(make, _imported(name, package))
-    module, colon, attribute = name.partition(":")
-    if not colon:
+        try:
+            return partial(make, importlib.import_module(package))
+        except ModuleNotFoundError:
+            extra = name.partition("-")[0]
+            raise BadInput(f"--log {name}: needs {extra}; install it with: pip install 'ddco-pyro[{extra}]'") from None
+    if ":" not in name:
         raise BadInput(
             f"--log: there is no log {name!r}{nearest(name, LOGS)}; there is: {', '.join(LOGS)}, module:Class"
         )
     if not allow_code:
         raise BadInput(f"--log {name}: would import user code; pass --allow-code if you trust it")
     try:
-        found: MakeLog = getattr(importlib.import_module(module), attribute)
+        make_log: MakeLog = resolve_name(name)
     except Exception as error:  # whatever the user's code raises
         raise BadInput(f"--log {name}: cannot be imported: {type(error).__name__}: {error}") from error
-    return found
-
-
-def _imported(name: str, package: str) -> ModuleType:
-    try:
-        return importlib.import_module(package)
-    except ModuleNotFoundError:
-        extra = name.partition("-")[0]
-        raise BadInput(f"--log {name}: needs {extra}; install it with: pip install 'ddco-pyro[{extra}]'") from None
+    return make_log
 
 
 class TensorBoard:

@@ -36,7 +36,7 @@ def test_a_registered_task_whose_packages_are_missing_is_one_line(monkeypatch):
     [
         ("no_such_module:task", "^task 'no_such_module:task' cannot be loaded: No module named 'no_such_module'$"),
         ("toy_task:missing", "^task 'toy_task:missing' cannot be loaded: .*has no attribute 'missing'$"),
-        (":task", "^task ':task' cannot be loaded: Empty module name$"),
+        (":task", "^task ':task' cannot be loaded: invalid format: ':task'$"),
         ("toy_task:SPEC", r"leads to a str, not to a ddco_pyro\.simulation\.task\.Task$"),
     ],
 )

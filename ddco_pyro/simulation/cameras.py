@@ -67,11 +67,9 @@ class Watched:
         return getattr(self._environment, name)
 
     def reset(self) -> dm_env.TimeStep:
-        """Begin an episode."""
         return self._seen(self._environment.reset())
 
     def step(self, action: Any) -> dm_env.TimeStep:
-        """One control step."""
         return self._seen(self._environment.step(action))
 
     def _seen(self, step: dm_env.TimeStep) -> dm_env.TimeStep:
@@ -79,6 +77,5 @@ class Watched:
         return step._replace(observation={**step.observation, **pictures})
 
     def observation_spec(self) -> dict[str, specs.Array]:
-        """The spec of each observation."""
         pictures = {name: camera.spec(name) for name, camera in self._cameras.items()}
         return {**self._environment.observation_spec(), **pictures}

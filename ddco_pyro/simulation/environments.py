@@ -72,7 +72,6 @@ class TaskEnvironment(gymnasium.Env[Observation, np.ndarray]):
         return self.task.frame(self._environment) if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
-        """End the simulation."""
         self._environment.close()
 
 

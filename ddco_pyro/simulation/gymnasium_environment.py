@@ -38,7 +38,6 @@ class GymnasiumEnvironment(dm_env.Environment):
         self._control = _spec(f"{id}: the action", self._actions)
 
     def reset(self) -> dm_env.TimeStep:
-        """Begin an episode."""
         observation, _ = self.gymnasium.reset(seed=self._seed)
         self.success, self.total = 0.0, 0.0
         return dm_env.restart(self._seen(observation))
@@ -62,7 +61,6 @@ class GymnasiumEnvironment(dm_env.Environment):
         return {name: np.asarray(named[name]).reshape(spec.shape) for name, spec in self._observations.items()}
 
     def observation_spec(self) -> dict[str, specs.BoundedArray]:
-        """The spec of each observation."""
         return self._observations
 
     def action_spec(self) -> specs.BoundedArray:
@@ -86,7 +84,6 @@ class GymnasiumEnvironment(dm_env.Environment):
         return np.asarray(picture, np.uint8)
 
     def close(self) -> None:
-        """End the simulation."""
         self.gymnasium.close()
 
 

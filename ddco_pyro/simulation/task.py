@@ -6,13 +6,13 @@ The library never imports a task. :func:`find_task` resolves an entry point of t
 
 from __future__ import annotations
 
-import importlib
 import importlib.metadata
 import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Literal, Protocol, get_args
 
 import numpy as np
@@ -185,14 +185,10 @@ def find_task(name: str) -> Task:
     """
     registered = {point.name: point for point in entry_points(group=TASKS)}
     if name not in registered and ":" not in name:
-        known = ", ".join(sorted(registered)) or "none"
-        raise UnknownTask(f"no task is registered as {name!r} (registered: {known}); module:name works too")
+        names = ", ".join(sorted(registered)) or "none"
+        raise UnknownTask(f"no task is registered as {name!r} (registered: {names}); module:name works too")
     try:
-        if name in registered:
-            task: Any = registered[name].load()
-        else:
-            module, _, attribute = name.partition(":")
-            task = getattr(importlib.import_module(module), attribute)
+        task: Any = registered[name].load() if name in registered else resolve_name(name)
     except Failed:  # such as missing OpenGL
         raise
     except ModuleNotFoundError as error:
