@@ -171,7 +171,7 @@ class OptionSegmenter(BaseEstimator):
         except SpecError as error:
             paths = {path: name for path, name in PARAMETERS.items() if path not in settings}
             problems = (problem.split(":", 1) for problem in error.problems)
-            raise SpecError(*(f"{paths.get(path, path)}:{said}" for path, said in problems)) from None
+            raise SpecError(*(f"{paths.get(path, path)}:{problem}" for path, problem in problems)) from None
 
     def _demonstrations(
         self, X: Arrays, U: Arrays | None, lengths: Sequence[int] | None, fitting: bool = False
@@ -210,12 +210,12 @@ class OptionSegmenter(BaseEstimator):
                     validate_data(self, rows, reset=fitting and number == 0, skip_check_array=True)
                 X = check_array(np.concatenate([np.asarray(rows) for rows in X]), dtype=np.float64, input_name="X")
                 if U is not None:
-                    each = [np.asarray(rows) for rows in U]
-                    if [len(rows) for rows in each] != lengths:
+                    controls = [np.asarray(rows) for rows in U]
+                    if [len(rows) for rows in controls] != lengths:
                         raise BadInput("X and U must be lists of sequences with equal numbers of steps")
                     for number, rows in enumerate(U):
                         self._check_controls(rows, fitting and number == 0)
-                    U = np.concatenate([rows[:, None] if rows.ndim == 1 else rows for rows in each])
+                    U = np.concatenate([rows[:, None] if rows.ndim == 1 else rows for rows in controls])
             else:
                 X = validate_data(self, X, reset=fitting, dtype=np.float64, ensure_min_samples=2 if fitting else 1)
                 self._check_controls(U, fitting)

@@ -150,13 +150,13 @@ class Monitor:
                 self._filter.update(emission)
             self._outputs, self._states = self.hierarchy.advance(inputs, self._states)
             self.belief = self._filter.predict(complete(self._outputs.tables(), ONE_STEP).steps()[0])
-        found = {}
-        for (level, own), choices in zip(self.names.items(), self.belief.choices, strict=True):
-            found[level] = dict(zip(own, choices[0].tolist(), strict=True))
+        probabilities = {}
+        for (level, names), choices in zip(self.names.items(), self.belief.choices, strict=True):
+            probabilities[level] = dict(zip(names, choices[0].tolist(), strict=True))
             option = int(choices[0].argmax())
             before, steps = self._active.get(level, (option, 0))
             self._active[level] = (option, steps + 1 if option == before else 1)
-        return found
+        return probabilities
 
     def _scaled(self, control: np.ndarray | None) -> Tensor:
         scaling = self.hierarchy.scaling

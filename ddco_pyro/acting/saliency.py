@@ -49,9 +49,10 @@ class Saliency:
             outputs, states = self.hierarchy.advance(Inputs(seen.vectors, images, seen.time), self._states)
             self._states = {name: tuple(part.detach() for part in state) for name, state in states.items()}
             level = next((number for number, choice in enumerate(choices) if choice), len(choices))
-            said = outputs.callers[level].numbers
-            assert said is not None  # the active caller emits the control
-            numbers = said[0, 0, choices[level] - 1 if level < len(choices) else 0, : self.hierarchy.scaling.numbers]
+            of_callers = outputs.callers[level].numbers
+            assert of_callers is not None  # the active caller emits the control
+            caller = choices[level] - 1 if level < len(choices) else 0
+            numbers = of_callers[0, 0, caller, : self.hierarchy.scaling.numbers]
             squared = {key: torch.zeros(image.shape[2:4]) for key, image in images.items()}
             for number in numbers:
                 slopes = torch.autograd.grad(number, [*images.values()], retain_graph=True, allow_unused=True)

@@ -77,8 +77,8 @@ class Clusters:
     def choices(self, batch: Batch) -> Tensor:
         """The cluster of each step, [N, T], 1 to k; 0 where there is padding."""
         choices = torch.zeros(batch.inputs.batch, dtype=torch.long)
-        each = [self._namer.predict(rows) for rows in _together(self._blocks(batch), self._most)]
-        choices[_alive(batch)] = torch.as_tensor(np.concatenate(each), dtype=torch.long) + 1
+        clusters = [self._namer.predict(rows) for rows in _together(self._blocks(batch), self._most)]
+        choices[_alive(batch)] = torch.as_tensor(np.concatenate(clusters), dtype=torch.long) + 1
         return choices
 
     def _blocks(self, batch: Batch) -> Iterator[np.ndarray]:
@@ -87,9 +87,9 @@ class Clusters:
             alone, first = batch.inputs.part(torch.tensor([row]), slice(0, length)), 0
             for inputs in alone.chunks(FRAMES_AT_ONCE if alone.images else length):
                 loaded = inputs.loaded()
-                given = loaded.select(self._read) if self._read else loaded
-                means = [block_means(image[0].cpu()) for image in given.images.values()]
-                seen = torch.cat([given.vector[0], *means], dim=-1).double().numpy()
+                read = loaded.select(self._read) if self._read else loaded
+                means = [block_means(image[0].cpu()) for image in read.images.values()]
+                seen = torch.cat([read.vector[0], *means], dim=-1).double().numpy()
                 last = first + len(seen)
                 yield joined(seen, batch.actions[row, first:last].double().numpy()) if self._controls else seen
                 first = last

@@ -86,8 +86,8 @@ def _distinct(labels: Iterable[np.ndarray]) -> tuple[int, ...]:
 
 def choices(demos: Demonstrations, name: str, values: tuple[int, ...], labelled: tuple[str, ...]) -> Tensor:
     """The option of each step, [N, T]; -1 where it is free, and past a demonstration's end."""
-    each = []
+    options = []
     for demo in demos:
         labels = demo.labels[name] if demo.name in labelled else np.full(len(demo), -1)
-        each.append(torch.as_tensor(np.where(labels >= 0, np.searchsorted(values, labels) + 1, -1)))
-    return pad_sequence(each, batch_first=True, padding_value=-1)
+        options.append(torch.as_tensor(np.where(labels >= 0, np.searchsorted(values, labels) + 1, -1)))
+    return pad_sequence(options, batch_first=True, padding_value=-1)

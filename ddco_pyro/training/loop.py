@@ -28,7 +28,8 @@ from ddco_pyro.events import EpochEnded, OnEvent, ignore
 from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.model.seeding import seed, seeded
+from ddco_pyro.model.seeding import seed as seed_generators
+from ddco_pyro.model.seeding import seeded
 from ddco_pyro.model.tables import Tables
 from ddco_pyro.training.checkpoint import Restart, State, TrainingData, copy_of
 from ddco_pyro.training.devices import device_of, repeatable
@@ -244,13 +245,13 @@ class StageTraining:
         """A minibatch in parts as equal as they can be, none of them empty."""
         return rows.tensor_split(min(self.spec.shards, len(rows)))
 
-    def _shard(self, batch: Batch, rows: Tensor, own: int, steps: int) -> tuple[float, Gradients]:
-        """What a shard adds to what is maximised, and to the gradient of each parameter.
+    def _shard(self, batch: Batch, rows: Tensor, seed: int, steps: int) -> tuple[float, Gradients]:
+        """The part of a shard in the objective, and in the gradient of each parameter.
 
-        :param own: the seed of the shard's random numbers.
+        :param seed: of the shard's random numbers.
         """
         self.optimizer.zero_grad()
-        seed(own, self.model.device)
+        seed_generators(seed, self.model.device)
         value = backward(self.objective, self.model, batch, rows, steps)
         return value, [None if p.grad is None else p.grad.cpu().numpy() for p in self.parameters]
 
