@@ -102,8 +102,9 @@ def _arrays(outputs: Outputs) -> runner.Outputs:
 def _episode(encoder: ObservationEncoder, steps: int, random: np.random.Generator) -> dict[str, np.ndarray]:
     """Random observations with the mean and spread of the training data, and of its differences where they are used."""
     observations: dict[str, np.ndarray] = {}
-    ends = np.cumsum(encoder.sizes)[:-1]
-    means, stds = np.split(encoder.mean.numpy(), ends), np.split(encoder.std.numpy(), ends)
+    means, stds = (
+        (part.numpy() for part in statistic.split(encoder.sizes)) for statistic in (encoder.mean, encoder.std)
+    )
     for spec, mean, std in zip(encoder.specs, means, stds, strict=True):
         if spec.key == STEP:
             continue
