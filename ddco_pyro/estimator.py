@@ -257,7 +257,7 @@ def _dimensions(values: Any) -> int:
 def _drawn(random_state: Any) -> int:
     """A seed drawn from a random state.
 
-    :raises BadInput: it is none.
+    :raises BadInput: ``random_state`` is no random state.
     """
     try:
         return int(check_random_state(random_state).randint(SEEDS))

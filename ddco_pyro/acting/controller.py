@@ -27,7 +27,7 @@ ControlExecution = Literal["mean", "sample"]
 def fitted(hierarchy: Hierarchy) -> Hierarchy:
     """The networks of a fit, for acting.
 
-    :raises BadInput: it is something else.
+    :raises BadInput: ``hierarchy`` is something else.
     """
     if not isinstance(hierarchy, Hierarchy):
         raise BadInput(f"a {type(hierarchy).__name__} in place of networks: give fit.hierarchy")

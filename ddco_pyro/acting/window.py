@@ -72,7 +72,7 @@ def numbers(what: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
     """An array of finite real numbers.
 
     :param what: the name of the value in errors.
-    :raises ObservationError: it is something else, or has another shape.
+    :raises ObservationError: the value is something else, or has another shape.
     """
     try:
         array = np.asarray(value)

@@ -26,7 +26,7 @@ _goes_on: ContextVar[bool] = ContextVar("goes_on", default=False)
 
 @contextmanager
 def going_on() -> Iterator[None]:
-    """Inside, a command that calls others goes on itself: they do not say what to do next."""
+    """Inside, a command calls others and goes on by itself: these name no next step."""
     token = _goes_on.set(True)
     try:
         yield
@@ -35,14 +35,14 @@ def going_on() -> Iterator[None]:
 
 
 def hint(text: str) -> str:
-    """What to do next, in words; empty where that is done anyway (:func:`going_on`)."""
+    """The next step, in words; empty where a command takes the step itself (:func:`going_on`)."""
     return "" if _goes_on.get() else text
 
 
 def out_file(text: str | os.PathLike[str]) -> Path:
     """The name of a file to write.
 
-    :raises typer.BadParameter: it is empty, or that of a folder.
+    :raises typer.BadParameter: the name is empty, or that of a folder.
     """
     name = os.fspath(text)
     if name.endswith(os.sep) or (name and not Path(name).name):
@@ -53,7 +53,7 @@ def out_file(text: str | os.PathLike[str]) -> Path:
 def out_folder(text: str | os.PathLike[str]) -> Path:
     """The name of a folder to write.
 
-    :raises typer.BadParameter: it is empty.
+    :raises typer.BadParameter: the name is empty.
     """
     if not os.fspath(text):
         raise typer.BadParameter("the name is empty; name a place")

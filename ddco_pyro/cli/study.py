@@ -16,7 +16,7 @@ from ddco_pyro.errors import BadInput, Failed, command
 
 
 class Action(StrEnum):
-    """What ``study`` does."""
+    """The actions of ``study``."""
 
     RUN = "run"
     STATUS = "status"

@@ -66,7 +66,7 @@ class StepProgram(nn.Module):
         return (features, torch.zeros(1, dtype=torch.int64), *images, *self.initial_state())
 
     def onnx_names(self) -> tuple[list[str], list[str]]:
-        """What the inputs and outputs are called in ONNX."""
+        """The names of inputs and outputs in ONNX."""
         images = [f"image_{number}" for number in range(len(self.keys))]
         state = [f"state_{number}" for number in range(len(self.initial_state()))]
         return ["features", "step", *images, *state], [*self.names, *(f"next_{name}" for name in state)]

@@ -1,4 +1,4 @@
-"""What every part of the spec is built from: the strict base model, types of values, and errors in words."""
+"""The base of every part of the spec: the strict model, types of values, and errors in words."""
 
 from __future__ import annotations
 

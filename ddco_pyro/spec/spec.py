@@ -203,7 +203,7 @@ class Spec(Model):
 
     @property
     def _emitted(self) -> list[tuple[Emission, ...]]:
-        """What the policies of each level and the meta-policy emit."""
+        """The choices that the policies of each level, and last the meta-policy, emit."""
         meta_policy = [self.hierarchy.meta_policy.emits] if self.hierarchy else []
         return [*(level.policy.emits for level in self._levels), *meta_policy]
 

@@ -188,7 +188,7 @@ def _needed(spec: Spec) -> str:
 
 
 def _refuse_what_cannot_be_read(spec: Spec, path: Path) -> None:
-    """See that there is a file, and that its demonstrations fit into memory, by the file's headers."""
+    """Refuse a missing file, and by its headers a file whose demonstrations do not fit into memory."""
     if not path.exists():
         raise DemonstrationsError(f"demonstrations.path: {path}: there is no such file; {_needed(spec)}")
     remedy = "leave observations out, or make its demonstrations fewer, shorter or equally long"

@@ -263,7 +263,7 @@ class StageTraining:
                     yield piece
 
     def states(self) -> dict[str, State]:
-        """What a checkpoint keeps of the stage, beside the best epoch and the objective."""
+        """The state of the stage in a checkpoint, beside the best epoch and the objective."""
         average = {} if self.mean is None else {"average": copy_of(self.mean)}
         if self.whole is not None:
             return {"model": copy_of(self.model), "whole": self.whole.states(), **average}

@@ -1,4 +1,4 @@
-"""What a stage of training maximises."""
+"""The objective of a stage of training."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ Known = dict[int, Tensor]
 
 
 class Objective:
-    """What a stage maximises: the log-likelihood given the known choices, plus the log-prior of durations.
+    """The objective of a stage: the log-likelihood given the known choices, plus the log-prior of durations.
 
     In a stage with ``from_constants`` the expected log-probability of selections and terminations (an M-step) takes the
     place of the log-likelihood. In a stage with ``selecting`` the levels and the meta-policy are trained apart: the
@@ -71,7 +71,7 @@ class Objective:
                     known[stage.clamped] = states["known"][part].long()
 
     def states(self) -> dict[str, State]:
-        """What a checkpoint keeps of the objective."""
+        """The state of the objective in a checkpoint."""
         clamped = self.stage.clamped
         parts = zip(("train", "tune"), self.known, strict=True)
         known = {} if clamped is None else {part: known[clamped].short() for part, known in parts}
