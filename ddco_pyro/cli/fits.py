@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ddco_pyro.cli import AllowCode, Level, Overrides, RunPath, Scheduler, SpecPath, hint, out_folder, written
+from ddco_pyro.cli import AllowCode, Backend, Level, Overrides, RunPath, Scheduler, SpecPath, hint, out_folder, written
 from ddco_pyro.data.files import Output, check_outputs
 from ddco_pyro.errors import BadInput, Failed, command
 from ddco_pyro.events import Event

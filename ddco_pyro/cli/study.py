@@ -9,8 +9,7 @@ from typing import Annotated
 
 import typer
 
-from ddco_pyro.cli import AllowCode, Scheduler, out_folder, written
-from ddco_pyro.cli.fits import Backend
+from ddco_pyro.cli import AllowCode, Backend, Scheduler, out_folder, written
 from ddco_pyro.data.files import Output, check_outputs, write_text
 from ddco_pyro.errors import BadInput, Failed, command
 
