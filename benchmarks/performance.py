@@ -38,7 +38,7 @@ from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.tables import Tables, complete
 from ddco_pyro.spec import Spec, load_spec, parse_spec, with_overrides
-from ddco_pyro.study.cells import COLUMNS
+from ddco_pyro.study.table import COLUMNS
 from ddco_pyro.training.data import demonstrations, parts
 from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.restarts import Trainer

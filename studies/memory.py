@@ -11,14 +11,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+import pandas as pd
 from matplotlib.axes import Axes
 from table import RESULTS, ROOT
 
 from ddco_pyro.drawing.figures import FAINT, blank, save, style
-from ddco_pyro.study.cells import Row, earlier
 from ddco_pyro.study.declaration import Study
-from ddco_pyro.study.report import name_of, values
+from ddco_pyro.study.report import name_of
 from ddco_pyro.study.statistics import estimate
+from ddco_pyro.study.table import earlier, values
 
 COLOURS = {"mixture - flat": "#c08a30", "options - mixture": "#1f3f70"}
 NAMED = {
@@ -35,22 +36,22 @@ Line = tuple[str, int, str]
 """A study, a number of demonstrations and a measure."""
 
 
-def read() -> dict[str, list[Row]]:
-    """The rows of each study, by its name."""
+def read() -> dict[str, pd.DataFrame]:
+    """The table of each study, by its name."""
     return {name: earlier(Study.load(ROOT / "studies" / f"{name}.yaml", allow_code=True)) for name in NAMED}
 
 
-def lines(rows: dict[str, list[Row]], of: Iterable[tuple[str, str]] | None = None) -> list[Line]:
+def lines(rows: dict[str, pd.DataFrame], of: Iterable[tuple[str, str]] | None = None) -> list[Line]:
     """Every comparison; of pairs of study and measure those with most demonstrations."""
     found = list(dict.fromkeys(
-        (study, row.demonstrations or 0, row.measure)
-        for study, own in rows.items() for row in own
+        (study, int(row.demonstrations), row.measure)
+        for study, table in rows.items() for row in table.itertuples()
         if row.method == "mixture" and row.measure in ("nats", "nmi", "success", "goals")
     ))  # fmt: skip
     return found if of is None else [max(line for line in found if (line[0], line[2]) == pair) for pair in of]
 
 
-def draw(rows: dict[str, list[Row]], chosen: Sequence[Line], path: Path, columns: int = 2) -> None:
+def draw(rows: dict[str, pd.DataFrame], chosen: Sequence[Line], path: Path, columns: int = 2) -> None:
     """Both differences of every comparison, a panel for each measure; in one column on half the width."""
     groups = {one: [line for line in chosen if line[2] == one] for one in ("nats", "nmi", "success", "goals")}
     groups = {name: group for name, group in groups.items() if group}
@@ -70,10 +71,10 @@ def draw(rows: dict[str, list[Row]], chosen: Sequence[Line], path: Path, columns
         save(figure, path, "What several policies are worth, and what it is worth that they last", "")
 
 
-def _panel(axes: Axes, measure: str, group: Sequence[Line], rows: dict[str, list[Row]]) -> None:
+def _panel(axes: Axes, measure: str, group: Sequence[Line], rows: dict[str, pd.DataFrame]) -> None:
     for place, (study, count, _) in enumerate(group):
         for shift, (contrast, colour) in zip((-0.11, 0.11), COLOURS.items(), strict=True):
-            if differences := values(rows[study], contrast, measure, [count]):
+            if len(differences := values(rows[study], contrast, measure, [count])):
                 found, label = estimate(differences), contrast.replace(" - ", " − ")
                 known = label in axes.get_legend_handles_labels()[1]
                 axes.plot(found.value, place + shift, "o", ms=4, color=colour, label=None if known else label)

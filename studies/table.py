@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import numpy as np
-from scipy import stats
+import pandas as pd
 
 from ddco_pyro.data.files import only_one, write_text
+from ddco_pyro.drawing.page import Table
+from ddco_pyro.study.report import shown as mean_and_interval
+from ddco_pyro.study.statistics import estimate
+from ddco_pyro.study.table import COLUMNS, read_tidy
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "docs" / "results"
@@ -29,60 +30,26 @@ class Row(NamedTuple):
     value: float
 
 
-def read(path: Path) -> list[Row]:
-    """The rows of a table; none where there is no table."""
-    if not path.exists():
-        return []
-    with path.open(encoding="utf-8", newline="") as file:
-        return [
-            Row(one["study"], one["task"], one["method"], _whole(one["demonstrations"]), _whole(one["seed"]),
-                one["measure"], float(one["value"]))
-            for one in csv.DictReader(file)
-        ]  # fmt: skip
-
-
-def _whole(text: str) -> Any:
-    return int(text) if text.isdigit() else text or None
+def tidy(rows: Iterable[Row]) -> pd.DataFrame:
+    """The rows as :func:`ddco_pyro.study.table.read_tidy` reads them."""
+    text = [(*("" if part is None else str(part) for part in row[:-1]), row[-1]) for row in rows]
+    return pd.DataFrame(text, columns=COLUMNS)
 
 
 def add(path: Path, rows: Iterable[Row]) -> None:
     """Write rows into a table, in the place of those of the same cell and measure; another process may do so too."""
     with only_one(path.parent, wait=True):
-        known = {row[:-1]: row for row in read(path)}
-        known |= {row[:-1]: row for row in rows}
-        written = io.StringIO()
-        table = csv.writer(written, lineterminator="\n")
-        table.writerow(Row._fields)
-        table.writerows((*row[:-1], f"{row.value:.9g}") for row in known.values())
-        write_text(path, written.getvalue())
+        tables = [read_tidy(path)] if path.exists() else []
+        table = pd.concat([*tables, tidy(rows)]).groupby(COLUMNS[:-1], sort=False, as_index=False).last()
+        write_text(path, table.to_csv(index=False, lineterminator="\n", float_format="%.9g"))
 
 
-def shown(rows: Sequence[Row]) -> str:
+def shown(rows: Iterable[Row]) -> str:
     """Means over seeds with 95 % t intervals, as Markdown: a line for each method and number of demonstrations."""
-    measures = list(dict.fromkeys(row.measure for row in rows))
-    cells: dict[tuple[Any, ...], dict[str, list[float]]] = {}
-    for row in rows:
-        cells.setdefault(row[:4], {}).setdefault(row.measure, []).append(row.value)
-    head = ["study", "task", "method", "demonstrations", *measures]
-    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
-    for name, found in cells.items():
-        numbers = [spread(over_seeds(found.get(measure, [])), "{:.3g}") for measure in measures]
-        lines.append(f"| {' | '.join(['' if one is None else str(one) for one in name] + numbers)} |")
-    return "\n".join(lines) + "\n"
-
-
-def over_seeds(values: Sequence[float]) -> dict[str, Any]:
-    """Mean over training seeds and its 95 % t ``interval``, which is None for a single seed."""
-    found: dict[str, Any] = {"mean": float(np.mean(values)) if len(values) else None, "by_seed": list(values)}
-    if len(values) < 2:
-        return found | {"interval": None}
-    half = stats.sem(values) * stats.t.ppf(0.975, len(values) - 1)
-    return found | {"interval": [found["mean"] - half, found["mean"] + half]}
-
-
-def spread(one: dict[str, Any], form: str) -> str:
-    """A mean and its interval; a dash where there is none."""
-    if one["mean"] is None:
-        return "-"
-    ends = f" [{', '.join(form.format(end) for end in one['interval'])}]" if one["interval"] else ""
-    return form.format(one["mean"]) + ends
+    table, lines = tidy(rows), []
+    measures = table.measure.unique()
+    for named, cells in table.groupby(COLUMNS[:4], sort=False):
+        by_measure = dict(iter(cells.set_index(["task", "seed"]).groupby("measure").value))
+        means = {measure: mean_and_interval(estimate(own), ".3g") for measure, own in by_measure.items()}
+        lines.append([*named, *(means.get(measure, "-") for measure in measures)])
+    return Table([*COLUMNS[:4], *measures], lines, range(4)).markdown() + "\n"

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import arena_playing
 import numpy as np
+import pandas as pd
 import pytest
 import sawyer
 import toy_task
@@ -29,9 +30,10 @@ from ddco_pyro.selection import Workers
 from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.spec import SpecError
 from ddco_pyro.study import cells, declaration, report, statistics
-from ddco_pyro.study.cells import Folder, read_tidy
+from ddco_pyro.study.cells import Folder
 from ddco_pyro.study.declaration import Study
-from ddco_pyro.study.report import render, values, write
+from ddco_pyro.study.report import render, write
+from ddco_pyro.study.table import read_tidy, values
 
 ROOT = Path(__file__).parents[1]
 SPEC = {
@@ -279,9 +281,9 @@ def test_planted_options_win_in_the_table_and_the_contrast(done, tmp_path, drawn
     rows = read_tidy(tmp_path / "table.csv")
     assert len(rows) == 2 * 2 * 2 + 2 * 2  # nats of both methods, nmi of options
     (contrast,) = report.tested(done.study, rows)
-    nats = {(row.method, row.seed): row.value for row in rows if (row.measure, row.demonstrations) == ("nats", 6)}
-    by_hand = [nats["options", seed] - nats["flat", seed] for seed in (0, 1)]
-    assert contrast.found.value == pytest.approx(np.mean(by_hand))
+    nats = rows[(rows.measure == "nats") & (rows.demonstrations == "6")].set_index(["method", "seed"]).value
+    by_hand = [nats["options", seed] - nats["flat", seed] for seed in "01"]
+    assert contrast.estimate.value == pytest.approx(np.mean(by_hand))
     assert min(by_hand) > 0.3
     page = (tmp_path / "page.md").read_text()
     assert "| options - flat | held-out nats/step | 6 |" in page
@@ -395,7 +397,7 @@ def test_the_best_point_on_development_seeds_is_tested(made, tmp_path, drawn_her
     write(folder, state, tmp_path)
     rows = read_tidy(tmp_path / "table.csv")
     names = {"options", "flat", *(f"{name} (std = {std})" for name in ("options", "flat") for std in (0.5, 50.0))}
-    assert {row.method for row in rows} == names
+    assert {*rows.method} == names
     chosen = "on the development seeds, of 2: options (std = 0.5), flat (std = 0.5)."
     assert chosen in (tmp_path / "page.md").read_text()
     assert not made(**TUNED, methods=methods, kept=[{"table": "table.csv"}]).state().missing
@@ -419,7 +421,7 @@ def test_points_that_change_nothing_are_no_trials(made):
     places = folder.cells("development")
     values = {"options": {0.5: -1.0, 1.0: -1.0, 2.0: -0.5}, "flat": {0.5: -3.0, 1.0: -2.0, 2.0: -1.0}}
     done = [cells.Done(depends={}, values={"nats": values[one.of][one.point["control.std"]]}) for one in places]
-    lines = report.design(folder.study, [], cells.State(places, dict(enumerate(done)), {}))
+    lines = report.design(folder.study, cells.State(places, dict(enumerate(done)), {}))
     (line,) = (line for line in lines if "no trials" in line)
     assert line == "options: 1 of 3 points gave the results of another one: no trials."
 
@@ -452,7 +454,7 @@ def test_cells_of_an_earlier_table_are_not_done(made, done, tmp_path):
 def test_pages_quote_the_tables_by_the_names_of_the_study(made, done, tmp_path):
     write(done, done.state(), tmp_path)
     rows = read_tidy(tmp_path / "table.csv")
-    own = values(rows, "options", "nats", [6])[""]
+    own = [*values(rows, "options", "nats", [6])]
     methods = {"mine": {}, "flat": {"baseline": "flat"}}
     kept = [{"table": "table.csv", "study": "study", "methods": {"mine": "options"}, "measures": {"nats/step": "nats"}}]
     made(kept=kept, methods=methods, contrasts=[])
@@ -546,7 +548,10 @@ def test_a_page_has_the_bold_words_that_holm_leaves(tmp_path):
     ],
 )
 def test_both_sides_of_a_verdict_have_holms_correction(values, said):
-    family = [(statistics.estimate({"": dict(enumerate(map(float, own)))}), 0.0) for own in values.values()]
+    family = [
+        (statistics.estimate(pd.Series({("", str(seed)): float(value) for seed, value in enumerate(own)})), 0.0)
+        for own in values.values()
+    ]
     assert [verdict for verdict, _ in report.verdicts(family)] == said
 
 

@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 import study
 from cells import Cell, Settings, described
-from table import RESULTS, Row, add, read
+from table import RESULTS, Row, add
+
+from ddco_pyro.study.table import COLUMNS, read_tidy
 
 DEFAULTS = Settings({"episodes": 3, "noise": 0.5}, Path("unused"))
 
@@ -47,23 +49,23 @@ def test_cells_are_done_once_and_their_numbers_are_in_the_table(tmp_path, monkey
     add(tmp_path / "toy.csv", [Row("toy", "old", "ddco", 10, 0, "product", 7.0)])
     whole = ["a-2", "a-4", "b-2", "b-4"]
     assert run(monkeypatch, tmp_path, ["--noise", "0.25", "--set", "a=1"]) == whole
-    assert [row[1:] for row in read(tmp_path / "toy.csv")] == [
-        ("old", "ddco", 10, 0, "product", 7.0),
-        *((task, "ddco", None, seed, "product", 0.25 * seed) for task in "ab" for seed in (2, 4)),
+    assert [row[1:] for row in read_tidy(tmp_path / "toy.csv").itertuples(index=False)] == [
+        ("old", "ddco", "10", "0", "product", 7.0),
+        *((task, "ddco", "", str(seed), "product", 0.25 * seed) for task in "ab" for seed in (2, 4)),
     ]
     # t(0.975, 1) = 12.7062 times the standard error 0.25
-    assert "| toy | a | ddco |  | 0.75 [-2.43, 3.93] |" in capsys.readouterr().out
+    assert "| toy | a | ddco |  | 0.75 [−2.43, 3.93] |" in capsys.readouterr().out
     assert run(monkeypatch, tmp_path, ["--noise", "0.25", "--set", "a=1"]) == whole
     assert run(monkeypatch, tmp_path, ["--tasks", "a"]) == [*whole, "a-2", "a-4"]  # other settings
-    assert [row.value for row in read(tmp_path / "toy.csv")] == [7.0, 1.0, 2.0, 0.5, 1.0]
+    assert [*read_tidy(tmp_path / "toy.csv").value] == [7.0, 1.0, 2.0, 0.5, 1.0]
 
 
 @pytest.mark.parametrize("path", sorted(RESULTS.glob("*.csv")), ids=lambda path: path.stem)
 def test_a_table_is_tidy_and_is_written_as_it_is_read(path, tmp_path):
-    rows = read(path)
-    assert len({row[:-1] for row in rows}) == len(rows)
-    add(tmp_path / "again.csv", rows)
+    table = read_tidy(path)
+    assert not table.duplicated(COLUMNS[:-1]).any()
+    add(tmp_path / "again.csv", table.itertuples(index=False))
     assert (tmp_path / "again.csv").read_text() == path.read_text()
     with path.open() as file:
-        assert tuple(next(csv.reader(file))) == Row._fields
+        assert next(csv.reader(file)) == COLUMNS == [*Row._fields]
     assert any((folder / f"{path.stem}.md").exists() for folder in (RESULTS, RESULTS.parent))

@@ -5,40 +5,56 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy import stats
 
-from ddco_pyro.study.statistics import estimate, holm, p_value, paired
+from ddco_pyro.study.statistics import estimate, holm
+from ddco_pyro.study.table import COLUMNS, values
 
 ROOT = Path(__file__).parents[1]
 
 
-def by_seed(values):
-    return dict(enumerate(map(float, values)))
+def by_seed(**tasks):
+    """Values by task and training seed: of each task a list, or a mapping from seeds."""
+    seeds = {task: own if isinstance(own, dict) else dict(enumerate(own)) for task, own in tasks.items()}
+    return pd.Series({(task, str(seed)): float(x) for task, own in seeds.items() for seed, x in own.items()})
+
+
+def paired(ours, theirs):
+    """Differences between two methods of a table."""
+    rows = [
+        ("study", task, method, "5", seed, "nats", value)
+        for method, own in (("ours", ours), ("theirs", theirs))
+        for (task, seed), value in own.items()
+    ]
+    return values(pd.DataFrame(rows, columns=COLUMNS), "ours - theirs", "nats", [5])
 
 
 def test_one_task_is_the_paired_t_test_over_seeds():
     random = np.random.default_rng(0)
     ours, theirs = random.normal(0.3, 1, 8), random.normal(0, 1, 8)
-    found = estimate(paired({"push": by_seed(ours)}, {"push": by_seed(theirs)}))
+    found = estimate(paired(by_seed(push=ours), by_seed(push=theirs)))
     for bound in (0.0, 0.2, -0.1):
         test = stats.ttest_rel(ours, theirs + bound, alternative="greater")
-        assert p_value(found, bound) == pytest.approx(test.pvalue)
+        assert found.p_value(bound) == pytest.approx(test.pvalue)
     interval = stats.ttest_rel(ours, theirs).confidence_interval(0.95)
     assert found.interval == pytest.approx((interval.low, interval.high))
     assert found.units == pytest.approx(tuple(ours - theirs))
 
 
 def test_the_units_of_several_tasks_are_their_means():
-    tasks = {"a": by_seed([0, 1]), "b": by_seed([1, 2, 3]), "c": by_seed([4])}
-    found, test = estimate(tasks), stats.ttest_1samp([0.5, 2, 4], 1.0, alternative="greater")
-    assert p_value(found, 1.0) == pytest.approx(test.pvalue)
+    found, test = (
+        estimate(by_seed(a=[0, 1], b=[1, 2, 3], c=[4])),
+        stats.ttest_1samp([0.5, 2, 4], 1.0, alternative="greater"),
+    )
+    assert found.p_value(1.0) == pytest.approx(test.pvalue)
     assert (found.value, len(found.units), found.range) == (pytest.approx(6.5 / 3), 3, (0.5, 4))
 
 
 def test_pairs_need_both_values():
-    found = paired({"a": {0: 3.0, 1: 5.0}, "b": {0: 1.0}, "c": {0: 1.0}}, {"a": {1: 2.0}, "b": {7: 0.0}})
-    assert found == {"a": {1: 3.0}}
+    found = paired(by_seed(a={0: 3, 1: 5}, b={0: 1}, c={0: 1}), by_seed(a={1: 2}, b={7: 0}))
+    assert found.to_dict() == {("a", "1"): 3.0}
 
 
 def successes(random, rates, starts=20):
@@ -86,10 +102,10 @@ def test_intervals_of_differences_cover_as_the_docs_say(named):
     means = population(random, 100 * studies).mean(1)
     found = population(random, units * studies).mean(1).reshape(studies, units)
     low, high = stats.ttest_1samp(found, 0.0, axis=1).confidence_interval(0.95)
-    assert estimate({"a": by_seed(found[0])}).interval == pytest.approx((low[0], high[0]))
+    assert estimate(by_seed(a=found[0])).interval == pytest.approx((low[0], high[0]))
     covered = np.mean((low <= means.mean()) & (means.mean() <= high))
     assert covered == pytest.approx(said, abs=0.025)  # two standard errors of 2000 studies are at most 0.022
-    ranks, median = estimate({"a": by_seed(range(units))}).median[1], np.median(means)
+    ranks, median = estimate(by_seed(a=range(units))).median[1], np.median(means)
     if units > 5:
         least, most = np.sort(found)[:, np.array(ranks, int)].T
         assert np.mean((least <= median) & (median <= most)) >= 0.95
@@ -101,7 +117,7 @@ def test_a_test_errs_as_often_as_its_level_says():
     random, wrong = np.random.default_rng(5), 0
     for _ in range(1000):
         tasks = random.choice([-0.3, 0.3], (8, 1)) + random.normal(0, 0.1, (8, 3))
-        wrong += p_value(estimate({str(n): by_seed(own) for n, own in enumerate(tasks)}), 0.0) <= 0.025
+        wrong += estimate(by_seed(**{str(n): own for n, own in enumerate(tasks)})).p_value(0.0) <= 0.025
     assert 0.01 <= wrong / 1000 <= 0.04  # two standard errors of 1000 studies are 0.01
 
 
@@ -122,9 +138,9 @@ def test_equal_units_have_the_interval_of_their_trials_or_none():
         (1.0, 0.0, (1 - most, 1.0)),
         (-1.0, -1.0, (-1.0, most - 1)),
     ):
-        found = estimate({"push": by_seed([value] * 3)}, trials=20, lowest=lowest)
+        found = estimate(by_seed(push=[value] * 3), trials=20, lowest=lowest)
         assert found.interval == pytest.approx(interval, abs=1e-6)
-        assert (p_value(found, 0.0) < 0.001) == (value > 0)
-    for values in ([0.1 + 0.2, 0.3], [0.0] * 3, [1.0]):
-        found = estimate({"push": by_seed(values)})
-        assert np.isnan([*found.interval, p_value(found, 0.0)]).all()
+        assert (found.p_value(0.0) < 0.001) == (value > 0)
+    for units in ([0.1 + 0.2, 0.3], [0.0] * 3, [1.0]):
+        found = estimate(by_seed(push=units))
+        assert np.isnan([*found.interval, found.p_value(0.0)]).all()

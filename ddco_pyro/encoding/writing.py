@@ -1,8 +1,8 @@
 """A file of demonstrations with features in place of pictures; an interrupted encoding can be resumed.
 
-While ``out.hdf5`` is made, the folder ``.out.hdf5.encoding`` holds the autoencoder's checkpoint and the features of
-every demonstration before they are reduced. Each picture goes through the encoder once. The principal components are
-computed from those features, and the file is written at the end.
+While ``out.hdf5`` is made, its parts (:class:`~ddco_pyro.data.sources.robomimic.Parts`) hold the features of every
+demonstration before they are reduced, and the autoencoder's checkpoint stands beside them. Each picture goes through
+the encoder once. The principal components are computed from those features, and the file is written at the end.
 """
 
 from __future__ import annotations
@@ -10,8 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -19,11 +18,18 @@ from pathlib import Path
 
 import numpy as np
 
-from ddco_pyro.data.files import only_one, write_text
 from ddco_pyro.data.hdf5 import DemonstrationsError, opened
 from ddco_pyro.data.pictures import MOVED, shifted
 from ddco_pyro.data.sources import Column, Recording, refuse_foreign
-from ddco_pyro.data.sources.robomimic import Robomimic, open_robomimic, parts_of, robomimic_file, write_recording
+from ddco_pyro.data.sources.robomimic import (
+    Parts,
+    Robomimic,
+    discard,
+    open_robomimic,
+    parts_of,
+    robomimic_file,
+    write_recording,
+)
 from ddco_pyro.encoding.autoencoder import UPDATES, Convolutions, train
 from ddco_pyro.encoding.encoder import (
     NOISE,
@@ -53,7 +59,9 @@ ROWS = 1024
 FEATURES, VERSIONS = "features", "versions"
 """Of the pictures, and of shifted pictures."""
 
-_IDENTITY, _CHECKPOINT, _UNREDUCED = "identity.json", "autoencoder.safetensors", "features.hdf5"
+_CHECKPOINT = "autoencoder.safetensors"
+
+Blocks = Callable[[], Iterator[np.ndarray]]
 
 
 @dataclass(frozen=True)
@@ -132,17 +140,17 @@ def encode(
         raise BadInput(f"{out}: is there already and is no file; choose another --out")
     refuse_foreign(path)
     with open_robomimic(path) as source, nullcontext() if users else one_thread():  # same bits
-        job = _Job(source, path, out, encoding, on_event, allow_code)
-        return job.already() or job.run()
+        return _Job(source, path, out, encoding, on_event, allow_code).run()
 
 
 class _Job:
-    """The encoding of one file, with the unfinished work in ``folder``; the encoder is written to ``beside``."""
+    """The encoding of one file; the encoder is written to ``beside``."""
 
     def __init__(
         self, source: Robomimic, path: Path, out: Path, encoding: Encoding, on_event: OnEvent, allow_code: bool
     ) -> None:
         self.source, self.out, self.encoding, self.on_event = source, out, encoding, on_event
+        self.beside = encoder_folder(out)
         self.pictures = Pictures(source, encoding.observation)
         for key in encoding.keys.values():
             if key in source.recording(source.names[0]).observations:
@@ -153,75 +161,60 @@ class _Job:
         self.extractor = extractor(encoding.encoder, self.pictures, encoding.seed, allow_code)
         self.about = _about(encoding, self.pictures, self.extractor)
         self.identity = _identity(path, encoding, self.extractor)
-        self.beside, self.folder = encoder_folder(out), out.with_name(f".{out.name}.encoding")
-
-    def already(self) -> Encoded | None:
-        """The result of an earlier call; None where there is none.
-
-        :raises BadInput: something else is there.
-        """
-        if not self.out.exists():
-            if self.beside.exists() and not self.folder.exists():
-                raise BadInput(f"{self.beside}: is there already; remove it, or choose another --out")
-            return None
-        with opened(self.out) as file:
-            if file.attrs.get(MADE) != _digest(self.identity):
-                raise BadInput(f"{self.out}: is there already and is not this encoding; choose another --out")
-        if self.folder.exists():
-            with only_one(self.folder):
-                shutil.rmtree(self.folder)
-        return self._encoded(about_of(self.beside))
+        self.digest = hashlib.sha256(self.identity.encode()).hexdigest()
 
     def run(self) -> Encoded:
-        """Encode every demonstration, reduce the features, and write both results."""
-        with only_one(self.folder):
-            known = self.folder / _IDENTITY
-            if not known.exists() or known.read_text(encoding="utf-8") != self.identity:
-                for old in self.folder.iterdir():
-                    shutil.rmtree(old) if old.is_dir() else old.unlink()
-                write_text(known, self.identity)
-            try:
-                encoder = self._fitted()
-                encoder.write(self.beside)
-                self._write(encoder)
-            finally:
-                if self.out.exists() or [path.name for path in self.folder.iterdir()] == [_IDENTITY]:
-                    shutil.rmtree(self.folder)
-        return self._encoded(encoder.about)
+        """Encode every demonstration, reduce the features, and write both results, unless they are there."""
+        if self.out.exists():
+            discard(self.out)
+        else:
+            with parts_of(self.out, self.identity, at_most=1) as parts:
+                if parts is not None:
+                    self._make(parts)
+        with opened(self.out) as file:
+            if file.attrs.get(MADE) != self.digest:
+                raise BadInput(f"{self.out}: is there already and is not this encoding; choose another --out")
+        return Encoded(self.out, self.beside, about_of(self.beside), len(self.source.names))
 
-    def _encoded(self, about: About) -> Encoded:
-        return Encoded(self.out, self.beside, about, len(self.source.names))
-
-    def _fitted(self) -> Encoder:
-        """The encoder with its projection, once every demonstration has been encoded."""
-        network, encoding = self.extractor.network, self.encoding
+    def _make(self, parts: Parts) -> None:
+        """Encode what is not encoded yet, and write the encoder and the file."""
+        if self.beside.exists() and not parts.done:
+            raise BadInput(f"{self.beside}: is there already; remove it, or choose another --out")
+        network, encoding, about = self.extractor.network, self.encoding, self.about
         if encoding.encoder == "autoencoder" and isinstance(network, Convolutions):
-            train(network, self.pictures, encoding.seed, encoding.updates, self.folder / _CHECKPOINT, self.on_event)
-        self._encode_all()
-        projection = self._projection()
-        found = {"explained": projection.explained, "size": len(projection.components)} if projection else {}
-        about = self.about.model_copy(update=found)
-        return Encoder(about, self.extractor, projection)
-
-    def _encode_all(self) -> None:
-        """Write the unreduced features of every demonstration that has none yet."""
-        with parts_of(self.folder / _UNREDUCED, self.identity, at_most=1) as parts:
-            if parts is None:
-                return
-            for name in self.source.names[len(parts.done) :]:
-                actions = self.source.recording(name).actions
-                blocks = {FEATURES: partial(self._features_of, name), VERSIONS: partial(self._versions_of, name)}
-                columns = {
-                    kind: Column(self._shape(actions, kind, self.about.features), np.dtype(np.float32), blocks[kind])
-                    for kind in self.encoding.keys
+            checkpoint = parts.folder / _CHECKPOINT
+            train(network, self.pictures, encoding.seed, encoding.updates, checkpoint, self.on_event)
+        for name in self.source.names[len(parts.done) :]:
+            blocks = {FEATURES: partial(self._features_of, name), VERSIONS: partial(self._versions_of, name)}
+            parts.add(self._recording(name, {kind: (kind, blocks[kind]) for kind in encoding.keys}, about.features))
+            self.on_event(DemonstrationsDone(len(parts.done), len(self.source.names)))
+        projection = self._projection(parts)
+        if projection is not None:
+            facts = {"explained": projection.explained, "size": len(projection.components)}
+            about = about.model_copy(update=facts)
+        encoder = Encoder(about, self.extractor, projection)
+        encoder.write(self.beside)
+        attributes = {**self.source.attributes, MADE: self.digest}
+        with one_thread(), robomimic_file(self.out, attributes, self.source.masks) as data:
+            for name in self.source.names:
+                reduced = {
+                    key: (kind, partial(map, encoder.reduced, self._unreduced(parts, name, kind)))
+                    for kind, key in encoding.keys.items()
                 }
-                parts.add(Recording(name, columns, actions))
-                self.on_event(DemonstrationsDone(len(parts.done), len(self.source.names)))
-            parts.finish({}, {})
+                encoded = self._recording(name, reduced, about.size)
+                whole = self.source.recording(name)
+                others = {key: column for key, column in whole.observations.items() if key != self.pictures.key}
+                write_recording(data, replace(whole, observations=others | dict(encoded.observations)))
 
-    def _shape(self, actions: Column, kind: str, features: int) -> tuple[int, ...]:
-        """[T, F], or [T, moved, F] of shifted pictures."""
-        return actions.shape[0], *((self.encoding.moved,) if kind == VERSIONS else ()), features
+    def _recording(self, name: str, blocks: Mapping[str, tuple[str, Blocks]], features: int) -> Recording:
+        """A demonstration with features [T, F], or [T, moved, F] of shifted pictures, by key."""
+        actions = self.source.recording(name).actions
+        moved = {FEATURES: (), VERSIONS: (self.encoding.moved,)}
+        columns = {
+            key: Column((actions.shape[0], *moved[kind], features), np.dtype(np.float32), of)
+            for key, (kind, of) in blocks.items()
+        }
+        return Recording(name, columns, actions)
 
     def _features_of(self, name: str) -> Iterator[np.ndarray]:
         """Features of a demonstration's pictures, in blocks [M, F]."""
@@ -244,33 +237,16 @@ class _Job:
             )
         return values.astype(np.float32)
 
-    def _unreduced(self, source: Robomimic, name: str, kind: str = FEATURES) -> Iterator[np.ndarray]:
-        column = source.recording(name).observations[kind]
-        return batches(column, max(1, ROWS // math.prod(column.shape[1:-1])))
+    def _unreduced(self, parts: Parts, name: str, kind: str = FEATURES) -> Iterator[np.ndarray]:
+        with parts.column(name, f"obs/{kind}") as column:
+            yield from batches(column, max(1, ROWS // math.prod(column.shape[1:-1])))
 
-    def _projection(self) -> Projection | None:
+    def _projection(self, parts: Parts) -> Projection | None:
         if self.encoding.size is None and self.about.size == self.about.features:
             return None
-        with open_robomimic(self.folder / _UNREDUCED) as source, one_thread():
-            rows = (block for name in self.pictures.training for block in self._unreduced(source, name))
+        with one_thread():
+            rows = (block for name in self.pictures.training for block in self._unreduced(parts, name))
             return principal_components(rows, self.about.size, NOISE if self.encoding.size is None else 0.0)
-
-    def _write(self, encoder: Encoder) -> None:
-        attributes = {**self.source.attributes, MADE: _digest(self.identity)}
-        unreduced = open_robomimic(self.folder / _UNREDUCED)
-        with unreduced as features, one_thread(), robomimic_file(self.out, attributes, self.source.masks) as data:
-            for name in self.source.names:
-                recording = self.source.recording(name)
-                others = {key: column for key, column in recording.observations.items() if key != self.pictures.key}
-                encoded = {
-                    key: Column(
-                        self._shape(recording.actions, kind, encoder.about.size),
-                        np.dtype(np.float32),
-                        partial(map, encoder.reduced, self._unreduced(features, name, kind)),
-                    )
-                    for kind, key in self.encoding.keys.items()
-                }
-                write_recording(data, replace(recording, observations=others | encoded))
 
 
 def _about(encoding: Encoding, pictures: Pictures, source: Extractor) -> About:
@@ -299,7 +275,3 @@ def _identity(path: Path, encoding: Encoding, source: Extractor) -> str:
     """Everything that decides the contents of the file."""
     stat, code = path.stat(), hashlib.sha256(source.code).hexdigest()
     return json.dumps({"file": [str(path.resolve()), stat.st_size, stat.st_mtime_ns], "code": code} | asdict(encoding))
-
-
-def _digest(identity: str) -> str:
-    return hashlib.sha256(identity.encode()).hexdigest()

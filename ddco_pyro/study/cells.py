@@ -13,13 +13,14 @@ import math
 import shutil
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
+import pandas as pd
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import Busy, json_text, only_one, write_text
@@ -36,12 +37,13 @@ from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.inference import compile_all
 from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.jobs import Workers, processes, run_all
-from ddco_pyro.metrics import Record, read_record, read_table
+from ddco_pyro.metrics import Record, read_record
 from ddco_pyro.simulation.collect import collect
 from ddco_pyro.simulation.episodes import run_episodes
 from ddco_pyro.spec import DemonstrationsSpec, Spec, SpecError, parse_spec, with_overrides
 from ddco_pyro.spec.yaml import read_yaml
 from ddco_pyro.study.declaration import NATS, Study
+from ddco_pyro.study.table import CELL, COLUMNS, earlier
 from ddco_pyro.training import data
 from ddco_pyro.training.networks import Dimensions, baseline_spec, named_baselines
 
@@ -198,7 +200,7 @@ class Folder:
 
     def kept(self, cell: Cell) -> Done | None:
         """The results of a cell, if it is done: here, or in the declaration's table ``kept``."""
-        if values := self._earlier.get(cell.row):
+        if values := self._earlier.get(tuple(map(str, cell.row))):
             return Done(depends={}, values=values)
         path = self.place(cell)
         if not path.exists():
@@ -207,12 +209,20 @@ class Folder:
         return done if _agrees(done.depends, self.depends(cell)) else None
 
     @cached_property
-    def _earlier(self) -> dict[tuple[str, str, int, int], dict[str, float | None]]:
+    def _earlier(self) -> dict[tuple[str, ...], dict[str, float | None]]:
         """The values of the declaration's tables ``kept``, by cell and measure."""
-        found: dict[tuple[str, str, int, int], dict[str, float | None]] = defaultdict(dict)
-        for row in earlier(self.study):
-            found[row.cell][row.measure] = row.value
-        return dict(found)
+        by_cell = earlier(self.study).groupby(CELL)
+        return {cell: dict(zip(rows.measure, rows.value, strict=True)) for cell, rows in by_cell}
+
+    def table(self, state: State) -> pd.DataFrame:
+        """The declared measures of all cells that are done, tidy; methods of the development name their points."""
+        rows = [
+            (self.study.name, *map(str, state.cells[number].row), measure, value)
+            for number, done in state.done.items()
+            for measure in self.study.declared.measures
+            if (value := done.values.get(measure)) is not None
+        ]
+        return pd.DataFrame(rows, columns=COLUMNS)
 
     # --- keys ---------------------------------------------------------------------------------------------------------
 
@@ -438,78 +448,3 @@ def _agrees(kept: Any, now: Any) -> bool:
     if isinstance(kept, dict) and isinstance(now, dict):
         return all(_agrees(kept[key], now[key]) for key in kept.keys() & now.keys())
     return bool(kept == now)
-
-
-# --- tables -----------------------------------------------------------------------------------------------------------
-
-COLUMNS = ("study", "task", "method", "demonstrations", "seed", "measure", "value")
-
-
-@dataclass(frozen=True)
-class Row:
-    """A row of a tidy table.
-
-    :param demonstrations: None where the number does not depend on them.
-    :param seed: the training seed; text for other repetitions, empty where there is one value.
-    """
-
-    study: str
-    task: str
-    method: str
-    demonstrations: int | None
-    seed: int | str
-    measure: str
-    value: float
-
-    @property
-    def cell(self) -> tuple[Any, ...]:
-        """What names its cell."""
-        return self.task, self.method, self.demonstrations, self.seed
-
-
-def read_tidy(path: Path) -> list[Row]:
-    """The rows of a tidy table.
-
-    :raises BadInput: the file cannot be read.
-    """
-
-    def row(fields: Mapping[str, str]) -> Row:
-        count, seed = fields["demonstrations"], fields["seed"]
-        return Row(
-            fields["study"], fields["task"], fields["method"], int(count) if count else None,
-            int(seed) if seed.isdecimal() else seed, fields["measure"], float(fields["value"]),
-        )  # fmt: skip
-
-    remedy = "write it with: ddco-pyro study report"
-    try:
-        return read_table(path, row, remedy)
-    except OSError as error:
-        raise BadInput(f"{path}: cannot be read: {error.strerror}; {remedy}") from error
-
-
-def earlier(study: Study) -> list[Row]:
-    """The rows of a declaration's tables ``kept``, by the names of the declaration."""
-    found: dict[tuple[Any, ...], Row] = {}
-    seeds = study.declared.ranges("seeds").values()
-    for kept in study.declared.kept:
-        tasks, methods, measures = (
-            {there: here for here, there in names.items()} for names in (kept.tasks, kept.methods, kept.measures)
-        )
-        for row in read_tidy(study.path.parent / kept.table):
-            declared = any(row.seed in block for block in seeds)  # other rows are of other cells, or of several
-            if declared and kept.study in (None, row.study) and (not methods or row.method in methods):
-                task, method = tasks.get(row.task, row.task), methods.get(row.method, row.method)
-                measure = measures.get(row.measure, row.measure)
-                own = replace(row, study=study.name, task=task, method=method, measure=measure)
-                if task in study.tasks:
-                    found.setdefault((*own.cell, measure), own)
-    return list(found.values())
-
-
-def tidy(folder: Folder, state: State) -> Iterator[Row]:
-    """The rows of the declared measures of all cells that are done; those of development name their points."""
-    for number, done in state.done.items():
-        cell = state.cells[number]
-        for measure in folder.study.declared.measures:
-            if (value := done.values.get(measure)) is not None:
-                yield Row(folder.study.name, *cell.row, measure, value)

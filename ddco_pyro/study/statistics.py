@@ -7,17 +7,14 @@ single task the training seeds are the sample. No test pools episodes of several
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+import pandas as pd
 
 LEVEL = 0.025
 """One-sided level of the tests, which corresponds to two-sided 95 % intervals."""
-
-BySeed = Mapping[str, Mapping[Any, float]]
-"""Values by task and training seed."""
 
 
 @dataclass(frozen=True)
@@ -48,60 +45,44 @@ class Estimate:
         ends = quantile_test(self.units, q=middle, p=0.5).confidence_interval(1 - 2 * LEVEL)
         return middle, (float(ends.low), float(ends.high))
 
+    def p_value(self, bound: float) -> float:
+        """The one-sided p-value of the t test of "the mean is at most ``bound``"; NaN without a standard error.
 
-def paired(ours: BySeed, theirs: BySeed) -> dict[str, dict[Any, float]]:
-    """Differences by task and seed, where both have a value.
+        Superiority by a margin has the bound +margin, non-inferiority −margin.
+        """
+        from scipy.stats import t
 
-    >>> paired({"push": {0: 0.75, 1: 0.5}}, {"push": {0: 0.5}})
-    {'push': {0: 0.25}}
-    """
-    both = {
-        task: {seed: value - theirs[task][seed] for seed, value in own.items() if seed in theirs[task]}
-        for task, own in ours.items()
-        if task in theirs
-    }
-    return {task: own for task, own in both.items() if own}
+        return float(t.sf((self.value - bound) / self.error, len(self.units) - 1))
 
 
-def estimate(values: BySeed, trials: int = 0, lowest: float = -1.0) -> Estimate:
+def estimate(values: pd.Series, trials: int = 0, lowest: float = -1.0) -> Estimate:
     """The mean and its t interval.
 
-    >>> found = estimate({"push": {0: 1.0, 1: 2.0, 2: 3.0}})
+    >>> found = estimate(pd.Series({("push", 0): 1.0, ("push", 1): 2.0, ("push", 2): 3.0}))
     >>> found.value, round(found.interval[0], 3)
     (2.0, -0.484)
 
+    :param values: by task and training seed.
     :param trials: of each fit, where the values are rates or their differences. Equal units have Wilson's interval of
         all trials, a difference that of as many trials with different outcomes.
     :param lowest: the least possible value of a rate: 0, or -1 of a difference.
-    :raises ValueError: there are no values.
     """
     from scipy.stats import binomtest, norm, ttest_1samp
 
-    by_task = [np.array(list(own.values()), float) for own in values.values()]
-    means = np.array([own.mean() for own in by_task])
-    units = means if len(means) > 1 else by_task[0]
+    means = np.array([of_task.to_numpy().mean() for _, of_task in values.groupby(level=0, sort=False)])
+    units = means if len(means) > 1 else values.to_numpy()
     value, error, interval = float(means.mean()), math.nan, (math.nan, math.nan)
     if len(units) > 1 and not np.allclose(units, units[0], rtol=1e-9, atol=1e-12):
         low, high = ttest_1samp(units, 0.0).confidence_interval(1 - 2 * LEVEL)
         error, interval = float(units.std(ddof=1) / math.sqrt(len(units))), (float(low), float(high))
     elif len(units) > 1 and trials:
-        number = trials * sum(map(len, by_task))
+        number = trials * len(values)
         count = round(abs(value) * number)
         ends = binomtest(count, number).proportion_ci(1 - 2 * LEVEL, "wilson")
         low, high = sorted(math.copysign(end, value) for end in (ends.low, ends.high))
         interval = (low, high) if count else (max(lowest, -ends.high), ends.high)
         error = (interval[1] - interval[0]) / 2 / float(norm.isf(LEVEL))
     return Estimate(value, error, interval, tuple(map(float, units)))
-
-
-def p_value(found: Estimate, bound: float) -> float:
-    """The one-sided p-value of the t test of "the mean is at most ``bound``"; NaN without a standard error.
-
-    Superiority by a margin has the bound +margin, non-inferiority −margin.
-    """
-    from scipy.stats import t
-
-    return float(t.sf((found.value - bound) / found.error, len(found.units) - 1))
 
 
 def holm(p_values: Sequence[float]) -> list[float]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -175,7 +175,7 @@ _IDENTITY = "identity.json"
 
 
 class Parts:
-    """A file that is written in parts, made by :func:`parts_of`. ``done`` names the demonstrations that are safe.
+    """A file that is written in parts, made by :func:`parts_of`.
 
     While ``demos.hdf5`` is made, the folder ``.demos.hdf5.parts`` holds HDF5 files of some demonstrations each. A
     killed process leaves whole parts, from which the next process goes on.
@@ -183,9 +183,14 @@ class Parts:
 
     def __init__(self, path: Path, folder: Path, at_most: int = PART_RECORDINGS) -> None:
         self.path, self.folder, self.at_most = path, folder, at_most
-        self.done = [name for part in self._files() for name in _names(part)]
+        self._parts = {name: part for part in self._files() for name in _names(part)}
         self._open: list[Recording] = []
         self._bytes = 0
+
+    @property
+    def done(self) -> Collection[str]:
+        """The names of the demonstrations that are safe."""
+        return self._parts.keys()
 
     def _files(self) -> list[Path]:
         return sorted(self.folder.glob("*.hdf5"))
@@ -205,8 +210,14 @@ class Parts:
         with whole_file(part) as temporary, written(temporary) as file:
             for recording in self._open:
                 write_recording(file, recording)
-        self.done += [recording.name for recording in self._open]
+        self._parts |= {recording.name: part for recording in self._open}
         self._open, self._bytes = [], 0
+
+    @contextmanager
+    def column(self, name: str, place: str) -> Iterator[Column]:
+        """An array of a safe demonstration, such as ``obs/camera``."""
+        with opened(self._parts[name]) as file:
+            yield of_dataset(file[f"{name}/{place}"], f"{name}: {place}")
 
     def attributes(self) -> list[dict[str, Attribute]]:
         """The attributes of every safe demonstration."""
@@ -257,7 +268,7 @@ def parts_of(path: Path, identity: str, wait: bool = False, at_most: int = PART_
         try:
             yield parts
         finally:
-            if path.exists() or not parts.done:
+            if path.exists() or {entry.name for entry in folder.iterdir()} <= {_IDENTITY}:
                 shutil.rmtree(folder)
 
 
