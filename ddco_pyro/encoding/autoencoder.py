@@ -20,7 +20,6 @@ from ddco_pyro.spec import ConvolutionLayer
 from ddco_pyro.training.checkpoint import copy_of
 from ddco_pyro.training.optimizers import optimizer_state, restore_optimizer
 
-_KEY = "picture"
 _FIRST = ConvolutionLayer(filters=16, kernel=5, stride=2, padding=2)
 BUILT_IN = {"random_conv": 64, "autoencoder": 32}
 """Maps of the second convolution of each. The features are the expected row and column of every map under its
@@ -40,8 +39,25 @@ KEPT_EVERY = 50
 LEARNING_RATE = 3e-3
 
 
-class Convolutions(nn.Module):
-    """uint8 pictures [N, H, W, C] to features [N, F].
+class PictureNetwork(nn.Module):
+    """uint8 pictures [N, H, W, C] to features [N, F], by a network that reads them under a key."""
+
+    network: nn.Module
+    key = "picture"
+
+    def forward(self, pictures: Tensor) -> Tensor:
+        """Features of each picture by itself."""
+        features, _ = self.network(Inputs({}, {self.key: pictures[:, None]}, torch.zeros(1)), ())
+        return features[:, 0, 0]  # type: ignore[no-any-return]
+
+    def encode(self, pictures: np.ndarray) -> np.ndarray:
+        """Features of each picture by itself, float32."""
+        with torch.no_grad():
+            return self(torch.from_numpy(np.ascontiguousarray(pictures))).numpy()
+
+
+class Convolutions(PictureNetwork):
+    """A built-in encoder.
 
     :param kind: a name in :data:`BUILT_IN`.
     :param shape: of a picture.
@@ -52,20 +68,10 @@ class Convolutions(nn.Module):
         super().__init__()
         layers = (_FIRST, ConvolutionLayer(filters=BUILT_IN[kind], kernel=3, padding=1))
         with seeded(seed):
-            images = InputShape({}, {_KEY: tuple(shape)})
-            self.maps = Conv(images, 1, (), 0.0, "relu", 0, 0, layers, "spatial_softmax", 0, False)
+            images = InputShape({}, {self.key: tuple(shape)})
+            self.network = Conv(images, 1, (), 0.0, "relu", 0, 0, layers, "spatial_softmax", 0, False)
         if kind == "random_conv":  # sharp maps help training alone; random ones say less
-            self.maps.strengthen(1 / SHARPNESS)
-
-    def forward(self, pictures: Tensor) -> Tensor:
-        """Features of each picture by itself."""
-        maps: Tensor = self.maps(Inputs({}, {_KEY: pictures[:, None]}, torch.zeros(1)))[0]
-        return maps[:, 0, 0]
-
-    def encode(self, pictures: np.ndarray) -> np.ndarray:
-        """Features of each picture by itself, float32."""
-        with torch.no_grad():
-            return self(torch.from_numpy(np.ascontiguousarray(pictures))).numpy()
+            self.network.strengthen(1 / SHARPNESS)
 
 
 class Autoencoder(nn.Module):
@@ -82,7 +88,7 @@ class Autoencoder(nn.Module):
         self.target = (min(TARGET, shape[0]), min(TARGET, shape[1]))
         with seeded(seed + 1):
             outputs = self.target[0] * self.target[1] * shape[2]
-            features = encoder.maps.features
+            features = encoder.network.features
             self.decoder = nn.Sequential(nn.Linear(features, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, outputs))
 
     def loss(self, pictures: Tensor) -> Tensor:

@@ -6,14 +6,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
 from pydantic import field_validator
-from torch import nn
 
 from ddco_pyro.data.pictures import Transform
+from ddco_pyro.encoding.autoencoder import PictureNetwork
 from ddco_pyro.errors import BadInput
 from ddco_pyro.fitting.fitted import Fit, load
-from ddco_pyro.model.networks import Inputs, InputShape, Network, build_trunk
+from ddco_pyro.model.networks import InputShape, Network, build_trunk
 from ddco_pyro.model.networks.conv import Conv
 from ddco_pyro.model.networks.lstm import Lstm
 from ddco_pyro.model.networks.perceptrons import Branches
@@ -46,8 +45,8 @@ class Reader(Model):
         return network
 
 
-class FittedReader(nn.Module):
-    """uint8 pictures [N, H, W, C], as they are stored, to the last hidden layer of a fit's network, [N, F].
+class FittedReader(PictureNetwork):
+    """Pictures, as they are stored, to the last hidden layer of a fit's network.
 
     :param about: the network, and how pictures are cropped and scaled for it.
     :param picture: [H, W, C].
@@ -58,16 +57,12 @@ class FittedReader(nn.Module):
         self.about = about
         self.transform = Transform(about.crop, about.resize, about.grey)
         (self.key,) = about.network.inputs
-        shape = InputShape({}, {self.key: self.transform.shape(picture)})
-        self.network = build_trunk(about.network, shape, 1)
+        self.network = build_trunk(about.network, InputShape({}, {self.key: self.transform.shape(picture)}), 1)
         self.eval()
 
     def encode(self, pictures: np.ndarray) -> np.ndarray:
         """Features of each picture by itself, float32 [N, F]."""
-        seen = torch.from_numpy(np.ascontiguousarray(self.transform(pictures)))
-        with torch.no_grad():
-            features, _ = self.network(Inputs({}, {self.key: seen[:, None]}, torch.zeros(1)), ())
-        return features[:, 0, 0].numpy()  # type: ignore[no-any-return]
+        return super().encode(self.transform(pictures))
 
 
 def from_folder(folder: str, key: str, picture: Sequence[int], allow_code: bool = False) -> FittedReader:

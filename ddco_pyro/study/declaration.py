@@ -185,24 +185,23 @@ class Declaration(Model):
 
     def ranges(self, key: str) -> dict[str, range]:
         """All numbers of the blocks of ``seeds``, ``demonstrations`` or ``starts``, by key path."""
-        found = {}
+        once = key == "seeds" or (key == "demonstrations" and self.demonstrations.path is not None)
+        ranges = {}
         for part in PARTS:
             block, seeds = getattr(getattr(self, key), part, None), getattr(self.seeds, part)
             if block is not None and seeds is not None:
-                each = key == "seeds" or (key == "demonstrations" and self.demonstrations.path is not None)
-                found[f"{key}.{part}"] = range(block.first, block.first + block.count * (1 if each else seeds.count))
-        return found
+                stop = block.first + block.count * (1 if once else seeds.count)
+                ranges[f"{key}.{part}"] = range(block.first, stop)
+        return ranges
 
     def _blocks(self) -> Iterator[tuple[str, str]]:
-        data = self.ranges("demonstrations")
-        alike = [self.ranges("seeds"), data | self.ranges("starts")]
-        if self.demonstrations.path is not None:
-            alike = [self.ranges("seeds"), data, self.ranges("starts")]
-        for blocks in alike:
+        seeds, data, starts = map(self.ranges, ("seeds", "demonstrations", "starts"))
+        recorded = self.demonstrations.path is None  # of episodes, as starts are
+        for blocks in (seeds, data | starts) if recorded else (seeds, data, starts):
             for (one, ours), (other, theirs) in itertools.combinations(blocks.items(), 2):
                 if ours.start < theirs.stop and theirs.start < ours.stop:
-                    text = f"{_said(theirs)} overlaps {one} ({_said(ours)}); move one of them"
-                    yield other, text
+                    taken = f"{one} ({ours.start} to {ours.stop - 1})"
+                    yield other, f"{theirs.start} to {theirs.stop - 1} overlaps {taken}; move one of them"
 
     def _data(self) -> Iterator[tuple[str, str]]:
         data, needed = self.demonstrations, max(self.demonstrations.counts) + self.demonstrations.held_out
@@ -259,8 +258,8 @@ class Declaration(Model):
                 yield f"choose_on.{number}", f"{task!r} is not among tasks, or there is nothing to choose; remove it"
         trials = {name: len({point_name(point) for point in self.points(name)}) for name in self.methods}
         if self.choose is not None and len({*trials.values()}) > 1:
-            said = ", ".join(f"{name} {count}" for name, count in trials.items())
-            yield "methods", f"have unequal numbers of points to choose from ({said}); name as many for each"
+            counts = ", ".join(f"{name} {count}" for name, count in trials.items())
+            yield "methods", f"have unequal numbers of points to choose from ({counts}); name as many for each"
         elif self.choose is not None and max(trials.values()) == 1:
             yield "grid", "is empty; name what to choose from"
 
@@ -277,10 +276,6 @@ class Declaration(Model):
     def labels(self) -> list[str]:
         """The names of all methods in the tables of the test."""
         return list(dict.fromkeys(self.label(name, point) for name in self.methods for point in self.points(name)))
-
-
-def _said(numbers: range) -> str:
-    return f"{numbers.start} to {numbers.stop - 1}"
 
 
 @dataclass(frozen=True)
@@ -310,8 +305,8 @@ class Study:
             declared = Declaration.model_validate(data)
         except ValidationError as error:
             raise SpecError(*(f"{path}: {line}" for line in lines(error, Declaration))) from None
-        own = None if declared.spec == INIT else load_spec(path.parent / declared.spec, (), allow_code)
-        study = cls(path, declared, own)
+        base = None if declared.spec == INIT else load_spec(path.parent / declared.spec, (), allow_code)
+        study = cls(path, declared, base)
         if not study.tasks[0] and (declared.starts or declared.demonstrations.path is None):
             where = "the task in which methods act" if declared.starts else "tasks, or a file in demonstrations.path"
             raise SpecError(f"{path}: tasks: missing; name {where}")
@@ -334,8 +329,8 @@ class Study:
 
     def changes(self, method: str, point: dict[str, Any]) -> dict[str, Any]:
         """What a method with a point of the grid changes in the spec, by key path."""
-        own = {**self.declared.overrides, **self.declared.methods[method].overrides, **point}
-        return {"demonstrations.leave_one_out": False, "selection.grid": {}, **own}
+        alone = {"demonstrations.leave_one_out": False, "selection.grid": {}}
+        return {**alone, **self.declared.overrides, **self.declared.methods[method].overrides, **point}
 
     def overridden_code(self) -> dict[str, str]:
         """The user code that the spec of a method names, by method.
@@ -343,7 +338,7 @@ class Study:
         :raises SpecError: the overrides of a method do not fit the spec.
         """
         given: Any = SKELETON if self.base is None else self.base.model_dump(exclude_unset=True)
-        found: dict[str, str] = {}
+        named: dict[str, str] = {}
         for method, point in [(name, one) for name in self.declared.methods for one in self.declared.points(name)]:
             where = self.declared.label(method, point, "")
             try:
@@ -351,8 +346,8 @@ class Study:
             except SpecError as error:
                 raise SpecError(*(f"{self.path}: {where}: {problem}" for problem in error.problems)) from None
             if code := user_code(spec):
-                found[where] = ", ".join(code.values())
-        return found
+                named[where] = ", ".join(code.values())
+        return named
 
     @cached_property
     def source(self) -> Path | None:
@@ -374,12 +369,11 @@ class Study:
             sys.path.append(folder)
         module, _, name = self.declared.world.partition(":")
         try:
-            found = getattr(importlib.import_module(module), name)
+            world = getattr(importlib.import_module(module), name)
         except Exception as error:  # whatever the adapter's code raises
             raise BadInput(f"{self.path}: world: {self.declared.world} cannot be loaded: {error}") from error
         for method in self.declared.methods.values():
-            if method.by is not None and method.by not in found.methods:
-                known = ", ".join(found.methods)
-                text = f"{self.declared.world} has no method {method.by!r}{nearest(method.by, found.methods)}"
-                raise BadInput(f"{self.path}: {text}; it has: {known}")
-        return found
+            if method.by is not None and method.by not in world.methods:
+                text = f"{self.declared.world} has no method {method.by!r}{nearest(method.by, world.methods)}"
+                raise BadInput(f"{self.path}: {text}; it has: {', '.join(world.methods)}")
+        return world
