@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-import shutil
 from collections import Counter
 from dataclasses import replace
 
@@ -74,18 +72,6 @@ def test_pyro_finds_the_dependencies(counts):
     assert {site: set(others) for site, others in relations["sample_sample"].items()} == expected
     assert relations["observed"] == ["a_0", "a_1", "a_2"]
     assert set(relations["plate_sample"]["demonstrations"]) == expected.keys()
-
-
-@pytest.mark.parametrize("counts", [(2,), (2, 3)])
-def test_pyro_draws_the_dependencies(counts):
-    pytest.importorskip("graphviz")
-    expected = causes(len(counts), 3)
-    graph = pyro.render_model(ahmm, model_args=program_of(counts))
-    edges = set(re.findall(r"^\s*(\w+) -> (\w+)", graph.source, re.MULTILINE))
-    assert edges == {(cause, site) for site, others in expected.items() for cause in others}
-    assert set(re.findall(r"(\w+) \[label=\1", graph.source)) == expected.keys()
-    if shutil.which("dot"):
-        assert b"<svg" in graph.pipe(format="svg")
 
 
 # --- samples ----------------------------------------------------------------------------------------------------------

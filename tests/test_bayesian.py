@@ -11,18 +11,14 @@ import pytest
 import torch
 from scipy.stats import chisquare
 
-from ddco_pyro.inference import sample_paths
 from ddco_pyro.inference.marginal import EliminatedAHMM
 from ddco_pyro.model.emissions import Gaussian
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
-from ddco_pyro.model.tables import NEVER, Tables
 
 BINS = 20
 GOALS = np.array([1.0, -1.0])
 """Prior means of the two options' biases: the options cannot be exchanged."""
 SPREAD, SIGMA = 0.6, 0.5
-ENDS = 2.0, 5.0
-"""Of the beta prior of ψ; that of η is Beta(2, 2)."""
 UNIFORM = 1e-3
 """Ranks with a smaller p-value are not uniform."""
 
@@ -87,74 +83,3 @@ def test_log_prob_is_the_density_of_what_is_sampled():
 @pytest.mark.parametrize("wrong", [{"change": memoryless}, {"change": wider}, {"spread": 0.5}])
 def test_ranks_by_a_wrong_log_prob_or_prior_are_not_uniform(wrong):
     assert p_values(ranks_by_log_prob(**wrong)).min() < UNIFORM**2
-
-
-def simulate(replications: int, steps: int, random: np.random.Generator):
-    """Parameters from the prior, and states and controls [R, T] by the definition of §4.1, in plain numpy."""
-    weights = np.stack([np.zeros(2), GOALS], -1) + SPREAD * random.normal(size=(replications, 2, 2))
-    ending, first = random.beta(*ENDS, (replications, 2)), random.beta(2.0, 2.0, replications)
-    states, controls = random.normal(size=(2, replications, steps))
-    rows, option = np.arange(replications), np.zeros(replications, dtype=int)
-    for t in range(steps):
-        selects = (random.random(replications) < ending[rows, option]) | (t == 0)
-        option = np.where(selects, random.random(replications) >= first, option)
-        slope, bias = weights[rows, option].T
-        controls[:, t] = slope * states[:, t] + bias + SIGMA * controls[:, t]
-    return weights, ending, first, states, controls
-
-
-def ranks_by_paths(replications=1000, steps=25, burn=150, thin=8, spread=SPREAD, ends=ENDS, lasting=True) -> np.ndarray:
-    """Ranks of four weights, two ψ and η by Gibbs sampling: paths given parameters, conjugate parameters given paths.
-
-    The sampler starts at the truth, and forgets it within ``burn`` sweeps.
-
-    :param spread, ends: of the prior that the sampler has.
-    :param lasting: whether it draws paths from options that last.
-    """
-    random = np.random.default_rng(4)
-    truth = simulate(replications, steps, random)
-    states, controls = truth[3:]
-    weights, ending, first = truth[:3]
-    center, precision = np.stack([np.zeros(2), GOALS], -1), np.eye(2) / spread**2
-    lengths, x = torch.full((replications,), steps), np.stack([states, np.ones_like(states)], -1)
-    ranks = np.zeros((replications, 7), dtype=int)
-    true = np.concatenate([truth[0].reshape(-1, 4), truth[1], truth[2][:, None]], 1)
-    for sweep in range(burn + (BINS - 1) * thin):
-        density = -0.5 * ((controls[..., None] - np.einsum("rtf,rkf->rtk", x, weights)) / SIGMA) ** 2
-        with np.errstate(divide="ignore"):
-            selection = np.log(np.stack([np.zeros_like(first), first, 1 - first], -1))[:, None, None]
-        termination = np.log(np.stack([1 - ending, ending], -1))[:, None]
-        selection, termination, density, none = (
-            torch.from_numpy(np.broadcast_to(table, (replications, steps, *table.shape[2:])).copy())
-            for table in (selection, termination, density, np.full((1, 1, 1), NEVER))
-        )
-        tables = Tables((selection,), (termination,), (density, none))
-        path = sample_paths(tables if lasting else tables.memoryless(), lengths, 1, (5, sweep))
-        options, ends_here = (kind[0][0].numpy() for kind in (path.choices, path.terminations))
-        active = options[..., None] == [1, 2]
-        ended, going_on = (
-            ((ends_here[:, 1:, None] == value) & active[:, :-1]).sum(1) for value in (1, 0)
-        )  # fmt: skip
-        selected = ((ends_here[..., None] == 1) & active).sum(1)
-        ending = random.beta(ends[0] + ended, ends[1] + going_on)
-        first = random.beta(2 + selected[:, 0], 2 + selected[:, 1])
-        information = precision + np.einsum("rtk,rtf,rtg->rkfg", active, x, x) / SIGMA**2
-        pull = center @ precision + np.einsum("rtk,rtf,rt->rkf", active, x, controls) / SIGMA**2
-        root = np.linalg.cholesky(np.linalg.inv(information))
-        mean = np.linalg.solve(information, pull[..., None])
-        weights = (mean + root @ random.normal(size=(replications, 2, 2, 1)))[..., 0]
-        if sweep >= burn and (sweep - burn) % thin == 0:
-            drawn = np.concatenate([weights.reshape(-1, 4), ending, first[:, None]], 1)
-            ranks += drawn < true
-    return ranks
-
-
-@pytest.mark.slow
-def test_draws_of_paths_make_a_calibrated_sampler():
-    assert p_values(ranks_by_paths()).min() > UNIFORM
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("wrong", [{"spread": SPREAD / 3}, {"ends": (5.0, 2.0)}, {"lasting": False}])
-def test_a_wrong_prior_or_wrong_paths_are_not_calibrated(wrong):
-    assert p_values(ranks_by_paths(replications=400, **wrong)).min() < UNIFORM**2

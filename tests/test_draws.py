@@ -11,7 +11,6 @@ import pytest
 import torch
 from hierarchies import make_hierarchy
 from oracle import brute_force, paths
-from planted import make_spec, make_truth, plant
 from random_demonstrations import of_states
 from scipy import stats
 
@@ -91,36 +90,6 @@ def test_a_demonstrations_draws_depend_on_its_place_and_the_seed_alone() -> None
     both = drawn(hierarchy, of_states(lengths), 6, 1, chains=2).options["level-1"]
     np.testing.assert_array_equal(both[:1], whole)
     assert not np.array_equal(both[0], both[1])
-
-
-@pytest.mark.slow
-def test_draws_are_calibrated() -> None:
-    """Simulation-based calibration (Talts et al., 2018): the truth has each rank among its draws equally often.
-
-    The truth is of Pyro's program run forward. With another termination in the inference its ranks are not uniform.
-    """
-    spec = make_spec((2, 2), control={"std": 0.4, "scale": "none"})
-    truth = make_truth(spec)
-    demos, choices = plant(truth, 300, 12, seed=0)
-    values, random = {}, np.random.default_rng(1)
-    for name, model in (("right", truth), ("wrong", make_truth(spec, ending=0.0))):
-        found = drawn(model, demos, 99)
-        options = np.stack(list(found.options.values()), -1)[0]
-        for what, statistic in STATISTICS.items():
-            theirs, own = statistic(options), statistic(choices.numpy()[None])[0]
-            below, equal = (theirs < own).sum(0), (theirs == own).sum(0)
-            ranks = random.integers(below, below + equal, endpoint=True)
-            values[name, what] = stats.chisquare(np.bincount(ranks // 10, minlength=10)).pvalue
-    assert min(p for (name, _), p in values.items() if name == "right") > 1e-3
-    assert values["wrong", "changes"] < 1e-6
-
-
-STATISTICS = {
-    "changes": lambda options: (np.diff(options[..., 0], axis=-1) != 0).sum(-1),
-    "upper changes": lambda options: (np.diff(options[..., 1], axis=-1) != 0).sum(-1),
-    "steps of option 1": lambda options: (options[..., 0] == 1).sum(-1),
-    "first change": lambda options: (np.diff(options[..., 0], axis=-1) != 0).argmax(-1),
-}
 
 
 # --- chains -----------------------------------------------------------------------------------------------------------

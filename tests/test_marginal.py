@@ -8,7 +8,7 @@ import pyro.distributions as dist
 import pytest
 import torch
 from hierarchies import make_batch, make_hierarchy
-from pyro.infer import MCMC, NUTS, SVI, Trace_ELBO, TraceEnum_ELBO
+from pyro.infer import MCMC, NUTS, Trace_ELBO, TraceEnum_ELBO
 from pyro.infer.autoguide import AutoDelta, AutoNormal
 from torch.func import functional_call
 
@@ -64,27 +64,6 @@ def test_priors_and_guides_see_the_same_as_with_enumeration(counts, guide):
     assert gradients.keys() == expected.keys()
     for name, gradient in gradients.items():
         torch.testing.assert_close(gradient, expected[name], rtol=1e-4, atol=1e-4)
-
-
-@pytest.mark.slow
-def test_svi_reaches_the_posterior_mode():
-    """There the gradient of the prior and that of the likelihood cancel."""
-    pyro.clear_param_store()
-    pyro.set_rng_seed(0)
-    hierarchy, batch = make_hierarchy((2,), network="linear"), make_batch(trajectories=6, steps=8)
-    model = bayesian(hierarchy, batch, True)
-    guide = AutoDelta(model)
-    svi = SVI(model, guide, pyro.optim.Adam({"lr": 0.03}), Trace_ELBO())
-    for _ in range(500):
-        svi.step()
-    found = {
-        name: guide()[name.replace(".", "_")].detach().requires_grad_() for name, _ in hierarchy.named_parameters()
-    }
-    outputs = functional_call(hierarchy, found, (batch.inputs,))
-    likelihood = EliminatedAHMM(outputs, batch.lengths).log_prob(batch.actions).sum()
-    pull = torch.autograd.grad(likelihood, list(found.values()))
-    for value, gradient in zip(found.values(), pull, strict=True):
-        torch.testing.assert_close(gradient, value.detach() / PRIOR**2, atol=2e-2, rtol=1e-2)
 
 
 def test_nuts_moves_with_weights_in_double_precision():

@@ -10,7 +10,6 @@ import pytest
 import torch
 from oracle import paths, random_tables
 from pyro.infer import TraceEnum_ELBO, infer_discrete
-from scipy import stats
 
 from ddco_pyro.inference import most_likely_path, posterior, sample_paths, segment
 from ddco_pyro.inference.enumeration import known_controls
@@ -62,35 +61,6 @@ def test_of_equally_likely_paths_the_one_that_keeps_the_lowest_choices():
     assert as_tuples(most_likely_path(tables, torch.tensor([4])), 0, 4) == (((1,),) * 4, ((1,), (0,), (0,), (0,)))
     never_kept = Tables(tables.selection, (termination * 0 + torch.tensor([NEVER, 0.0]),), tables.control)
     assert as_tuples(most_likely_path(never_kept, torch.tensor([4])), 0, 4) == (((1,),) * 4, ((1,),) * 4)
-
-
-@pytest.mark.parametrize(("counts", "hybrid", "steps"), CASES[1:4])
-def test_sampled_paths_have_the_posteriors_frequencies(counts, hybrid, steps):
-    tables = random_tables(counts, hybrid, steps=steps, seed=12)
-    length, draws = steps - 1, 4000
-    found = sample_paths(tables, torch.tensor([length]), draws, seed=3)
-    seen = {}
-    for m in range(draws):
-        one = as_tuples(found, 0, length, m)
-        seen[one] = seen.get(one, 0) + 1
-    every = {(h, b): p for h, b, p in paths(tables, 0, length, [t.shape[-1] for t in tables.selection]) if p > 0}
-    total = sum(every.values())
-    assert set(seen) <= set(every)
-    common = [one for one, p in every.items() if p / total * draws > 5]
-    counts_seen = [seen.get(one, 0) for one in common]
-    expected = [every[one] / total * draws for one in common]
-    counts_seen.append(draws - sum(counts_seen))
-    expected.append(draws - sum(expected))
-    assert stats.chisquare(counts_seen, expected).pvalue > 1e-3
-
-
-def test_samples_depend_on_their_seed():
-    tables = random_tables((3,), (True,), trajectories=2, steps=20, seed=13)
-    lengths = torch.tensor([20, 15])
-    first, again, other = (sample_paths(tables, lengths, 5, seed).choices[0] for seed in (1, 1, 2))
-    assert torch.equal(first, again)
-    assert not torch.equal(first, other)
-    assert not torch.equal(first[0], first[1])
 
 
 @pytest.mark.parametrize(("counts", "hybrid"), [((3,), (True,)), ((2, 2), (False, True))])
