@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,7 +10,6 @@ from planted import small_spec
 from torch import Tensor
 
 from ddco_pyro.inference import log_likelihood
-from ddco_pyro.model import hierarchy as chunking
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs
@@ -133,43 +128,3 @@ def test_the_gradient_of_chunks_is_the_slope(monkeypatch: pytest.MonkeyPatch) ->
 
     slope = (value(1e-6) - value(-1e-6)) / 2e-6
     assert float(gradient @ direction) == pytest.approx(slope, rel=1e-6)
-
-
-@pytest.mark.slow
-def test_a_gradient_takes_the_memory_of_a_chunk() -> None:
-    """In a process of its own that gives back at once what it frees: what is left on a heap would be taken again."""
-    giving = os.environ | {"MALLOC_MMAP_THRESHOLD_": "100000"}
-    alone = subprocess.run([sys.executable, __file__], env=giving, check=True, capture_output=True, text=True)
-    chunked, whole = map(float, alone.stdout.split())
-    print(f"in chunks {chunked / 1e6:.0f} MB, at once {whole / 1e6:.0f} MB")
-    assert chunked < 2e7 < 5e7 < whole
-
-
-def peaks() -> tuple[float, float]:
-    """What a gradient takes in chunks and at once: 450 pictures of 64 × 64, of which convolutions keep over 50 MB."""
-    torch.set_num_threads(1)
-    spec = small_spec((), {"network": "conv", "filters": 8, "hidden": []}, observations=["camera"])
-    model = Hierarchy(spec, {"camera": (64, 64, 3)}, 2, 450)
-    pictures = torch.randint(256, (1, 450, 64, 64, 3), dtype=torch.uint8)
-    seen = Batch(Inputs({}, {"camera": pictures}, torch.arange(450)), torch.randn(1, 450, 2), torch.tensor([450]))
-
-    def peak(at_once: int) -> float:
-        chunking.BYTES_AT_ONCE = at_once
-        assert model.steps_in_memory > 1
-        Path("/proc/self/clear_refs").write_text("5")  # the highest mark begins anew
-        before = status("VmRSS")
-        value_and_gradient(model, seen, None)
-        return status("VmHWM") - before
-
-    peak(10**6)
-    return peak(2 * 10**7), peak(10**10)
-
-
-def status(what: str) -> int:
-    """A line of this process's status, bytes."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(1024 * int(line.split()[1]) for line in lines if line.startswith(f"{what}:"))
-
-
-if __name__ == "__main__":
-    print(*peaks())

@@ -7,7 +7,6 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-import torch
 from command_line import call
 from planted import make_spec, make_trainer, make_truth, plant, recovered
 
@@ -17,7 +16,6 @@ from ddco_pyro.data.controls import ControlPart, control_dimensions, control_par
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
 from ddco_pyro.exporting import TOLERANCE, export, runner
 from ddco_pyro.spec import ControlSpec, SpecError, dump_spec, with_overrides
-from ddco_pyro.training.networks import Dimensions
 
 STEPS = 30
 
@@ -263,15 +261,7 @@ def test_different_measures_are_not_ranked(fitted, tmp_path):
     assert "kind = auto and kind = gaussian measure different things: control dimension 1" in ended.err
 
 
-def test_a_sigma_for_each_option_is_learned():
-    spec = spec_of(std={"learn": True, "per_option": True})
-    fit = ddco_pyro.fit(with_overrides(spec, {"training.epochs": 60}), demonstrations())
-    level = fit.hierarchy.levels[0].policy.std()
-    assert level.shape == (2, 3)  # three continuous dimensions; the switch has none
-    assert not torch.allclose(level[0], level[1])
-
-
-# --- planted bounds and a planted switch ------------------------------------------------------------------------------
+# --- planted bounds -----------------------------------------------------------------------------------------------
 
 
 BOUND = 0.12
@@ -279,7 +269,6 @@ BOUND = 0.12
 
 TRAINING = {"epochs": 200, "restarts": 1, "patience": 30, "initialize": "vq_controls"}
 CLIPPED = (ControlPart("clipped", (0, 1), "clipped", low=(-BOUND, -BOUND), high=(BOUND, BOUND)),)
-SWITCHED = (ControlPart("hand", (0, 1), "gaussian"), ControlPart("jaw", (2,), "binary", low=(0.0,), high=(0.42,)))
 
 
 def learned(kind, count=4):
@@ -301,37 +290,3 @@ def test_options_with_saturated_controls_are_recovered(tmp_path):
     assert found["found nmi"][0] > 0.98 * found["truth nmi"][0]
     assert found["found"] > found["truth"] - 0.1
     assert found["found nmi"][0] > gaussian["found nmi"][0] - 0.02
-
-
-@pytest.fixture(scope="module")
-def switched():
-    """Two options that move and two that hold the jaw closed, and demonstrations of them."""
-    truth = make_truth(make_spec((4,), control={"std": 0.03, "scale": "none"}), parts=SWITCHED)
-    with torch.no_grad():
-        truth.levels[0].policy.network.layers[0].bias[:, 0, 2] = torch.tensor([4.0, -4.0, 4.0, -4.0])
-    return plant(truth, 40, 25, seed=1)[0]
-
-
-def switches(jaw):
-    """How often the jaw changes, per step, over episodes [N, T]."""
-    return float((np.diff(jaw, axis=1) != 0).mean())
-
-
-def test_a_switch_is_never_half_open_and_switches_as_often(switched, tmp_path):
-    """Rolled out in the plane that the demonstrations were made in."""
-    parts = control_parts(learned("auto").control, Dimensions.of(switched).control)
-    assert {part.kind: part.dims for part in parts} == {"gaussian": (0, 1), "binary": (2,)}
-    model = make_trainer(learned("auto"), switched, tmp_path / "fit").run()
-    controller, jaws = Controller(model, "sample"), []
-    controller.reset_all(range(100))
-    state = np.random.default_rng(0).uniform(-1, 1, (100, 2))
-    for _ in range(30):
-        controls = controller.act_all([{"state": row} for row in state])
-        jaws.append(controls[:, 2])
-        state = (state + controls[:, :2]).clip(-1, 1)
-    rolled = np.stack(jaws, axis=1)
-    assert set(np.unique(rolled)) == {0.0, 0.42}
-    demonstrated = np.stack([demo.actions[:, 2] for demo in switched])
-    error = (0.25 / rolled.size) ** 0.5
-    assert abs(switches(rolled) - switches(demonstrated)) < 0.03 + 3 * error
-    assert abs((rolled > 0).mean() - (demonstrated > 0).mean()) < 0.1

@@ -20,7 +20,6 @@ from random_demonstrations import numbered
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.pictures import padded
-from ddco_pyro.exporting import export
 from ddco_pyro.model.networks.conv import _field_means
 from ddco_pyro.spec import Spec
 from ddco_pyro.training import devices
@@ -148,15 +147,6 @@ def test_the_double_refuses_what_was_left_on_the_host() -> None:
         with pytest.raises(AssertionError, match="mixes devices"):
             there + torch.ones(3)
         assert float((there + 1).cpu().sum()) == 6
-
-
-@pytest.mark.slow
-def test_what_was_fitted_elsewhere_is_exported(demos: Demonstrations, tmp_path, monkeypatch) -> None:
-    on(monkeypatch, THERE)
-    with Device():
-        fit = ddco_pyro.fit(spec_of(SAME["mlp"], epochs=1), demos)
-        fit.hierarchy.place(torch.device("cpu"))
-    assert export(fit, tmp_path / "out").keys() == {"numpy", "torch"}
 
 
 @pytest.mark.parametrize("size", [(9, 7), (8, 16), (5, 30)])

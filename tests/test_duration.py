@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 import torch
 from planted import make_spec, make_trainer, make_truth, plant, tabulated
-from scipy import integrate, stats
+from scipy import stats
 
 import ddco_pyro
 from ddco_pyro.inference import log_likelihood
@@ -46,20 +44,6 @@ def test_it_is_a_beta_density_of_each_logit_summed_over_steps(mean):
             total += [density[n, :length].sum() for n, length in enumerate(LENGTHS.tolist())]
         expected.append(total)
     assert (values[0] - values[1]).numpy() == pytest.approx(expected[0] - expected[1], rel=1e-9)
-
-
-def test_the_mean_of_that_density_is_one_in_as_many_steps():
-    """E[ψ] = 1/m, by integration over the logit."""
-
-    def density(x):
-        return math.exp(float(log_duration_prior([log_termination(torch.full((1, 1, 1), x))], torch.tensor([1]), own)))
-
-    own = prior(20, 3)
-    total, first = (
-        integrate.quad(lambda x, f=f: f(12 * math.tanh(x / 12)) * density(x), -10, 4, limit=200)[0]
-        for f in (lambda _: 1.0, lambda x: 1 / (1 + math.exp(-x)))
-    )
-    assert first / total == pytest.approx(1 / 20, rel=0.02)  # the bound on logits bends them a little
 
 
 def test_no_weight_is_no_prior_and_lower_levels_alone_have_theirs():

@@ -10,7 +10,6 @@ from odd_files.atoms import ROWS, at_bounds, no_ops
 from planted import make_spec
 
 import ddco_pyro
-from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.controls import control_dimensions, control_parts, described
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.exporting import TOLERANCE, export, runner
@@ -158,17 +157,6 @@ def test_values_are_emitted_exactly_and_exports_act_alike(fitted, control, tmp_p
         np.testing.assert_array_equal(rests, own[:, 2] == 0)
         assert {-1.0, 0.0, 1.0} <= set(own[:, 0])
         assert (np.abs(own[:, 0]) <= 1).all()
-
-
-def test_a_controller_rests_as_often_as_the_demonstrations(fitted):
-    """Samples in the states of the demonstrations, where resting depends on the state."""
-    controller, demos = Controller(fitted.hierarchy, "sample"), mixed()
-    controller.reset_all(range(len(demos)))
-    steps = [controller.act_all([{"state": demo.observations["state"][t]} for demo in demos]) for t in range(40)]
-    shown = np.concatenate([demo.actions for demo in demos])
-    for dimension, value in ((0, 0.0), (1, STILL)):
-        share = (np.concatenate(steps)[:, dimension] == value).mean()
-        assert abs(share - (shown[:, dimension] == value).mean()) < 0.1
 
 
 @pytest.mark.parametrize("row", ROWS)

@@ -213,16 +213,6 @@ def test_equal_seeds_give_equal_clusters():
     assert len({tuple(alive(Clusters(batch, 4, seed=seed).choices(batch))) for seed in range(6)}) > 1
 
 
-def test_the_clusters_leave_the_global_randomness_alone():
-    batch = make_batch(random_rows(11, 3), random_rows(12, 2))
-    np.random.seed(0)  # noqa: NPY002 (the global one is meant)
-    torch.manual_seed(0)
-    before = np.random.get_state()[1].tolist(), torch.get_rng_state()  # noqa: NPY002
-    Clusters(batch, 4, seed=5)
-    assert np.random.get_state()[1].tolist() == before[0]  # noqa: NPY002
-    assert torch.equal(torch.get_rng_state(), before[1])
-
-
 @pytest.mark.filterwarnings("error")
 def test_there_are_no_more_clusters_than_distinct_observations():
     place, _, actions = planted()

@@ -97,28 +97,6 @@ def test_it_is_the_likelihood_of_the_paths_that_have_the_labels(counts, level):
     assert objective.tune(model) == pytest.approx(values["tune"] / STEPS, abs=1e-5)
 
 
-def test_its_gradient_is_that_of_finite_differences():
-    material = make(labelled(), random_demonstrations())
-    model = material.hierarchy(0)
-    assert model.step_bytes > 0  # counted on the model as built
-    model = model.double()
-    double = material.train.inputs.map(torch.Tensor.double, torch.arange(STEPS))
-    material = replace(material, train=replace(material.train, inputs=double))
-    objective, rows = whole(material), torch.arange(len(material.train))
-    parameter = model.levels[0].termination.layers[0].weight
-    backward(objective, model, material.train, rows)
-    gradients = parameter.grad.clone()
-    for place in ((0, 0, 0), (1, 1, 0)):
-        gradient, values = float(gradients[place]), []
-        for step in (1e-4, -1e-4):
-            with torch.no_grad():
-                parameter[place] += step
-            values.append(backward(objective, model, material.train, rows))
-            with torch.no_grad():
-                parameter[place] -= step
-        assert gradient == pytest.approx(-(values[0] - values[1]) / 2e-4 / material.train.steps, rel=1e-5, abs=1e-9)
-
-
 @pytest.mark.parametrize(
     ("level", "own", "stages"),
     [

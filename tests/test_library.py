@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import math
-import signal
-import subprocess
-import sys
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -20,12 +17,11 @@ from selecting import DATA, data_at, two_skills
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
 from ddco_pyro.errors import BadInput
-from ddco_pyro.events import TrainingBegan
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.fitting.run import RunError
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.report import write_report
-from ddco_pyro.spec import load_spec, parse_spec, with_overrides
+from ddco_pyro.spec import load_spec, with_overrides
 
 FLAT = {"kind": "flat", "policy": {"network": "linear"}}
 
@@ -281,45 +277,6 @@ def test_the_spec_says_what_is_seen_of_demonstrations_from_memory(in_memory: ddc
         ddco_pyro.fit(with_overrides(in_memory.spec, {"observations": ["plac"]}), two_skills())
     with pytest.raises(DemonstrationsError, match=r"there is no labels/phase; there is: nothing"):
         ddco_pyro.fit(with_overrides(in_memory.spec, {"demonstrations.labels": "phase"}), two_skills())
-
-
-BESIDE = {"kind": "flat", "policy": {"network": "mlp", "hidden": [4]}, "optimizer": {"name": "adam"}}
-KILLED = """
-import os, pathlib, signal, sys, time
-from ddco_pyro.events import EpochEnded
-from ddco_pyro.fitting import fit
-fit.LONG = 0
-out = pathlib.Path(sys.argv[2])
-def strike(event):
-    while isinstance(event, EpochEnded) and not list(out.glob("baselines/*/checkpoints/*")):
-        time.sleep(0.01)
-    if isinstance(event, EpochEnded):
-        os.kill(os.getpid(), signal.SIGKILL)
-fit.fit(sys.argv[1], out=out, on_event=strike, jobs=2)
-"""
-
-
-@pytest.mark.slow
-def test_baselines_in_other_processes_are_the_same_also_after_a_kill(commanded: Path, tmp_path: Path, monkeypatch):
-    """The first run is killed, with its worker, once the worker has written a checkpoint."""
-    data = spec_for(commanded / "demos.hdf5", compare_with=[FLAT, BESIDE])
-    (tmp_path / "spec.yaml").write_text(yaml.safe_dump(data))
-    told: dict[int, list[object]] = {1: [], 2: []}
-    killed = subprocess.run([sys.executable, "-c", KILLED, tmp_path / "spec.yaml", tmp_path / "2"])
-    assert killed.returncode == -signal.SIGKILL
-    monkeypatch.setattr("ddco_pyro.fitting.fit.LONG", 0)
-    fits = [
-        ddco_pyro.fit(tmp_path / "spec.yaml", out=tmp_path / str(jobs), on_event=told[jobs].append, jobs=jobs)
-        for jobs in (1, 2)
-    ]
-    assert numbers(fits[0]) == numbers(fits[1])
-    for path in sorted((tmp_path / "1").rglob("*.safetensors")) + sorted((tmp_path / "1").rglob("*.csv")):
-        assert path.read_bytes() == (tmp_path / "2" / path.relative_to(tmp_path / "1")).read_bytes()
-    began = [[event for event in events if isinstance(event, TrainingBegan)] for events in told.values()]
-    assert began[0] == [TrainingBegan(name, 8) for name in ("ddco", "flat", "flat_2")]
-    assert began[1] == [TrainingBegan(name, 8) for name in ("ddco", "flat_2", "flat")]  # this process has its share
-    again = ddco_pyro.fit(parse_spec(data), two_skills(), jobs=2)  # without a folder
-    assert numbers(again.baselines["flat_2"]) == numbers(fits[0].baselines["flat_2"])
 
 
 def test_another_process_fits_a_baseline_whose_restarts_are_short(in_memory: ddco_pyro.Fit, monkeypatch) -> None:

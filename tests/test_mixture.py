@@ -2,28 +2,21 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
 import yaml
 from hierarchies import make_batch, make_hierarchy
 from oracle import brute_force
-from planted import make_spec, make_truth, plant
 from toy_task import SPEC
 
 import ddco_pyro
-from ddco_pyro.acting.controller import Controller
 from ddco_pyro.drawing import words
 from ddco_pyro.evaluation import verdicts
 from ddco_pyro.evaluation.worth import mean_run, worth
 from ddco_pyro.inference import log_likelihood, posterior
 from ddco_pyro.inference.engines import compare_engines
 from ddco_pyro.metrics import Worth
-from ddco_pyro.model.batch import encode
-from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.tables import always_ends
 from ddco_pyro.segmenting import LevelLabels
 from ddco_pyro.selection.grid import candidates
@@ -72,36 +65,6 @@ def test_any_level_can_be_without_memory(counts, memoryless):
         value = float(log_likelihood(tables, batch.lengths)[0])
     assert value == pytest.approx(truth.log_likelihood, abs=1e-6)
     assert compare_engines(outputs, batch.actions, batch.lengths).agrees
-
-
-# --- acting -----------------------------------------------------------------------------------------------------------
-
-
-def test_a_controller_chooses_by_the_gate_alone():
-    """How often each option follows each other does not depend on the one before: its share is the gate's."""
-    hierarchy = make_hierarchy((3,), memoryless=[1])
-    controller = Controller(hierarchy, options="sample")
-    controller.reset_all(range(400))
-    state = np.array([0.3, -0.2, 0.5])
-    chosen = []
-    for _ in range(25):
-        controller.act_all([{"state": state}] * 400)
-        chosen.append(controller.all_choices[:, 0])
-        assert (controller.all_terminations == 1.0).all()
-    before, after = np.concatenate(chosen[:-1]), np.concatenate(chosen[1:])
-    gate = gate_of(hierarchy, state)
-    for option in (1, 2, 3):
-        rows = after[before == option]
-        shares = np.bincount(rows, minlength=4)[1:] / len(rows)
-        assert np.abs(shares - gate).max() < 4 * math.sqrt(0.25 / len(rows))
-
-
-def gate_of(hierarchy, state):
-    """η(h | s) of each option."""
-    seen = torch.as_tensor(state).float().reshape(1, 1, -1)
-    with torch.no_grad():
-        tables = hierarchy(Inputs({"state": seen}, {}, torch.zeros(1, dtype=torch.int64))).tables()
-    return tables.selection[0][0, 0, 0, 1:].exp().numpy()
 
 
 # --- the spec ---------------------------------------------------------------------------------------------------------
@@ -270,18 +233,3 @@ def test_its_segments_are_runs_of_one_expert():
     ended, active = np.ones(6, int), np.eye(3)[options]
     assert LevelLabels.of(options, ended, active, lasts=False).runs() == [(1, 0, 2), (2, 2, 5), (1, 5, 6)]
     assert len(LevelLabels.of(options, ended, active, lasts=True).runs()) == 6
-
-
-def test_planted_memory_shows_in_the_likelihood():
-    """Options that last whatever the state says are worth nats; the same networks without memory lack them."""
-    truth = make_truth(make_spec((4,)))
-    demos, _ = plant(truth, number=20, steps=30, seed=0)
-    batch = encode(demos, truth.encoder, truth.scaling)
-    with torch.no_grad():
-        tables = truth.tabulate(batch)
-    ended = torch.tensor([-math.inf, 0.0]).expand(tables.termination[0].shape)
-    lasting, mixture = (
-        log_likelihood(each, batch.lengths) / batch.lengths for each in (tables, replace(tables, termination=(ended,)))
-    )
-    difference = (lasting - mixture).numpy()
-    assert difference.mean() - 3 * difference.std() / math.sqrt(len(difference)) > 0.5

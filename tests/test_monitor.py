@@ -147,24 +147,3 @@ def test_steps_are_those_of_the_whole_demonstration(differences):
         assert one.time.tolist() == [t]
         torch.testing.assert_close(one.vector[0, 0], whole.vector[0, t])
         assert one.vectors["step"].shape == (1, 1, 1)
-
-
-@pytest.mark.parametrize(
-    ("observation", "message"),
-    [
-        ({"pose": np.zeros(2), "jaw": np.zeros(1)}, r"^the observation has no 'state' \(it has: jaw, pose\)$"),
-        ({"state": np.zeros(3)}, r"^observation 'state' has shape \(3,\), the demonstrations had \(2,\)$"),
-        ({"state": np.zeros((1, 2))}, r"^observation 'state' has shape \(1, 2\), the demonstrations had \(2,\)$"),
-        ({"state": np.array([0.0, np.nan])}, r"^observation 'state' is not finite$"),
-    ],
-)
-def test_what_cannot_be_used_is_refused_and_leaves_the_window_as_it_was(observation, message):
-    encoder, states = make_encoder()
-    refusing, other = Window(encoder), Window(encoder)
-    refusing.inputs([{"state": states[0]}])
-    other.inputs([{"state": states[0]}])
-    with pytest.raises(ObservationError, match=message):
-        refusing.inputs([observation])
-    found, expected = refusing.inputs([{"state": states[1]}]), other.inputs([{"state": states[1]}])
-    torch.testing.assert_close(found.vector, expected.vector)
-    assert found.time.tolist() == [1]

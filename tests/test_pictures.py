@@ -16,7 +16,6 @@ import yaml
 from command_line import call
 from dots import followed
 from elsewhere import THERE, Device
-from killing import struck
 from odd_files.hdf5 import spoil
 
 import ddco_pyro
@@ -301,31 +300,6 @@ def test_a_worker_that_dies_is_one_line(kept: Path) -> None:
             process.join()
         with pytest.raises(Failed, match=r"a process that read pictures was ended from outside .* training\.workers"):
             list(map(readers.take, jobs[1:]))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("whom", "expected"), [("os.getpid()", -9), ("active_children()[0].pid", 1)])
-def test_killed_while_workers_read(kept: Path, tmp_path: Path, whom: str, expected: int) -> None:
-    """SIGKILL in the third epoch, of the fit or of its worker, which is one line; called again, it ends with the bits
-    of an undisturbed fit.
-    """
-    data = spec_of(kept, "camera", epochs=4, initialize="random", layerwise=False, workers=1)
-    spec = tmp_path / "spec.yaml"
-    spec.write_text(yaml.safe_dump(data | {"compare_with": []}))
-    strike = f"from multiprocessing import active_children; os.kill({whom}, signal.SIGKILL)"
-    status, err = struck(("fit", spec, "--out", "killed"), tmp_path, "EpochEnded", 3, strike)
-    assert status == expected
-    said = [line for line in err.splitlines() if line.startswith("ddco-pyro: ")]
-    assert len(said) == (expected == 1)
-    assert all(line.startswith("ddco-pyro: a process that read pictures was ended from outside") for line in said)
-    assert "Traceback" not in err
-    assert (tmp_path / "killed" / "checkpoints" / "restart-0.safetensors").exists()
-    assert not (tmp_path / "killed" / "model.safetensors").exists()
-    for name in ("killed", "whole"):
-        ended = call("fit", spec, "--out", tmp_path / name)
-        assert ended.status == 0, ended.err
-    for name in ("model.safetensors", "history.csv"):
-        assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
 
 
 def test_a_damaged_picture_is_one_line(kept: Path, tmp_path: Path) -> None:

@@ -10,8 +10,6 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 import torch
-from random_demonstrations import numbered
-from sklearn.metrics import normalized_mutual_info_score
 
 import ddco_pyro
 from ddco_pyro.events import EpochEnded
@@ -121,60 +119,9 @@ def test_only_the_training_demonstrations_standardise(toy_run, parts, toy_spec):
     np.testing.assert_allclose(toy_run.hierarchy.scaling.scale, controls.std(0))
 
 
-def test_agreement_with_the_labels_can_be_computed_again(toy_run, parts):
-    for name, part in parts.items():
-        (segments,) = toy_run.segment(part)
-        found = np.concatenate(segments)
-        truth = np.concatenate([demo.labels["phase"] for demo in part])
-        (scores,) = getattr(toy_run.metrics.agreement, name)
-        assert scores.nmi == pytest.approx(normalized_mutual_info_score(truth, found))
-        values, counts = np.unique(found, return_counts=True)
-        (table,) = toy_run.metrics.agreement.confusion  # of the part that comes last, which is held out
-        assert name == "train" or np.sum(table.steps, 0).tolist() == counts.tolist()
-        assert name == "train" or table.options == values.tolist()
-    assert toy_run.metrics.agreement.labels == ["phase"]
-
-
 def test_the_use_of_options_can_be_computed_again(toy_run, demos):
     u = toy_run.posterior(demos).u[0].sum((0, 1))
     assert [one.share for one in toy_run.metrics.options[0]] == pytest.approx((u / u.sum()).tolist())
-
-
-@pytest.fixture(scope="module")
-def planted(tmp_path_factory):
-    """Demonstrations of two skills that ``side`` tells apart: label 5 follows ``place``, label 2 flees from it.
-
-    No single linear policy does both.
-    """
-    random, rows = np.random.default_rng(0), []
-    for _ in range(12):
-        labels = np.repeat([5, 2, 5], [4, 5, 4])
-        side = np.where(labels == 5, 1.0, -1.0)
-        place = random.normal(size=13)
-        observations = {"side": (side + 0.1 * random.normal(size=13))[:, None], "place": place[:, None]}
-        actions = (side * place)[:, None] + 0.1 * random.normal(size=(13, 1))
-        rows.append((observations, actions, {"skill": labels}))
-    path = tmp_path_factory.mktemp("planted") / "demos.hdf5"
-    numbered(rows).write(path)
-    return path
-
-
-LINEAR = {
-    f"hierarchy.{place}.network": "linear" for place in ("levels.0.policy", "levels.0.termination", "meta_policy")
-}
-
-
-def test_planted_skills_are_found(planted, tmp_path, toy_spec):
-    data = {"demonstrations": {"path": str(planted), "labels": "skill"}, "observations": ["side", "place"]}
-    training = {"training.epochs": 60, "training.optimizer": {"name": "em"}, "compare_with": []}
-    spec = with_overrides(toy_spec, {"task": None} | data | training | LINEAR)
-    found = fit(spec, out=tmp_path / "run")
-    (scores,) = found.metrics.agreement.valid
-    assert (scores.nmi, scores.boundary_f1_1) == (pytest.approx(1), 1)
-    assert {value for _, value in scores.matched_globally} == {1}
-    (table,) = found.metrics.agreement.confusion
-    assert (table.labels, sorted(table.matched)) == ([2, 5], [2, 5])
-    assert found.metrics.demonstrations.supervisor == {}
 
 
 # --- going on ---------------------------------------------------------------------------------------------------------
