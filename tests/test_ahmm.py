@@ -14,7 +14,7 @@ from pyro.infer.inspect import get_model_relations
 
 from ddco_pyro.inference import log_likelihood
 from ddco_pyro.inference.enumeration import known_controls
-from ddco_pyro.model.ahmm import Tabulated, ahmm
+from ddco_pyro.model.ahmm import ahmm
 from ddco_pyro.model.tables import NEVER, Tables, complete
 
 SAMPLES = 4000
@@ -97,16 +97,6 @@ def test_samples_keep_to_the_rules(hybrid):
     assert set(h[..., 1].unique().tolist()) >= {1, 2}
 
 
-def test_past_the_end_every_choice_is_kept():
-    steps, length = 6, 2
-    tables = random_tables((3, 2), (True, True), trajectories=50, steps=steps, seed=5)
-    trace = run_forward(tables, torch.full((50,), length))
-    h, b = latents(trace, 2, steps)
-    assert (b[:, length:] == 0).all()
-    assert torch.equal(h[:, length:], h[:, length - 1 : length].expand(-1, steps - length, -1))
-    assert all(not trace.nodes[f"a_{t}"]["log_prob"].any() for t in range(length, steps))
-
-
 @pytest.mark.parametrize(
     ("counts", "hybrid", "steps"), [((2,), (True,), 4), ((2, 2), (False, True), 3), ((1, 1, 1), (True, True, True), 3)]
 )
@@ -147,31 +137,6 @@ def test_what_is_sampled_has_the_probability_of_the_paper():
     assert len(seen) >= 4
 
 
-# --- a choice with a table --------------------------------------------------------------------------------------------
-
-
-def test_a_tabulated_choice_gives_its_entries_as_they_are():
-    log_probs = torch.tensor([[0.5, NEVER, -2.0], [NEVER, NEVER, 0.0]])  # not normalised
-    choice = Tabulated(log_probs)
-    assert choice.batch_shape == (2,)
-    assert choice.log_prob(torch.tensor([0, 2])).tolist() == [0.5, 0.0]
-    assert choice.log_prob(torch.tensor([1, 0])).tolist() == [-torch.inf, -torch.inf]
-    every = choice.enumerate_support()
-    assert every.tolist() == [[0, 0], [1, 1], [2, 2]]
-    assert choice.enumerate_support(expand=False).tolist() == [[0], [1], [2]]
-    assert torch.equal(choice.log_prob(every), log_probs.T)
-    assert torch.equal(choice.log_prob(choice.enumerate_support(expand=False)), log_probs.T)
-    larger = choice.expand((4, 2))
-    assert larger.batch_shape == (4, 2)
-    assert torch.equal(larger.log_prob(torch.full((4, 2), 2)), torch.tensor([-2.0, 0.0]).expand(4, 2))
-
-
-def test_the_gradient_of_a_tabulated_choice_is_its_entry():
-    log_probs = torch.tensor([NEVER, -1.0, -3.0], requires_grad=True)
-    Tabulated(log_probs).log_prob(torch.tensor(1)).backward()
-    assert log_probs.grad.tolist() == [0, 1, 0]
-
-
 # --- tables -----------------------------------------------------------------------------------------------------------
 
 
@@ -210,21 +175,6 @@ def test_the_gradient_where_some_choices_are_known_is_that_of_finite_differences
         return log_likelihood(Tables.of(len(counts), leaves).clamp(1, choices), lengths)
 
     assert torch.autograd.gradcheck(value, leaves)
-
-
-def test_where_every_choice_is_known_only_terminations_are_summed_over():
-    """By hand: the option may stay, or end and be chosen again. Levels may be clamped in any order."""
-    tables = random_tables((2,), (False,), steps=2, seed=12)
-    choices = torch.tensor([[1, 1]])
-    eta, psi = tables.selection[0][0, :, 0].exp(), tables.termination[0][0, 1, 0].exp()
-    control = tables.control[0][0, :, 0]
-    expected = eta[0, 1].log() + (psi[0] + psi[1] * eta[1, 1]).log() + control.sum()
-    found = log_likelihood(tables.clamp(1, choices), torch.tensor([2]))
-    assert float(found) == pytest.approx(float(expected), abs=1e-12)
-    two = random_tables((2, 2), (False, False), steps=2, seed=12)
-    once, again = two.clamp(1, choices).clamp(2, choices), two.clamp(2, choices).clamp(1, choices)
-    for one, other in zip(once.evidence, again.evidence, strict=True):
-        assert one.tolist() == other.tolist() == [[[NEVER, 0, NEVER]] * 2]
 
 
 def test_a_trajectory_alone_is_what_it_is_among_others():

@@ -105,26 +105,3 @@ def test_a_chunk_drops_the_same_in_both_passes(network: str, monkeypatch: pytest
     assert (again[1] - kept[1]).abs().max() <= 1e-10 * kept[1].abs().max()
     model.eval()
     assert value_and_gradient(model, seen, None)[0] != kept[0]  # dropout matters
-
-
-def test_the_gradient_of_chunks_is_the_slope(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Against finite differences of the unchunked value, along a random direction of all parameters."""
-    model, seen = hierarchy("lstm over conv").eval(), batch()
-    in_chunks(monkeypatch, model, 3)
-    gradient = value_and_gradient(model, seen, None)[1]
-    monkeypatch.undo()
-    parameters = list(model.parameters())
-    direction = torch.randn(len(gradient), generator=torch.Generator().manual_seed(5), dtype=torch.float64)
-    parts = direction.split([parameter.numel() for parameter in parameters])
-
-    def value(step: float) -> float:
-        with torch.no_grad():
-            for parameter, part in zip(parameters, parts, strict=True):
-                parameter += step * part.view_as(parameter)
-            total = float(log_likelihood(model.tabulate(seen), seen.lengths).sum())
-            for parameter, part in zip(parameters, parts, strict=True):
-                parameter -= step * part.view_as(parameter)
-        return total
-
-    slope = (value(1e-6) - value(-1e-6)) / 2e-6
-    assert float(gradient @ direction) == pytest.approx(slope, rel=1e-6)

@@ -8,11 +8,11 @@ import h5py
 import numpy as np
 import pytest
 from command_line import call
-from planted import make_spec, make_trainer, make_truth, plant, recovered
+from planted import make_spec
 
 import ddco_pyro
 from ddco_pyro.acting.controller import Controller
-from ddco_pyro.data.controls import ControlPart, control_dimensions, control_parts, described
+from ddco_pyro.data.controls import control_dimensions, control_parts, described
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
 from ddco_pyro.exporting import TOLERANCE, export, runner
 from ddco_pyro.spec import ControlSpec, SpecError, dump_spec, with_overrides
@@ -259,34 +259,3 @@ def test_different_measures_are_not_ranked(fitted, tmp_path):
     ended = call("select", tmp_path / "grid.yaml", "--out", tmp_path / "selected")
     assert ended.status == 2
     assert "kind = auto and kind = gaussian measure different things: control dimension 1" in ended.err
-
-
-# --- planted bounds -----------------------------------------------------------------------------------------------
-
-
-BOUND = 0.12
-"""Far from its corner an option is on a bound nearly always: more than half of the controls are."""
-
-TRAINING = {"epochs": 200, "restarts": 1, "patience": 30, "initialize": "vq_controls"}
-CLIPPED = (ControlPart("clipped", (0, 1), "clipped", low=(-BOUND, -BOUND), high=(BOUND, BOUND)),)
-
-
-def learned(kind, count=4):
-    control = {"kind": kind, "std": {"learn": True, "floor": 0.005}, "scale": "none"}
-    return make_spec((count,), control=control, **TRAINING)
-
-
-def test_options_with_saturated_controls_are_recovered(tmp_path):
-    """Clipped emissions find them and reach the truth's held-out likelihood, and Gaussian ones are no better."""
-    truth = make_truth(make_spec((3,), control={"std": 0.03, "scale": "none"}), parts=CLIPPED)
-    demos, _ = plant(truth, 40, 25, seed=1)
-    held_out = plant(truth, 30, 25, seed=2)
-    controls = np.concatenate([demo.actions for demo in demos])
-    assert (np.abs(controls) == BOUND).mean() > 0.3
-    auto = make_trainer(learned("auto", 3), demos, tmp_path / "auto")
-    assert [part.kind for part in auto.hierarchy.scaling.parts] == ["clipped"]
-    found = recovered(auto.run(), truth, *held_out)
-    gaussian = recovered(make_trainer(learned("gaussian", 3), demos, tmp_path / "gaussian").run(), truth, *held_out)
-    assert found["found nmi"][0] > 0.98 * found["truth nmi"][0]
-    assert found["found"] > found["truth"] - 0.1
-    assert found["found nmi"][0] > gaussian["found nmi"][0] - 0.02

@@ -67,27 +67,6 @@ def test_tables_are_normalised(counts, emits):
     assert tables.control[-1].isfinite().all() == ("control" in emits)
 
 
-def test_policy_and_termination_read_the_trunk_of_their_option():
-    hierarchy = make_hierarchy((3,), network="linear", trunk={"network": "lstm", "over": {"hidden": [5]}, "hidden": 4})
-    batch, level = make_batch(), hierarchy.levels[0]
-    outputs = hierarchy(batch.inputs)
-    features, _ = level.trunk(batch.inputs, level.trunk.initial_state(2))
-    assert features.shape == (*batch.inputs.batch, 3, 4)
-    for head, found in (
-        (level.policy.network, outputs.callers[0].numbers),
-        (level.termination, outputs.termination_logits[0].unsqueeze(-1)),
-    ):
-        weight, bias = head.layers[0].weight, head.layers[0].bias
-        expected = torch.stack([features[:, :, k] @ weight[k] + bias[k] for k in range(3)], dim=2)
-        torch.testing.assert_close(found, expected)
-    narrow, wide = (
-        make_hierarchy((3,), network="linear", trunk={"network": "lstm", "hidden": size}).step_bytes
-        for size in (100, 200)
-    )
-    assert wide == pytest.approx(2 * narrow, rel=0.1)  # the gates of each step, not weights, which are squares
-    assert hierarchy.step_bytes > make_hierarchy((3,), network="linear").step_bytes
-
-
 def test_discovery_sees_a_uniform_meta_policy():
     hierarchy, batch = make_hierarchy((3, 2)), make_batch()
     tables = hierarchy.tabulate(batch, discovering=1)

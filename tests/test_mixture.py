@@ -14,7 +14,7 @@ import ddco_pyro
 from ddco_pyro.drawing import words
 from ddco_pyro.evaluation import verdicts
 from ddco_pyro.evaluation.worth import mean_run, worth
-from ddco_pyro.inference import log_likelihood, posterior
+from ddco_pyro.inference import log_likelihood
 from ddco_pyro.inference.engines import compare_engines
 from ddco_pyro.metrics import Worth
 from ddco_pyro.model.tables import always_ends
@@ -33,24 +33,6 @@ from ddco_pyro.training.objective import log_duration_prior
 from ddco_pyro.training.upper import Constants, fitted
 
 # --- the likelihood ---------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("emits", [("options",), ("options", "control")])
-def test_each_step_is_a_mixture_of_experts(emits):
-    """Σ_t log Σ_h η(h | s_t) π_h(a_t | s_t), in plain sums; with control the meta-policy is one more expert."""
-    hierarchy, batch = make_hierarchy((3,), emits, memoryless=[1]), make_batch()
-    with torch.no_grad():
-        tables = hierarchy.tabulate(batch)
-    gate = tables.selection[0][:, :, 0].double().exp()
-    experts = torch.cat([tables.control[1], tables.control[0]], dim=-1).double().exp()
-    steps = (gate * experts).sum(-1).log()
-    for engine in ("fused", "enumerate"):
-        values = log_likelihood(tables, batch.lengths, engine=engine)
-        for n, length in enumerate(batch.lengths.tolist()):
-            assert float(values[n]) == pytest.approx(float(steps[n, :length].sum()), abs=1e-6)
-    (u,) = posterior(tables, batch.lengths).u
-    expected = (gate * experts) / (gate * experts).sum(-1, keepdim=True)
-    assert torch.allclose(u[0], expected[0], atol=1e-6)
 
 
 @pytest.mark.parametrize(("counts", "memoryless"), [((2, 2), [1]), ((2, 2), [2]), ((2, 2), [1, 2])])

@@ -70,17 +70,6 @@ def _count(h, b, weight, depth, selected, ended):
             ended[level - 1][h[t - 1][level] - 1, b[t][level]] += weight
 
 
-def test_no_iteration_lowers_the_likelihood(monkeypatch):
-    monkeypatch.setattr(upper, "PSEUDO", 0.0)
-    tables = random_tables((3, 2, 2), (False,) * 3, 5, 12, seed=3)
-    pieces, constants, values = [(tables, torch.tensor([12, 7, 12, 1, 9]))], random_constants(tables), []
-    for _ in range(25):
-        value, constants = improved(pieces, constants)
-        values.append(value)
-    assert np.diff(values).min() > -1e-9
-    assert values[-1] > values[0] + 0.01
-
-
 def test_demonstrations_count_alike_in_one_piece_and_in_two():
     tables, lengths = random_tables((3, 2), (False, False), 4, 6), torch.tensor([6, 4, 6, 5])
     parts = [(_rows(tables, rows), lengths[rows]) for rows in (slice(0, 1), slice(1, 4))]
@@ -175,12 +164,6 @@ def test_labels_say_which_option_is_which():
         constants = fitted([(tables.clamp(2, labels), lengths)], seed=0)
         segments = segment(constants.within(tables), lengths)[1]
         assert (segments == truth)[3:].double().mean() > 0.85
-
-
-def test_equal_seeds_find_equal_constants():
-    pieces = [(random_tables((2, 2), (False, False), 4, 8), torch.tensor([8, 8, 5, 3]))]
-    one, two = (fitted(pieces, seed=4).selection for _ in range(2))
-    assert all(torch.equal(*both) for both in zip(one, two, strict=True))
 
 
 def test_constants_are_read_as_they_were_kept():

@@ -10,7 +10,7 @@ from ddco_tasks import psm
 from ddco_tasks.bin_picking import alone, camera, candidates, geometry, objects, supervisor, task
 from ddco_tasks.bin_picking import environment as bin_picking
 from ddco_tasks.bin_picking.environment import Environment
-from ddco_tasks.bin_picking.instrument import BACKLASH, Instrument, slack_after
+from ddco_tasks.bin_picking.instrument import BACKLASH, slack_after
 from ddco_tasks.bin_picking.trials import Attempt, End, Trials
 from ddco_tasks.rendering import mujoco
 
@@ -47,12 +47,6 @@ def test_points_are_where_mujocos_camera_sees_them(environment: Environment, eye
     column, row, depth = seen.matrix @ np.column_stack([points, np.ones(20)]).T
     truth = np.column_stack([column / depth, row / depth])
     np.testing.assert_allclose(geometry.project(points, right), truth, atol=0.51)  # from corners or from centres
-
-
-def test_a_pixel_is_turned_back_into_its_point() -> None:
-    points = np.random.default_rng(1).uniform(-0.025, 0.025, (20, 3)) * [1, 1, 0] + [0, 0, geometry.OBJECT_HEIGHT]
-    for point in points:
-        np.testing.assert_allclose(geometry.lying_at(geometry.project(point)), point, atol=1e-12)
 
 
 def test_an_object_is_seen_where_it_lies_by_both_eyes(environment: Environment) -> None:
@@ -118,18 +112,6 @@ def test_backlash_is_a_dead_band_moved_through_in_small_steps() -> None:
         np.testing.assert_allclose(motors - slack, joints, atol=1e-12)
 
 
-def test_a_command_brings_the_joints_to_where_they_are_wanted() -> None:
-    generator = np.random.default_rng(4)
-    instrument, motors, slack = Instrument.numbered(1), psm.inverse(supervisor.RECOVERY[0].pose), np.zeros(6)
-    for _ in range(20):
-        place = generator.uniform([-0.02, -0.02, 0.0], [0.02, 0.02, 0.03])
-        joints = psm.inverse(geometry.upright(generator.uniform(-0.7, 2.2), place))
-        command = instrument.command(joints, motors, slack)
-        slack, motors = slack_after(slack, command - motors), command
-        np.testing.assert_allclose(instrument.joints(motors, slack), joints, atol=1e-9)
-        np.testing.assert_allclose(instrument.motors(joints, slack), motors, atol=1e-9)
-
-
 def test_open_loop_is_off_by_what_is_said_of_uncalibrated_arms(environment: Environment) -> None:
     physics = environment.physics
     misses = []
@@ -171,10 +153,6 @@ def test_features_are_those_of_the_grippers_frame() -> None:
 # Contact.
 
 
-def test_nothing_is_welded(environment: Environment) -> None:
-    assert environment.physics.model.neq == 0
-
-
 JAWS = 4 * bin_picking.JAW_ERROR
 
 
@@ -189,12 +167,6 @@ def test_jaws_close_as_far_as_what_they_hold_lets_them(environment: Environment,
     nearest, furthest = 0.0077, 0.0127  # m, of the pads from the hinge
     angle = observation["kin"][6]
     assert 2 * radius / furthest - JAWS < angle < 2 * radius / nearest + JAWS
-
-
-def test_empty_jaws_close(environment: Environment) -> None:
-    angles = [go(environment, (0.0, 0.0, 0.03), 0).observation["kin"][6] for _ in range(5)]
-    np.testing.assert_allclose(angles, 0.0, atol=JAWS)
-    assert np.std(angles) > 0.0
 
 
 @pytest.mark.parametrize("number", range(3))

@@ -71,10 +71,6 @@ def test_forward_kinematics_is_mujocos(environment: Environment) -> None:
         np.testing.assert_allclose(gripper.rotation.ravel(), physics.named.data.site_xmat["gripper"], atol=1e-6)
 
 
-def test_joint_ranges_are_the_models(environment: Environment) -> None:
-    np.testing.assert_allclose(environment.physics.named.model.jnt_range[list(psm.JOINTS)], psm.JOINT_RANGES)
-
-
 def test_inverse_kinematics_is_the_inverse() -> None:
     generator = np.random.default_rng(1)
     for pose in workspace((0.0, 0.03)):
@@ -85,22 +81,11 @@ def test_inverse_kinematics_is_the_inverse() -> None:
         np.testing.assert_allclose(reached.rotation, wanted.rotation, atol=1e-12)
 
 
-def test_rotation_vector_is_axis_times_angle() -> None:
-    np.testing.assert_allclose(psm.rotation_vector(psm.rotation(2, 2.5)), [0.0, 0.0, 2.5], atol=1e-12)
-    np.testing.assert_allclose(psm.rotation_vector(np.eye(3)), 0.0)
-
-
 def test_kinematic_error_is_the_papers() -> None:
     error = [psm.forward(psm.true_joints(psm.inverse(pose))).position - pose.position for pose in workspace()]
     distance = 1e3 * np.linalg.norm(error, axis=1)
     assert np.sqrt(np.mean(distance**2)) == pytest.approx(3.3, abs=0.3)
     assert np.percentile(distance, 75) == pytest.approx(4.7, abs=0.4)
-
-
-def test_encoder_readings_invert_the_error() -> None:
-    for pose in workspace((0.0, 0.03)):
-        joints = psm.inverse(pose)
-        np.testing.assert_allclose(psm.true_joints(psm.encoder_readings(joints)), joints, atol=1e-9)
 
 
 def test_reported_pose_is_where_the_encoders_were_sent(environment: Environment) -> None:
@@ -131,19 +116,6 @@ def test_ellipse_is_where_the_needle_is(environment: Environment, x: float, y: f
     angle = vision.principal_angle(seen, near=heading)
     assert np.rad2deg(abs(angle - np.arctan2(chord[1], chord[0]))) < 1.5
     assert seen[2] == pytest.approx(1e3 * np.linalg.norm(chord), abs=3.0)
-
-
-def test_ellipse_of_a_drawn_line() -> None:
-    image = np.zeros((vision.IMAGE_SIZE, vision.IMAGE_SIZE, 3), np.uint8)
-    rows = np.arange(100, 201)
-    for width in range(4):
-        image[rows, 300 - rows + width] = [20, 230, 60]  # rising to the right in the picture, as y grows upwards
-    seen = vision.ellipse(image)
-    assert seen is not None
-    middle = (vision.IMAGE_SIZE - 1) / 2
-    centre = [151.5 - middle, middle - 150.0]  # columns 100 to 203
-    np.testing.assert_allclose(seen[:2] / vision.MM_PER_PIXEL, centre, atol=1.0)
-    assert np.rad2deg(vision.principal_angle(seen, near=0.5)) == pytest.approx(45.0, abs=1.0)
 
 
 def test_a_hidden_needle_keeps_its_last_ellipse(environment: Environment, monkeypatch: pytest.MonkeyPatch) -> None:

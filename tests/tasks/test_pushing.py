@@ -56,13 +56,6 @@ def test_forward_kinematics_is_mujocos(environment: Environment) -> None:
         np.testing.assert_allclose(pushing_geometry.tip_position(angles), environment.physics.tip(), atol=1e-9)
 
 
-def test_forward_kinematics_is_the_closed_form() -> None:
-    first, second, third = 0.3, 0.9, -0.5
-    x = 0.5 * np.sin(0.3) + 0.5 * np.sin(1.2) + 0.3 * np.sin(0.7)
-    z = 0.95 - 0.5 * np.cos(0.3) - 0.5 * np.cos(1.2) - 0.3 * np.cos(0.7)
-    np.testing.assert_allclose(pushing_geometry.tip_position(np.array([first, second, third])), [x, z])
-
-
 def test_inverse_kinematics_is_the_inverse() -> None:
     for x in np.linspace(-0.65, 0.65, 9):
         for z in (0.1, 0.25, 0.45):
@@ -72,22 +65,6 @@ def test_inverse_kinematics_is_the_inverse() -> None:
                 angles = pushing_geometry.inverse(np.array([x, z]), pitch)
                 np.testing.assert_allclose(pushing_geometry.tip_position(angles), [x, z], atol=1e-9)
                 assert np.sum(angles) == pytest.approx(pitch)
-
-
-def test_joint_ranges_are_the_models(environment: Environment) -> None:
-    model = environment.physics.named.model
-    np.testing.assert_allclose(model.jnt_range[["shoulder", "elbow", "wrist"]], pushing_geometry.JOINT_RANGES)
-    np.testing.assert_allclose(np.abs(model.actuator_ctrlrange[:]), pushing_geometry.MAX_SPEED)
-
-
-def test_joints_move_at_the_velocities_that_are_set(environment: Environment) -> None:
-    arrange(environment, pushing.RAISED, 0.4, -0.4)
-    velocities = np.array([0.3, -0.2, 0.5])
-    environment.step(velocities)
-    before = environment.physics.joint_angles()
-    for _ in range(10):
-        environment.step(velocities)
-    np.testing.assert_allclose(environment.physics.joint_angles() - before, 0.5 * velocities, atol=0.01)
 
 
 def test_clear_is_what_points_along_the_links_say() -> None:
@@ -105,14 +82,6 @@ def test_clear_is_what_points_along_the_links_say() -> None:
 
 
 # The box.
-
-
-def test_the_box_does_not_move_without_contact(environment: Environment) -> None:
-    arrange(environment, pushing.RAISED, 0.2, -0.4)
-    before = environment.physics.box()
-    for _ in range(40):
-        environment.step(np.array([0.2, 0.0, -0.3]))
-    np.testing.assert_allclose(environment.physics.box(), before, atol=1e-3)
 
 
 @pytest.mark.parametrize("speed", [0.4, 0.8])

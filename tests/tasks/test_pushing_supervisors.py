@@ -9,7 +9,6 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from ddco_tasks.planning import plan_path
 from ddco_tasks.pushing import environment as pushing
 from ddco_tasks.pushing import geometry as pushing_geometry
 from ddco_tasks.pushing import planner as pushing_planner
@@ -91,29 +90,6 @@ def test_a_planned_push_is_a_function_of_the_observation() -> None:
         observation = {key: value[row] for key, value in record.observations.items()}
         fresh = pushing_planner.Planner().decide(rules.scene(observation))
         np.testing.assert_array_equal(fresh, record.actions[row])
-
-
-def test_unrepeatable_plans_differ() -> None:
-    scene = next(scenes())
-    planner = pushing_planner.Planner(repeatable=False)
-    one, other = planner._approach(scene), planner._approach(scene)
-    assert one.shape != other.shape or not np.allclose(one, other)
-
-
-def test_shortcuts_make_paths_shorter() -> None:
-    def is_free(point: np.ndarray) -> bool:
-        return not (abs(point[0]) < 0.2 and point[1] < 0.5)
-
-    ranges = np.array([[-1.0, 1.0]] * 2)
-    ends = np.array([[-0.6, 0.0], [0.6, 0.0]])
-    lengths = []
-    for shortcuts in (0, 60):
-        settings = pushing_planner.Settings(range=0.1, shortcuts=shortcuts)
-        path = plan_path(*ends, ranges, is_free, settings)
-        lengths.append(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
-    shortest = 2 * np.hypot(0.4, 0.5) + 0.4
-    assert shortest - 0.02 < lengths[1] < lengths[0]
-    assert lengths[1] < 1.15 * shortest
 
 
 DIGESTS = """
