@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import json
+import copy
 import random
 import traceback
 from collections.abc import Callable, Iterator
@@ -37,8 +37,7 @@ VALUES: tuple[Any, ...] = (
 
 def damaged_spec(base: dict[str, Any], seed: int) -> bytes:
     """The text of a spec with some things wrong, or right in another way."""
-    choose = random.Random(seed)
-    data = json.loads(json.dumps(base))
+    choose, data = random.Random(seed), copy.deepcopy(base)
     for _ in range(choose.randint(1, 3)):
         _damage_data(data, choose)
     text = yaml.safe_dump(data, allow_unicode=True, sort_keys=choose.random() < 0.5).encode()
@@ -53,44 +52,32 @@ def places(node: Any) -> Iterator[tuple[Any, Any]]:
 
 
 def _damage_data(data: dict[str, Any], choose: random.Random) -> None:
-    known = list(places(data))
-    if not known:
+    """Remove, misspell, double, or replace something, by a value from elsewhere or an odd one."""
+    if not data:
         return
-    node, key = choose.choice(known)
-    other_node, other_key = choose.choice(known)
-    how = choose.randrange(6)
+    known = list(places(data))
+    (node, key), (other_node, other_key) = choose.choice(known), choose.choice(known)
+    other, how = copy.deepcopy(other_node[other_key]), choose.randrange(6)
     if how == 0:
         del node[key]
     elif how == 1 and isinstance(node, dict):
-        name = str(key)
-        at = choose.randrange(len(name) + 1)
-        node[name[:at] + choose.choice("xs_. ") + name[at + 1 :]] = node.pop(key)
-    elif how == 2:
-        node[key] = json.loads(json.dumps(other_node[other_key]))
-    elif how == 3 and isinstance(node, list):
-        node.insert(key, json.loads(json.dumps(node[key])))
+        at = choose.randrange(len(str(key)) + 1)
+        node[str(key)[:at] + choose.choice("xs_. ") + str(key)[at + 1 :]] = node.pop(key)
+    elif how == 2 and isinstance(node, list):
+        node.insert(key, copy.deepcopy(node[key]))
     else:
-        node[key] = choose.choice(VALUES)
+        node[key] = other if how == 3 else choose.choice(VALUES)
 
 
 def _damage_bytes(content: bytes, choose: random.Random) -> bytes:
+    """Flip a bit, or replace a piece by zeros, by noise or by nothing; at times cut off the rest."""
     damaged = bytearray(content)
     for _ in range(choose.randint(1, 4)):
-        if not damaged:
-            break
-        at = choose.randrange(len(damaged))
+        at = choose.randrange(len(damaged) or 1)
         end = min(at + choose.choice([1, 2, 8, 64, 512]), len(damaged))
-        how = choose.randrange(5)
-        if how == 0:
-            damaged[at] = choose.randrange(256)
-        elif how == 1:
-            del damaged[at:end]
-        elif how == 2:
-            damaged[at:at] = bytes(choose.randrange(256) for _ in range(choose.choice([1, 4, 8])))
-        elif how == 3:
-            damaged[at:end] = bytes([choose.choice([0, 255])]) * (end - at)
-        else:
-            damaged[at] ^= 1 << choose.randrange(8)
+        size = end - at
+        pieces = b"", bytes(size), b"\xff" * size, choose.randbytes(size), choose.randbytes(size + 8)
+        damaged[at:end] = choose.choice([*pieces, bytes(byte ^ 1 << choose.randrange(8) for byte in damaged[at:end])])
     return bytes(damaged[: choose.randrange(len(damaged) + 1)] if choose.random() < 0.1 else damaged)
 
 
@@ -100,18 +87,16 @@ def _damage_bytes(content: bytes, choose: random.Random) -> bytes:
 def damaged_file(path: Path, seed: int) -> None:
     choose = random.Random(seed)
     demonstrations(4, {"train": ("demo_0", "demo_1"), "valid": ("demo_2",)}).write(path)
-    if choose.random() < 0.3:
-        with h5py.File(path, "r+") as file:
-            for group in file["data"].values():
-                camera = group["obs/camera"][()]
-                del group["obs/camera"]
-                group.create_dataset("obs/camera", data=camera, chunks=(1, *camera.shape[1:]), compression="gzip")
-    if choose.random() < 0.5:
-        with h5py.File(path, "r+") as file:
-            for _ in range(choose.randint(1, 3)):
-                with contextlib.suppress(ValueError, OSError, RuntimeError, KeyError, TypeError):
-                    choose.choice(EDITS)(file, choose)
-    else:
+    with h5py.File(path, "r+") as file:
+        for group in file["data"].values() if choose.random() < 0.3 else ():
+            camera = group["obs/camera"][()]
+            del group["obs/camera"]
+            group.create_dataset("obs/camera", data=camera, chunks=(1, *camera.shape[1:]), compression="gzip")
+        edits = choose.randint(1, 3) if choose.random() < 0.5 else 0
+        for _ in range(edits):
+            with contextlib.suppress(ValueError, OSError, RuntimeError, KeyError, TypeError):
+                choose.choice(EDITS)(file, choose)
+    if not edits:
         path.write_bytes(_damage_bytes(path.read_bytes(), choose))
 
 
@@ -124,54 +109,45 @@ def _anything(file: h5py.File, choose: random.Random) -> str:
     return choose.choice(found or ["data"])
 
 
-def _remove(file: h5py.File, choose: random.Random) -> str:
-    place = _anything(file, choose)
-    if place in file:
-        del file[place]
-    return place
+def _replace(make: Callable[[random.Random], Any] | None = None) -> Edit:
+    """Something is this instead; removed where nothing is made."""
 
-
-def _replace(make: Callable[[random.Random], Any]) -> Edit:
     def edit(file: h5py.File, choose: random.Random) -> None:
-        file[_remove(file, choose)] = make(choose)
+        place = _anything(file, choose)
+        del file[place]
+        if make:
+            file[place] = make(choose)
 
     return edit
 
 
 def _huge(file: h5py.File, choose: random.Random) -> None:
-    place = _remove(file, choose)
-    steps = choose.choice([10**9, 10**15])
-    file.create_dataset(place, shape=(steps, 3), chunks=(1024, 3), dtype=choose.choice(["f8", "u1"]),
+    place, rows = _anything(file, choose), choose.choice([10**9, 10**15])
+    del file[place]
+    file.create_dataset(place, (rows, 3), choose.choice(["f8", "u1"]), chunks=(1024, 3),
                         compression=choose.choice([None, "gzip"]))  # fmt: skip
 
 
-def _loop(file: h5py.File, choose: random.Random) -> None:
-    place = _anything(file, choose)
-    group = file.get(place, file)
-    if isinstance(group, h5py.Group):
-        group[f"again{choose.randrange(9)}"] = choose.choice(
-            [file["/"], h5py.SoftLink("/data"), h5py.SoftLink("nowhere"), h5py.ExternalLink("none.hdf5", "/")]
-        )
+def _link(file: h5py.File, choose: random.Random) -> None:
+    links = [file["/"], h5py.SoftLink("/data"), h5py.SoftLink("nowhere"), h5py.ExternalLink("none.hdf5", "/")]
+    file[_anything(file, choose)][f"again{choose.randrange(9)}"] = choose.choice(links)
 
 
 def _attribute(file: h5py.File, choose: random.Random) -> None:
-    place = _anything(file, choose)
     values = [np.nan, -1, 10**18, "x" * 9999, np.zeros((50, 50)), h5py.Empty("f8"), b"\xff\xfe", "{", 7]
-    if place in file:
-        names = ["num_samples", "env_args", "control_frequency", "total", "segmented_by", "imported"]
-        file[place].attrs[choose.choice(names)] = choose.choice(values)
+    names = ["num_samples", "env_args", "control_frequency", "total", "segmented_by", "imported"]
+    file[_anything(file, choose)].attrs[choose.choice(names)] = choose.choice(values)
 
 
 def _rename(file: h5py.File, choose: random.Random) -> None:
     place = _anything(file, choose)
-    if place in file:
-        file.move(place, place + choose.choice(["x", "\n", " ", "é", "/y", "[red]", "<b>"]))
+    file.move(place, place + choose.choice(["x", "\n", " ", "é", "/y", "[red]", "<b>"]))
 
 
 DTYPES = ("i1", "f2", "c16", "?", "u8")
 
 EDITS: tuple[Edit, ...] = (
-    _remove, _remove, _huge, _loop, _attribute, _attribute, _rename,
+    _replace(), _replace(), _huge, _link, _attribute, _attribute, _rename,
     _replace(lambda choose: np.full((choose.randint(0, 5), 2), choose.choice([np.nan, np.inf, 1e308, 0.0]))),
     _replace(lambda choose: np.zeros((choose.randint(0, 5),) * choose.randint(0, 4), choose.choice(DTYPES))),
     _replace(lambda choose: np.zeros(4, dtype=[("a", "f8"), ("b", "S3")])),
