@@ -71,21 +71,6 @@ def test_an_option_that_does_not_end_stays(seed):
     np.testing.assert_allclose(controls, [MEANS[choices[0] - 1]] * 30)
 
 
-def test_an_option_that_always_ends_is_followed_by_a_draw_from_eta():
-    eta = np.array([0.6, 0.3, 0.1])
-    choices, _ = play(Controller(by_hand(MEANS, [ALWAYS] * 3, np.log(eta))), 500)
-    observed = np.bincount(choices, minlength=4)[1:]
-    assert stats.chisquare(observed, 500 * eta).pvalue > P_VALUE
-
-
-def test_options_end_as_often_as_psi_says():
-    """Among four equally likely options an ending shows as a change in three cases of four."""
-    means = [[0.0, float(k)] for k in range(4)]
-    choices = np.array(play(Controller(by_hand(means, [logit(0.4)] * 4, [0] * 4)), 500)[0])
-    changes = int((np.diff(choices) != 0).sum())
-    assert stats.binomtest(changes, 499, 0.4 * 3 / 4).pvalue > P_VALUE
-
-
 def test_most_likely_takes_the_mode_of_every_choice():
     """η prefers option 2 in the beginning; an option ends where ψ is above one half."""
     staying = by_hand(MEANS, [logit(0.49)] * 3, [0.0, 0.1, 0.05])

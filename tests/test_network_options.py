@@ -73,13 +73,6 @@ class Typed(nn.Module):
         return torch.zeros(*inputs.batch, *self.size)
 
 
-class Untyped(Typed):
-    """A network that passes on what it is given."""
-
-    def __init__(self, shape, outputs, copies, **options):
-        super().__init__(shape, outputs, copies, **options)
-
-
 def made(options, name="Typed"):
     return build(network_spec(network=f"{__name__}:{name}", options=options), SHAPE, 2, 4).module
 
@@ -110,10 +103,6 @@ def test_options_that_the_class_does_not_take_are_one_line_each(options, message
         made(options)
     assert len(caught.value.problems) == 1
     assert caught.value.problems[0].startswith(message)
-
-
-def test_options_that_are_passed_on_are_checked_by_the_class_alone():
-    assert made({"width": "3"}, "Untyped").given["width"] == "3"
 
 
 WRONG_OPTIONS = {"network": f"{__name__}:Typed", "options": {"width": "a", "gian": 1}}

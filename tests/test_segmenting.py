@@ -127,14 +127,6 @@ def test_labels_go_into_the_file_and_are_read_from_there(toy_run, file):
     assert file.stat().st_mtime_ns == time  # it has these labels already
 
 
-def test_a_copy_is_labelled(toy_run, written):
-    file, places = written
-    copy = Demonstrations.read(places["--out"], labels=["option"])
-    for one, demo in zip(look(toy_run.folder, file).segments, copy, strict=True):
-        assert one.name == demo.name
-        np.testing.assert_array_equal(demo.labels["option"], one.levels["option"].options)
-
-
 def test_labels_from_elsewhere_are_never_replaced(toy_run, file):
     with h5py.File(file, "r+") as opened:
         opened["data/demo_3/labels/option"] = np.zeros(len(opened["data/demo_3/actions"]), int)
