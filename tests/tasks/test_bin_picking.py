@@ -10,7 +10,7 @@ from ddco_tasks import psm
 from ddco_tasks.bin_picking import alone, camera, candidates, geometry, objects, supervisor, task
 from ddco_tasks.bin_picking import environment as bin_picking
 from ddco_tasks.bin_picking.environment import Environment
-from ddco_tasks.bin_picking.instrument import BACKLASH, slack_after
+from ddco_tasks.bin_picking.instrument import BACKLASH, Instrument, slack_after
 from ddco_tasks.bin_picking.trials import Attempt, End, Trials
 from ddco_tasks.rendering import mujoco
 
@@ -47,6 +47,12 @@ def test_points_are_where_mujocos_camera_sees_them(environment: Environment, eye
     column, row, depth = seen.matrix @ np.column_stack([points, np.ones(20)]).T
     truth = np.column_stack([column / depth, row / depth])
     np.testing.assert_allclose(geometry.project(points, right), truth, atol=0.51)  # from corners or from centres
+
+
+def test_a_pixel_is_turned_back_into_its_point() -> None:
+    points = np.random.default_rng(1).uniform(-0.025, 0.025, (20, 3)) * [1, 1, 0] + [0, 0, geometry.OBJECT_HEIGHT]
+    for point in points:
+        np.testing.assert_allclose(geometry.lying_at(geometry.project(point)), point, atol=1e-12)
 
 
 def test_an_object_is_seen_where_it_lies_by_both_eyes(environment: Environment) -> None:
@@ -110,6 +116,18 @@ def test_backlash_is_a_dead_band_moved_through_in_small_steps() -> None:
             joints = np.where(joints - step > BACKLASH, step + BACKLASH, joints)
         motors = goal
         np.testing.assert_allclose(motors - slack, joints, atol=1e-12)
+
+
+def test_a_command_brings_the_joints_to_where_they_are_wanted() -> None:
+    generator = np.random.default_rng(4)
+    instrument, motors, slack = Instrument.numbered(1), psm.inverse(supervisor.RECOVERY[0].pose), np.zeros(6)
+    for _ in range(20):
+        place = generator.uniform([-0.02, -0.02, 0.0], [0.02, 0.02, 0.03])
+        joints = psm.inverse(geometry.upright(generator.uniform(-0.7, 2.2), place))
+        command = instrument.command(joints, motors, slack)
+        slack, motors = slack_after(slack, command - motors), command
+        np.testing.assert_allclose(instrument.joints(motors, slack), joints, atol=1e-9)
+        np.testing.assert_allclose(instrument.motors(joints, slack), motors, atol=1e-9)
 
 
 def test_open_loop_is_off_by_what_is_said_of_uncalibrated_arms(environment: Environment) -> None:
