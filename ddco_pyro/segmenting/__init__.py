@@ -18,7 +18,8 @@ from ddco_pyro.data.sources import Recording, Source, open_source
 from ddco_pyro.data.sources.recording import label_names
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.errors import BadInput
-from ddco_pyro.evaluation.agreement import agreement, confusion
+from ddco_pyro.evaluation.agreement import agreement as scores_of  # a module here has that name
+from ddco_pyro.evaluation.agreement import confusion
 from ddco_pyro.evaluation.inferred import Inferred, started
 from ddco_pyro.events import BaselineSegmented, DemonstrationsDone, OnEvent, ignore
 from ddco_pyro.fitting.fitted import Fit
@@ -150,14 +151,14 @@ class Segmented:
             for part, group in groups.items():
                 options, labels = [demo.levels[level].options for demo in group], [demo.labels[truth] for demo in group]
                 scores = agreements.setdefault(level, {})
-                scores[f"options, {part}"] = agreement(options, labels)
+                scores[f"options, {part}"] = scores_of(options, labels)
                 equal = f"{baselines.BASELINES[baselines.EQUAL]}, {part}"
                 scores[equal] = baselines.of_equal_lengths(labels, self.counts[level])
             for part, group in [*groups.items()][:1]:
                 for name, words in baselines.BASELINES.items():
                     if group[0].baselines and name != baselines.EQUAL:
                         kinds = [demo.baselines[f"{level}_{name}"] for demo in group]
-                        agreements[level][f"{words}, {part}"] = agreement(kinds, [demo.labels[truth] for demo in group])
+                        agreements[level][f"{words}, {part}"] = scores_of(kinds, [demo.labels[truth] for demo in group])
         return agreements
 
     def label_colours(self, name: str) -> dict[int, str]:
