@@ -62,6 +62,7 @@ class Demonstration:
                 raise DemonstrationsError(f"{self.name}: {what} have to be a mapping of names to arrays [T, ...]")
         recording = self.recording()
         check(recording)
+        recording = recording.loaded()  # a file is read once
         check_values(recording, f"repair it, or leave {self.name} out (demonstrations.exclude)")
         observations = {key: _numbers(column.observed()) for key, column in recording.observations.items()}
         labels = {}

@@ -129,6 +129,15 @@ class Recording:
         )
         return cls(name, seen, column("actions", actions), known, attributes)
 
+    def loaded(self) -> Recording:
+        """The recording with its arrays in memory; pictures in files stay lazy."""
+
+        def held(columns: Mapping[str, Column]) -> dict[str, Column]:
+            return {key: of_array(column.observed()) for key, column in columns.items()}
+
+        actions, observations = of_array(self.actions.observed()), held(self.observations)
+        return replace(self, observations=observations, actions=actions, labels=held(self.labels))
+
     @property
     def numbers(self) -> dict[str, Column]:
         """The observations that hold real numbers."""
