@@ -88,7 +88,7 @@ class Autoencoder(nn.Module):
         self.target = (min(TARGET, shape[0]), min(TARGET, shape[1]))
         with seeded(seed + 1):
             outputs = self.target[0] * self.target[1] * shape[2]
-            features = encoder.network.features
+            features = int(encoder.network.features)  # type: ignore[arg-type]  # torch types every attribute alike
             self.decoder = nn.Sequential(nn.Linear(features, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, outputs))
 
     def loss(self, pictures: Tensor) -> Tensor:

@@ -56,7 +56,8 @@ def tested(study: Study, table: pd.DataFrame) -> list[Tested]:
         for one, number in zip(contrasts, numbers, strict=True)
     ]
     judged = verdicts([(own, one.bound) for own, one in zip(estimates, contrasts, strict=True)])
-    return [Tested(*facts, *verdict) for *facts, verdict in zip(contrasts, numbers, estimates, judged, strict=True)]
+    rows = zip(contrasts, numbers, estimates, judged, strict=True)
+    return [Tested(contrast, number, found, *verdict) for contrast, number, found, verdict in rows]
 
 
 def _estimate(study: Study, measure: str, of: pd.Series, lowest: float = 0.0) -> Estimate | None:
@@ -160,7 +161,7 @@ def _contrasts(contrasts: Sequence[Tested], to: Path) -> list[Block]:
 
 
 def _drawn(known: Estimate | None, bound: float | None = None) -> Interval | None:
-    return known and Interval(known.value, *known.interval, points=known.units, hollow=bound)
+    return None if known is None else Interval(known.value, *known.interval, points=known.units, hollow=bound)
 
 
 def _methods(study: Study, table: pd.DataFrame, to: Path) -> list[Block]:
@@ -369,7 +370,7 @@ class _Source:
     def quoted(self, quotation: str) -> str:
         """A number, or a table of several."""
         fields = [part.strip() for part in quotation.split(";")]
-        settings = dict(found.groups() for part in fields if (found := _SETTING.fullmatch(part)))
+        settings = {found[1]: found[2] for part in fields if (found := _SETTING.fullmatch(part))}
         plain = [part.split(" | ") for part in fields if not _SETTING.fullmatch(part)]
         methods, measures, numbers = (*plain, [""])[:3] if len(plain) in (2, 3) else ([], [], [])
         counts = [tuple(one.split(" - ")) for one in numbers]
