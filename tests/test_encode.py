@@ -117,7 +117,7 @@ def test_random_convolutions_written_out(few_dots, out):
     weights, picture = load_file(folder / "encoder.safetensors"), together(Demonstrations.read(few_dots), "camera")[7]
     maps = torch.from_numpy(picture).permute(2, 0, 1)[None] / 255
     for layer, stride, padding in (("0", 2, 2), ("1", 1, 1)):
-        weight, bias = (weights[f"network/maps.convolutions.0.{layer}.{name}"] for name in ("weight", "bias"))
+        weight, bias = (weights[f"network/network.convolutions.0.{layer}.{name}"] for name in ("weight", "bias"))
         maps = torch.relu(torch.nn.functional.conv2d(maps, weight, bias, stride, padding))
     share = torch.exp(maps[0]) / torch.exp(maps[0]).sum((1, 2), keepdim=True)
     axis = torch.linspace(-1, 1, SIZE // 2)

@@ -71,7 +71,7 @@ class Runner:
     def active(self) -> dict[str, str]:
         """The name of the active choice of each level."""
         levels = zip(self.about["names"].items(), self.choices, strict=False)
-        return {level: own[choice] for (level, own), choice in levels}
+        return {level: names[choice] for (level, names), choice in levels}
 
     def act(self, observation: Mapping[str, Any]) -> np.ndarray:
         """The control [A], in the control's own units.
@@ -81,22 +81,22 @@ class Runner:
         built_in = self.about["step"]
         if built_in:
             observation = {**observation, built_in["key"]: np.array([self.time / built_in["longest"]])}
-        now = {spec["key"]: _checked(observation, spec) for spec in self.about["observations"]}
+        specs = self.about["observations"]
+        now = {spec["key"]: _checked(observation, spec) for spec in specs}
+        images = {spec["key"]: self._recent(now[spec["key"]], spec) for spec in specs if spec["image"]}
         features = self._features(now, self._last or now)
-        images = {
-            spec["key"]: self._recent(now[spec["key"]], spec) for spec in self.about["observations"] if spec["image"]
-        }
         self.outputs, self._state = self._networks(features, self.time, images, self._state)
-        outputs = self.outputs
         generator = np.random.default_rng([self.seed, self.time])
         choose = self._largest_marginal if self.about["options"] == "marginal" else self._choose
-        self.choices = choose(outputs, generator)
-        self.terminations = tuple(
-            float(outputs[f"termination_{level}"][choice - 1]) if choice else 1.0
-            for level, choice in enumerate(self.choices)
-        )
+        self.choices = choose(self.outputs, generator)
+        self.terminations = self._psi(self.outputs)
         self._last, self.time = now, self.time + 1
-        return self._control(outputs, generator)
+        return self._control(self.outputs, generator)
+
+    def _psi(self, outputs: Outputs) -> tuple[float, ...]:
+        """ψ of each active choice, lowest level first; 1 for control."""
+        active = enumerate(self.choices)
+        return tuple(float(outputs[f"termination_{level}"][choice - 1]) if choice else 1.0 for level, choice in active)
 
     def _recent(self, picture: np.ndarray, spec: Mapping[str, Any]) -> np.ndarray:
         """The picture as networks see it, stacked behind earlier ones where networks see several."""
@@ -117,13 +117,10 @@ class Runner:
 
     def _choose(self, outputs: Outputs, generator: np.random.Generator) -> tuple[int, ...]:
         """Terminations go bottom-up, selections top-down; at the first step everything is selected."""
-        depth, terminated = len(self.about["levels"]), [True] * len(self.about["levels"])
-        if self.choices:
-            below = True
-            for level, choice in enumerate(self.choices):
-                psi = float(outputs[f"termination_{level}"][choice - 1]) if choice else 1.0
-                ends = self._pick(np.array([1 - psi, psi] if below else [1.0, 0.0]), generator)
-                terminated[level] = below = bool(ends)
+        depth, terminated = len(self.about["levels"]), [True]
+        for psi in self._psi(outputs):
+            ends = self._pick(np.array([1 - psi, psi] if terminated[-1] else [1.0, 0.0]), generator)
+            terminated.append(bool(ends))
         choices, caller = [0] * depth, 0
         for level in reversed(range(depth)):
             table = outputs[f"selection_{level + 1}"]
@@ -131,7 +128,7 @@ class Runner:
                 probabilities = np.eye(table.shape[-1])[0]  # below control there is nothing left to choose
             else:
                 probabilities = np.exp(table[caller - 1 if level < depth - 1 else 0].astype(np.float64))
-            if not terminated[level]:
+            if self.choices and not terminated[level + 1]:
                 probabilities = np.eye(len(probabilities))[self.choices[level]]
             caller = choices[level] = self._pick(probabilities, generator)
         return tuple(choices)
@@ -310,15 +307,17 @@ def _checked(observation: Mapping[str, Any], spec: Mapping[str, Any]) -> np.ndar
     return data
 
 
-class NumpyNetworks:
-    """Every network of the hierarchy, from ``weights.npz``."""
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """The arrays in an ``.npz`` file by name."""
+    with np.load(path, allow_pickle=False) as file:
+        return {name: file[name] for name in file.files}
 
-    def __init__(self, folder: Path, about: Mapping[str, Any]) -> None:
-        if not about["numpy"]:
-            raise ValueError('it has networks that numpy cannot evaluate: use Runner(..., networks="torch") or "onnx"')
-        with np.load(folder / "weights.npz", allow_pickle=False) as file:
-            self._weights = {name: file[name] for name in file.files}
-        self._about = about
+
+class NumpyNetworks:
+    """Every network of the hierarchy, from the arrays of ``weights.npz``."""
+
+    def __init__(self, weights: Mapping[str, np.ndarray], about: Mapping[str, Any]) -> None:
+        self._weights, self._about = weights, about
         self._after: State = []
 
     def __call__(
@@ -335,12 +334,13 @@ class NumpyNetworks:
         self._images, self._step = images, step
         self._before, self._after = iter(state), []
         outputs: Outputs = {}
-        whole = self._evaluate(self._about["trunk"], "trunk") if self._about["trunk"] else None
+        whole = self._network("trunk")
         for level, caller in enumerate(self._about["callers"]):
             self._features = whole
-            if level < depth and self._about["trunks"][level]:
-                self._features = self._evaluate(self._about["trunks"][level], f"trunk_{level}")
-            out = self._evaluate(caller["network"], f"caller_{level}")
+            trunk = self._network(f"trunk_{level}")
+            self._features = whole if trunk is None else trunk
+            out = self._network(f"caller_{level}")
+            assert out is not None  # every caller has a network
             logits, mean = out[:, : caller["logits"]], out[:, caller["logits"] :]
             if caller["choices"]:
                 outputs[f"selection_{level}"] = _selection(logits, caller)
@@ -352,12 +352,16 @@ class NumpyNetworks:
 
     def _termination(self, level: int, options: int) -> np.ndarray:
         """ψ [k] of a level, whose options end after every step where no network says when."""
-        network, bound = self._about["terminations"][level], np.float32(self._about["termination_bound"])
-        if network is None:
+        raw, bound = self._network(f"end_{level}"), np.float32(self._about["termination_bound"])
+        if raw is None:
             return np.ones(options)
-        raw = self._evaluate(network, f"end_{level}")[:, 0]
-        psi: np.ndarray = 1 / (1 + np.exp(-(bound * np.tanh(raw / bound)).astype(np.float64)))
+        psi: np.ndarray = 1 / (1 + np.exp(-(bound * np.tanh(raw[:, 0] / bound)).astype(np.float64)))
         return psi
+
+    def _network(self, name: str) -> np.ndarray | None:
+        """The outputs of a network for each of K copies, [K, outputs]; None where there is no such network."""
+        node = self._about["networks"].get(name)
+        return None if node is None else self._evaluate(node, name)
 
     def _evaluate(self, node: Mapping[str, Any], name: str) -> np.ndarray:
         """Features of a part of a network for each of K copies, [K, features]; ``name`` begins its arrays' names."""
@@ -383,9 +387,9 @@ class NumpyNetworks:
         """K perceptrons, those of this step; an activation follows the hidden layers."""
         values = self._evaluate(node["of"], f"{name}.of")[:, None]
         first = min(self._step, node["steps"] - 1) * node["copies"]
-        own = slice(first, first + node["copies"])
+        now = slice(first, first + node["copies"])
         for layer in range(node["layers"]):
-            values = values @ self._weights[f"{name}.{layer}.weight"][own] + self._weights[f"{name}.{layer}.bias"][own]
+            values = values @ self._weights[f"{name}.{layer}.weight"][now] + self._weights[f"{name}.{layer}.bias"][now]
             if layer < node["hidden"]:
                 values = ACTIVATIONS[node["activation"]](values)
         return values[:, 0]
@@ -426,8 +430,8 @@ def _convolved(maps: np.ndarray, weight: np.ndarray, bias: np.ndarray, layer: Ma
     size, pad, stride = weight.shape[-1], (layer["padding"],) * 2, layer["stride"]
     padded = np.pad(maps, ((0, 0), (0, 0), pad, pad))
     windows = np.lib.stride_tricks.sliding_window_view(padded, (size, size), axis=(2, 3))[:, :, ::stride, ::stride]
-    own = weight.reshape(len(maps), -1, *weight.shape[1:])
-    convolved = np.einsum("kchwij,kfcij->kfhw", windows, own, optimize=True)
+    filters = weight.reshape(len(maps), -1, *weight.shape[1:])
+    convolved = np.einsum("kchwij,kfcij->kfhw", windows, filters, optimize=True)
     return np.asarray(convolved + bias.reshape(len(maps), -1, 1, 1))
 
 
@@ -473,52 +477,53 @@ def _selection(logits: np.ndarray, caller: Mapping[str, Any]) -> np.ndarray:
     return log_probabilities if caller["hybrid"] else np.insert(log_probabilities, 0, -np.inf, axis=1)
 
 
-class TorchNetworks:
+def _numpy(folder: Path, about: Mapping[str, Any]) -> Networks:
+    if not about["numpy"]:
+        raise ValueError('it has networks that numpy cannot evaluate: use Runner(..., networks="torch") or "onnx"')
+    return NumpyNetworks(read_arrays(folder / "weights.npz"), about)
+
+
+def _torch(folder: Path, about: Mapping[str, Any]) -> Networks:
     """Every network of the hierarchy, from ``controller.pt2``."""
+    import torch
 
-    def __init__(self, folder: Path, about: Mapping[str, Any]) -> None:
-        import torch
+    program = torch.export.load(folder / "controller.pt2").module()
 
-        self._torch = torch
-        self._program = torch.export.load(folder / "controller.pt2").module()
-        self._outputs = about["outputs"]
-
-    def __call__(
-        self, features: np.ndarray, step: int, images: Mapping[str, np.ndarray], state: State
+    def evaluate(
+        features: np.ndarray, step: int, images: Mapping[str, np.ndarray], state: State
     ) -> tuple[Outputs, State]:
-        """The outputs of every network for one observation, and the next state."""
-        given = (features, np.array([step], np.int64), *images.values(), *state)
-        threads = self._torch.get_num_threads()
-        self._torch.set_num_threads(1)  # networks are small: more threads only wait for one another
+        inputs = (features, np.array([step], np.int64), *images.values(), *state)
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)  # networks are small: more threads only wait for one another
         try:
-            with self._torch.no_grad():
-                values = self._program(*(self._torch.tensor(array) for array in given))
+            with torch.no_grad():
+                values = program(*map(torch.tensor, inputs))
         finally:
-            self._torch.set_num_threads(threads)
-        return _divided(self._outputs, [tensor.numpy() for tensor in values])
+            torch.set_num_threads(threads)
+        return _divided(about["outputs"], [tensor.numpy() for tensor in values])
+
+    return evaluate
 
 
-class OnnxNetworks:
+def _onnx(folder: Path, about: Mapping[str, Any]) -> Networks:
     """Every network of the hierarchy, from ``controller.onnx``."""
+    import onnxruntime
 
-    def __init__(self, folder: Path, about: Mapping[str, Any]) -> None:
-        import onnxruntime
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    session = onnxruntime.InferenceSession(str(folder / "controller.onnx"), options)
+    names = {argument.name for argument in session.get_inputs()}
 
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = 1
-        self._session = onnxruntime.InferenceSession(str(folder / "controller.onnx"), options)
-        self._inputs = {argument.name for argument in self._session.get_inputs()}
-        self._outputs = about["outputs"]
-
-    def __call__(
-        self, features: np.ndarray, step: int, images: Mapping[str, np.ndarray], state: State
+    def evaluate(
+        features: np.ndarray, step: int, images: Mapping[str, np.ndarray], state: State
     ) -> tuple[Outputs, State]:
-        """The outputs of every network for one observation, and the next state."""
-        given = {"features": features, "step": np.array([step], np.int64)}
-        given |= {f"image_{number}": image for number, image in enumerate(images.values())}
-        given |= {f"state_{number}": array for number, array in enumerate(state)}
-        values = self._session.run(None, {name: array for name, array in given.items() if name in self._inputs})
-        return _divided(self._outputs, values)
+        inputs = {"features": features, "step": np.array([step], np.int64)}
+        inputs |= {f"image_{number}": image for number, image in enumerate(images.values())}
+        inputs |= {f"state_{number}": array for number, array in enumerate(state)}
+        values = session.run(None, {name: array for name, array in inputs.items() if name in names})
+        return _divided(about["outputs"], values)
+
+    return evaluate
 
 
 def _divided(names: list[str], values: list[np.ndarray]) -> tuple[Outputs, State]:
@@ -526,11 +531,7 @@ def _divided(names: list[str], values: list[np.ndarray]) -> tuple[Outputs, State
     return dict(zip(names, values, strict=False)), list(values[len(names) :])
 
 
-FORMS: dict[str, Callable[[Path, Mapping[str, Any]], Networks]] = {
-    "numpy": NumpyNetworks,
-    "torch": TorchNetworks,
-    "onnx": OnnxNetworks,
-}
+FORMS: dict[str, Callable[[Path, Mapping[str, Any]], Networks]] = {"numpy": _numpy, "torch": _torch, "onnx": _onnx}
 
 
 def replay(controller: Runner, episodes: Mapping[str, np.ndarray]) -> tuple[float, float]:
@@ -581,8 +582,7 @@ def main() -> None:
     """Replay the recorded episodes."""
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else ".")
     networks = sys.argv[2] if len(sys.argv) > 2 else "numpy"
-    with np.load(folder / "check.npz", allow_pickle=False) as file:
-        episodes = {name: file[name] for name in file.files}
+    episodes = read_arrays(folder / "check.npz")
     largest, seconds = replay(Runner(folder, networks), episodes)
     allowed = float(episodes["tolerance"])
     print(f"largest difference: {largest:.1e} of {allowed:.1e} that are allowed; a step takes {1e3 * seconds:.3f} ms")
