@@ -87,7 +87,7 @@ def test_it_is_trained_with_the_lowest_level_and_with_all():
     ],
 )
 def test_what_cannot_read_it_is_refused(changes, message):
-    with pytest.raises(SpecError, match=rf"^{message}"):
+    with pytest.raises(SpecError, match=rf"(?m)^{message}"):
         spec_of(**{"network": LINEAR, "trunk": SEES} | changes)
 
 

@@ -410,7 +410,7 @@ class _Inspector:
         if any(dimension.integer for dimension in dimensions):
             return {}
         long = {name: rows for name, rows in self.controls.items() if len(rows) >= FEWEST}
-        still = {name: rows for name, rows in long.items() if same(rows.min(0), rows.max(0)).all()}
+        still = {name: rows for name, rows in long.items() if same(rows.min(0).astype(float), rows.max(0)).all()}
         dead = [name for name, rows in still.items() if not rows.any()]
         others = [name for name in still if name not in dead]
         reasons = dict.fromkeys(dead, "all commands are 0") if 2 * len(dead) < len(self.lengths) else {}

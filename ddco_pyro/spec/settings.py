@@ -136,6 +136,7 @@ class ObservationSpec(Model):
                 yield key, f"{STEP} is no angle; leave it out"
             elif getattr(self, key) and len(set(turned)) < len(turned):
                 yield key, "name a number twice; each is part of one angle or quaternion"
+                break
         if self.key == STEP and self.augment:
             yield "augment", f"{STEP} is computed and has no versions; leave it out"
 
