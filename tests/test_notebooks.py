@@ -15,7 +15,7 @@ from nbclient import NotebookClient
 
 ROOT = Path(__file__).parent.parent
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
-QUICK = ("05_your_own_demonstrations", "06_pushing")
+QUICK = ("06_pushing",)
 SMALL = "demonstrations.count=12 demonstrations.seed=0 training.epochs=4 selection.folds=2"
 
 

@@ -214,7 +214,8 @@ def test_after_another_process_is_killed_one_process_goes_on_to_the_same_bits(wh
 MOMENTUM = {"optimizer": {"name": "momentum"}, "clip_gradient": 0.1, "average": 0.9, "duration": {"mean": 4}}
 
 
-@pytest.mark.parametrize(("number", "training"), [(2, {}), pytest.param(3, MOMENTUM, marks=pytest.mark.slow)])
+@pytest.mark.slow  # the two processes above stand for torchrun's
+@pytest.mark.parametrize(("number", "training"), [(2, {}), (3, MOMENTUM)])
 def test_processes_of_torchrun_give_the_bits_of_one(demos, tmp_path, number, training):
     demos.write(tmp_path / "demos.hdf5")
     short = make_spec(tmp_path / "demos.hdf5", patience=None, epochs=4, restarts=1, **training)

@@ -60,6 +60,7 @@ def cluster(tmp_path_factory):
         process.wait()
 
 
+@pytest.mark.slow
 def test_a_worker_that_is_killed_changes_nothing(cluster, tmp_path):
     address, workers = cluster
     spec = spec_at(tmp_path)
