@@ -125,7 +125,7 @@ class Emission(ABC):
     def of(
         cls, part: ControlPart, numbers: Tensor, parameters: Tensor, log_scale: Tensor, ends: tuple[Tensor, Tensor]
     ) -> Emission:
-        """The distribution of a part of the control.
+        """The distribution of a part of the control; a product joins those of parts, and is of none.
 
         :param numbers: of the callers' network, [..., K, size].
         :param parameters: σ of a continuous part, then :meth:`further_parameters`, then those of other parts; [n],
