@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from numbers import Integral
 from typing import Any, Self
 
@@ -117,7 +118,7 @@ class OptionSegmenter(BaseEstimator):
         """log p(ξ, h) of the options h that :meth:`predict` gives, nats, and these options."""
         demos, total = self._demonstrations(X, U, lengths), 0.0
         for piece in self.fit_.infer(demos):
-            clamped = piece.tables.clamp(1, piece.path.choices[0])
+            clamped = replace(piece.tables.clamp(1, piece.path.choices[0]), power=1.0)
             total += float(log_likelihood(clamped, piece.batch.lengths).sum())
         return total, np.concatenate(self.fit_.segment(demos)[0]) - 1
 

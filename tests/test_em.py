@@ -107,26 +107,27 @@ def penalised(model, batch, ridge, discovering=None):
             value = value - 0.5 * ridge.termination * parameter.square().sum()
             continue
         caller = model.get_submodule(name.split(".network.")[0])
-        logits, std = caller.sizes[0], caller.std
+        logits, std, power = caller.sizes[0], caller.std, float(model.power)
         value = value - 0.5 * ridge.gate * parameter[..., :logits].square().sum()
         at, place = logits, 0
         for part in model.scaling.parts if std is not None else ():
             if part.exact or not part.continuous:
                 last = at + (1 if part.exact else KINDS[part.kind].size(part))
-                value = value - 0.5 * ridge.gate * parameter[..., at:last].square().sum()
+                value = value - power * 0.5 * ridge.gate * parameter[..., at:last].square().sum()
                 at = last
             for _ in part.dims if part.continuous else ():
                 if place in std.of_state:
-                    value = value - 0.5 * ridge.gate * parameter[..., at].square().sum()
+                    value = value - power * 0.5 * ridge.gate * parameter[..., at].square().sum()
                 else:
                     sigma = std().expand(parameter.shape[0], -1)[:, place]
-                    value = value - (0.5 * ridge.policy * parameter[..., at].square().sum(1) / sigma.square()).sum()
+                    square = parameter[..., at].square().sum(1)
+                    value = value - power * (0.5 * ridge.policy * square / sigma.square()).sum()
                     if place in (*std.own, *std.shared):
-                        value = value - parameter.shape[1] * sigma.log().sum()
+                        value = value - power * parameter.shape[1] * sigma.log().sum()
                 at, place = at + 1, place + 1
             place += part.kind == "student"  # ν
         if std is not None and std.of_state:
-            value = value - 0.5 * ridge.gate * parameter[..., -len(std.of_state) :].square().sum()
+            value = value - power * 0.5 * ridge.gate * parameter[..., -len(std.of_state) :].square().sum()
     return value
 
 
@@ -145,6 +146,8 @@ CASES = {
     "two levels": ((3, 2), CLIPPED, {"std": LEARNED}),
     "hybrid, two levels": ((2, 2), None, {"std": LEARNED, "emits": ("options", "control")}),
     "mixture": ((3,), None, {"std": {**LEARNED, "per_option": True}, "memoryless": (1,)}),
+    "a power": ((3,), CLIPPED, {"std": {**LEARNED, "per_option": True}, "power": 0.3}),
+    "a power, two levels": ((2, 2), MIXED, {"std": LEARNED, "power": 0.5}),
 }
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from hierarchies import make_batch, make_hierarchy
-from oracle import brute_force, random_tables
+from oracle import brute_force, predictions, random_tables
 
 import ddco_pyro
 from ddco_pyro import inference
@@ -19,7 +19,8 @@ from ddco_pyro.inference import log_likelihood, posterior, segment
 from ddco_pyro.inference.filtering import Filter
 from ddco_pyro.inference.kernel import STEPS_A_THREAD, on_threads
 from ddco_pyro.inference.marginal import EliminatedAHMM
-from ddco_pyro.model.tables import NEVER, Tables, complete
+from ddco_pyro.inference.posteriors import log_predictive
+from ddco_pyro.model.tables import NEVER, Tables, complete, joint_density
 
 CASES = [
     ((), (), 5),
@@ -39,16 +40,18 @@ CASES = [
 
 @pytest.mark.parametrize(("counts", "hybrid", "steps"), CASES)
 @pytest.mark.parametrize("engine", ["fused", "enumerate"])
-def test_log_likelihood_is_the_sum_over_paths(counts, hybrid, steps, engine):
-    tables = random_tables(counts, hybrid, trajectories=2, steps=steps, seed=1)
+@pytest.mark.parametrize("power", [1.0, 0.3])
+def test_log_likelihood_is_the_sum_over_paths(counts, hybrid, steps, engine, power):
+    tables = replace(random_tables(counts, hybrid, trajectories=2, steps=steps, seed=1), power=power)
     lengths = torch.tensor([steps, max(steps - 1, 1)])
     truth = [brute_force(tables, n, int(length)).log_likelihood for n, length in enumerate(lengths)]
     np.testing.assert_allclose(log_likelihood(tables, lengths, engine).numpy(), truth, atol=1e-9, rtol=0)
 
 
 @pytest.mark.parametrize(("counts", "hybrid", "steps"), CASES)
-def test_posterior_is_the_marginal_over_paths(counts, hybrid, steps):
-    tables = random_tables(counts, hybrid, trajectories=2, steps=steps, seed=2)
+@pytest.mark.parametrize("power", [1.0, 0.3])
+def test_posterior_is_the_marginal_over_paths(counts, hybrid, steps, power):
+    tables = replace(random_tables(counts, hybrid, trajectories=2, steps=steps, seed=2), power=power)
     lengths = torch.tensor([steps, max(steps - 1, 1)])
     found = posterior(tables, lengths)
     for n, length in enumerate(lengths.tolist()):
@@ -140,10 +143,12 @@ def test_compiled_code_is_in_one_file():
     ("counts", "hybrid", "steps"),
     [((1,), (True,), 4), ((3,), (True,), 4), ((2, 2), (True, False), 3), ((1, 2, 1), (False, True, True), 2)],
 )
-def test_the_belief_is_what_the_past_says(counts, hybrid, steps):
-    tables = random_tables(counts, hybrid, trajectories=2, steps=steps, seed=21)
-    filtering = Filter()
-    for t, now in enumerate(complete(tables, torch.tensor([steps, steps])).steps()):
+@pytest.mark.parametrize("power", [1.0, 0.3])
+def test_the_belief_is_what_the_past_says(counts, hybrid, steps, power):
+    tables = replace(random_tables(counts, hybrid, trajectories=2, steps=steps, seed=21), power=power)
+    filtering, lengths = Filter(power), torch.tensor([steps, steps])
+    density = joint_density(tables.control).unbind(1)
+    for t, now in enumerate(complete(tables, lengths).steps()):
         belief = filtering.predict(now)
         known = [table.clone() for table in tables.control]
         for table in known:
@@ -155,8 +160,20 @@ def test_the_belief_is_what_the_past_says(counts, hybrid, steps):
                 np.testing.assert_allclose(level[n].sum(-1), truth.u[d][t], atol=1e-12)
                 np.testing.assert_allclose(level[n, :, 1], truth.v[d][t], atol=1e-12)
                 np.testing.assert_allclose(belief.choices[d][n].sum(), 1.0, atol=1e-12)
-        filtering.update(now.emission)
-    torch.testing.assert_close(filtering.log_likelihood, log_likelihood(tables, torch.tensor([steps, steps])))
+        filtering.update(density[t])
+    torch.testing.assert_close(filtering.log_likelihood, log_predictive(tables, lengths))
+
+
+@pytest.mark.parametrize("power", [1.0, 0.3])
+@pytest.mark.parametrize(("counts", "hybrid", "steps"), CASES)
+def test_the_predictive_density_is_that_of_every_path_so_far(counts, hybrid, steps, power):
+    tables = replace(random_tables(counts, hybrid, trajectories=2, steps=steps, seed=5), power=power)
+    lengths = torch.tensor([steps, max(steps - 1, 1)])
+    found = log_predictive(tables, lengths)
+    truth = [sum(step.value for step in predictions(tables, n, int(length))) for n, length in enumerate(lengths)]
+    np.testing.assert_allclose(found.numpy(), truth, atol=1e-9)
+    if power == 1:
+        torch.testing.assert_close(found, log_likelihood(tables, lengths))
 
 
 def test_thousands_of_steps_do_not_drift():
@@ -340,7 +357,7 @@ def test_the_filter_refuses_steps_of_other_demonstrations():
     other, *_ = complete(random_tables((2, 2), (True, True), 1, 2), torch.tensor([2])).steps()
     filtering = Filter()
     filtering.predict(first)
-    with pytest.raises(BadInput, match=r"emission: expected \[3, 3, 3\]; got \[1, 3, 3\]"):
+    with pytest.raises(BadInput, match=r"density: expected \[3, 3, 3\]; got \[1, 3, 3\]"):
         filtering.update(other.emission)
     filtering.update(first.emission)
     with pytest.raises(BadInput, match=r"step: expected joint choices \[3, 3, 3\]; got \[1, 3, 3\]"):

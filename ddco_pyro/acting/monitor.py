@@ -17,7 +17,7 @@ from ddco_pyro.inference.filtering import Belief, Filter
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import States
 from ddco_pyro.model.outputs import Outputs
-from ddco_pyro.model.tables import complete
+from ddco_pyro.model.tables import complete, joint_density
 from ddco_pyro.names import choice_names
 
 Lengths = Mapping[str, Sequence[np.ndarray]]
@@ -92,7 +92,7 @@ class Monitor:
 
     def reset(self) -> None:
         """Begin an episode."""
-        self._window, self._filter = Window(self.hierarchy.encoder), Filter()
+        self._window, self._filter = Window(self.hierarchy.encoder), Filter(float(self.hierarchy.power))
         self._outputs: Outputs | None = None
         self._states: States | None = None
         self._active: dict[str, tuple[int, int]] = {}
@@ -145,9 +145,7 @@ class Monitor:
             inputs = self._window.inputs([observation])
             if self._outputs is not None:
                 assert scaled is not None
-                emission = complete(self._outputs.tables(scaled), ONE_STEP).steps()[0].emission
-                assert emission is not None  # the control is known
-                self._filter.update(emission)
+                self._filter.update(joint_density(self._outputs.tables(scaled).control)[:, 0])
             self._outputs, self._states = self.hierarchy.advance(inputs, self._states)
             self.belief = self._filter.predict(complete(self._outputs.tables(), ONE_STEP).steps()[0])
         probabilities = {}

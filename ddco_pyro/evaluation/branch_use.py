@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from ddco_pyro.evaluation.inferred import Inferred
-from ddco_pyro.inference.engines import log_likelihood
+from ddco_pyro.inference.posteriors import log_predictive
 from ddco_pyro.metrics import BranchUse
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs
@@ -100,7 +100,7 @@ def _score(hierarchy: Hierarchy, piece: Inferred, level: int, weight: Tensor, re
     """The weighted log-density of each caller's control; for the meta-policy the whole log-likelihood, [K]."""
     outputs = hierarchy(piece.batch.inputs) if replaced else piece.outputs
     if level == hierarchy.depth:
-        return log_likelihood(outputs.tables(piece.batch.actions), piece.batch.lengths).sum().reshape(1)
+        return log_predictive(outputs.tables(piece.batch.actions), piece.batch.lengths).sum().reshape(1)
     emission = outputs.emissions[level]
     if emission is None:
         return torch.full((weight.shape[-1],), torch.nan, dtype=torch.float64)

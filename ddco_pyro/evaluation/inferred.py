@@ -14,9 +14,8 @@ import torch
 from ddco_pyro.data.checks import check_fitted
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, not_demonstrations
 from ddco_pyro.data.memory import INFERENCE
-from ddco_pyro.inference.engines import log_likelihood
 from ddco_pyro.inference.paths import Path, most_likely_path, sample_paths
-from ddco_pyro.inference.posteriors import Decomposition, Posterior, decompose, posterior
+from ddco_pyro.inference.posteriors import Decomposition, Posterior, decompose, log_predictive, posterior
 from ddco_pyro.model.batch import Batch, encode
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.outputs import Outputs
@@ -116,8 +115,8 @@ class Inferred:
 
     @cached_property
     def log_likelihood(self) -> np.ndarray:
-        """log p(ξ) of each demonstration, nats in the control's own units, [N]."""
-        values: np.ndarray = log_likelihood(self.tables, self.batch.lengths).numpy()
+        """Σ_t log p(a_t | s_0..t, a_0..t-1) of each demonstration, nats in the control's own units, [N]."""
+        values: np.ndarray = log_predictive(self.tables, self.batch.lengths).numpy()
         return values
 
     @cached_property

@@ -24,9 +24,13 @@ class Belief(NamedTuple):
 
 
 class Filter:
-    """An exact filter: call :meth:`predict` with each step's tables, then :meth:`update` with its control."""
+    """An exact filter: call :meth:`predict` with each step's tables, then :meth:`update` with its control.
 
-    def __init__(self) -> None:
+    :param power: β, how many times the log-density of a control counts in later beliefs.
+    """
+
+    def __init__(self, power: float = 1.0) -> None:
+        self.power = power
         self._before: Tensor | None = None
         self._now: Tensor | None = None
         self.log_likelihood = torch.zeros(1, dtype=torch.float64)
@@ -43,21 +47,26 @@ class Filter:
         self._now = arrival.message
         return Belief(tuple(_marginals(arrival, level) for level in range(len(now.selection))))
 
-    def update(self, emission: Tensor) -> None:
+    def update(self, density: Tensor) -> None:
         """Condition on the applied control, given its log-density for each joint choice, [N, C_D, ..., C_1].
 
         :raises ValueError: :meth:`predict` was not called, the control has probability 0, or the shape is wrong.
         """
         if self._now is None:
             raise ValueError("update() follows predict(): there is no step to which this control belongs")
-        if emission.shape != self._now.shape:
-            raise BadTables(f"emission: expected {list(self._now.shape)}; got {list(emission.shape)}")
-        message = self._now + emission
-        total = log_sum(message.flatten(1)) if message.dim() > 1 else message
+        if density.shape != self._now.shape:
+            raise BadTables(f"density: expected {list(self._now.shape)}; got {list(density.shape)}")
+        total = _log_mass(self._now + density)
         if not bool(torch.isfinite(total).all()):
             raise ValueError("the control has probability 0 under every choice; is it in the demonstrations' units?")
         self.log_likelihood = self.log_likelihood + total
-        self._before, self._now = message - total.reshape(-1, *(1,) * (message.dim() - 1)), None
+        message = self._now + self.power * density
+        self._before, self._now = message - _log_mass(message).reshape(-1, *(1,) * (message.dim() - 1)), None
+
+
+def _log_mass(message: Tensor) -> Tensor:
+    """Its logarithm over all joint choices, [N]."""
+    return log_sum(message.flatten(1)) if message.dim() > 1 else message
 
 
 def _joint(now: Step) -> tuple[int, ...]:

@@ -34,11 +34,13 @@ class Eliminate(torch.autograd.Function):
     """Log-likelihoods of tables; the gradient with respect to a log-table is the posterior of its entries."""
 
     @staticmethod
-    def forward(ctx: Any, depth: int, lengths: Tensor, *leaves: Tensor | None) -> Tensor:
+    def forward(ctx: Any, depth: int, power: float, lengths: Tensor, *leaves: Tensor | None) -> Tensor:
         """log p(ξ), [N]."""
-        tables = Tables.of(depth, leaves)
-        found = posteriors(tables, lengths, marginals=any(ctx.needs_input_grad[3 * depth + 3 :]))
-        ctx.posteriors = *found.tables.leaves(), *(found.marginals or tables.evidence)
+        tables = Tables.of(depth, leaves, power)
+        found = posteriors(tables, lengths, marginals=any(ctx.needs_input_grad[3 * depth + 4 :]))
+        selection, termination, control = found.tables.selection, found.tables.termination, found.tables.control
+        evidence = found.marginals or tables.evidence
+        ctx.posteriors = *selection, *termination, *(power * acting for acting in control), *evidence
         ctx.save_for_backward(*leaves)
         return found.value
 
@@ -53,12 +55,12 @@ class Eliminate(torch.autograd.Function):
         with torch.no_grad():
             gradients = [
                 (posterior * upstream.reshape(-1, *(1,) * (posterior.dim() - 1))).to(leaf.dtype) if needed else None
-                for posterior, leaf, needed in zip(ctx.posteriors, leaves, ctx.needs_input_grad[2:], strict=True)
+                for posterior, leaf, needed in zip(ctx.posteriors, leaves, ctx.needs_input_grad[3:], strict=True)
             ]
         if torch.is_grad_enabled():
             inputs = [part for part in (upstream, *leaves) if part is not None and part.requires_grad]
             gradients = [None if one is None else _Refuse.apply(one, *inputs) for one in gradients]
-        return None, None, *gradients
+        return None, None, None, *gradients
 
 
 class _Refuse(torch.autograd.Function):
@@ -80,7 +82,7 @@ def log_likelihood(tables: Tables, lengths: Tensor) -> Tensor:
     """log p(ξ), [N] float64, of tables on the CPU."""
     if not tables.depth:
         return logspace.log_likelihood(complete(tables, lengths))  # nothing is latent
-    value: Tensor = Eliminate.apply(tables.depth, lengths, *tables.leaves())
+    value: Tensor = Eliminate.apply(tables.depth, tables.power, lengths, *tables.leaves())
     return value
 
 
@@ -118,6 +120,26 @@ def posteriors(tables: Tables, lengths: Tensor, marginals: bool = False) -> Elim
     return elimination
 
 
+def predicted(tables: Tables, lengths: Tensor) -> Tensor:
+    """log p(h_t | s_0..t, a_0..t-1) of each joint choice, float64 [N, T, C_D, ..., C_1]; 0 past the lengths.
+
+    Controls before t count β times, evidence before t counts too.
+    """
+    found = torch.zeros(*tables.control[-1].shape[:2], *reversed(tables.sizes), dtype=torch.float64)
+    if not tables.depth:
+        return found
+    structure = Structure.of(tables.sizes)
+    given = lengths.numpy(), logarithms(tables).flatten(0, 1).numpy(), found.reshape(-1, len(structure.actors)).numpy()
+
+    def some(first: int, last: int) -> None:
+        longest, size = int(lengths[first:last].max()), structure.entries
+        room = np.empty((longest + 1, size)), np.empty((longest, size))
+        kernel.predict(first, last, tables.steps, *given, *room, structure.columns, *structure.tables)
+
+    kernel.on_threads(some, given[0])
+    return found
+
+
 def logarithms(tables: Tables) -> Tensor:
     """The tables of all levels side by side, in the columns of :class:`~ddco_pyro.inference.kernel.Structure`."""
     evidence = tables.joint_evidence()
@@ -126,6 +148,9 @@ def logarithms(tables: Tables) -> Tensor:
     rows = torch.empty(*each[0].shape[:2], sum(sizes), dtype=torch.float64)
     for place, table in zip(rows.split(sizes, -1), each, strict=True):
         place.unflatten(2, table.shape[2:]).copy_(table.detach())
+    if tables.power != 1:
+        controls = sum(sizes[2 * tables.depth : 3 * tables.depth + 1])
+        rows[..., sum(sizes[: 2 * tables.depth]) :][..., :controls] *= tables.power
     return rows
 
 
@@ -161,11 +186,12 @@ def _repeat_in_log_space(tables: Tables, n: int, length: int, elimination: Elimi
     alone = tables.trajectory(n, length)
     leaves = [None if leaf is None else leaf.detach().double().requires_grad_() for leaf in alone.leaves()]
     with torch.enable_grad():
-        chain = complete(Tables.of(tables.depth, leaves), torch.tensor([length]))
+        chain = complete(Tables.of(tables.depth, leaves, tables.power), torch.tensor([length]))
         value = logspace.log_likelihood(chain)
         assert chain.emission is not None  # log_likelihood has scored it
         needed = [leaf for leaf in leaves[: 3 * tables.depth + 1] if leaf is not None]
         *each, joint = torch.autograd.grad(value.sum(), [*needed, chain.emission], materialize_grads=True)
+    each = [*each[: 2 * tables.depth], *(part / tables.power for part in each[2 * tables.depth :])]
     elimination.value[n] = value.detach()[0]
     for into, posterior in zip(elimination.tables.leaves(), each, strict=True):
         assert into is not None

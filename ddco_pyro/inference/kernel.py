@@ -304,6 +304,27 @@ def eliminate(
         value[n], exact[n] = found + math.log(product), good
 
 
+@entry
+def predict(
+    first: int, last: int, steps: int, lengths: Array, rows: Array, predicted: Array, messages: Array, spread: Array,
+    columns: int, callers: Array, actors: Array, choices: Array, above: Array,
+) -> None:  # fmt: skip
+    """Of trajectories ``first`` to ``last``, fill the ``predicted`` log-probabilities [N·T, S] of joint choices before
+    the control of each step.
+
+    :param rows: log-probabilities.
+    """
+    for n in range(first, last):
+        _begin(LOG_SUM, messages)
+        before = 0.0
+        for t in range(lengths[n]):
+            row = n * steps + t
+            _predict(LOG_SUM, t, row, rows, messages, spread, callers, actors)
+            for s in range(len(actors)):
+                predicted[row, s] = spread[t, s] - before
+            before = _act(LOG_SUM, t, row, rows, columns, messages, spread, actors)
+
+
 @inner
 def _share(semiring: int, part: float, whole: float) -> float:
     """The probability of a part of the mass, of logarithms; of a part of the maximum, 1 where it is the maximum."""

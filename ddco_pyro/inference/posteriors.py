@@ -7,6 +7,7 @@ probability that the entry was used.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -14,9 +15,10 @@ from torch import Tensor
 
 from ddco_pyro.inference import fused
 from ddco_pyro.inference.arguments import refuse_impossible
+from ddco_pyro.inference.logspace import log_sum
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.outputs import Outputs
-from ddco_pyro.model.tables import NEVER, Tables
+from ddco_pyro.model.tables import NEVER, Tables, joint_density
 
 
 class Posterior(NamedTuple):
@@ -70,15 +72,41 @@ def _not_ending(u: Tensor, terminated: Tensor, lengths: Tensor) -> Tensor:
     return w
 
 
+def log_predictive(tables: Tables, lengths: Tensor) -> Tensor:
+    """Σ_t log p(a_t | s_0..t, a_0..t-1) of each trajectory, nats, [N] float64, whatever the power β of the tables.
+
+    A power changes the beliefs over options in which past controls count; each control is scored by its density. With
+    β = 1 the sum is log p(ξ). The gradient with respect to ``tables.control`` is the belief after each control.
+
+    :param lengths: steps of each trajectory, int64 [N].
+
+    >>> import torch
+    >>> selection, ending = torch.tensor([0.0, 0.5, 0.5]).log(), torch.tensor([1.0, 0.0]).log()
+    >>> tables = Tables(  # an option that is kept for ever, of two
+    ...     selection=(selection.expand(1, 2, 1, 3),),
+    ...     termination=(ending.expand(1, 2, 2, 2),),
+    ...     control=(torch.tensor([4.0, 1.0]).log().expand(1, 2, 2), torch.full((1, 2, 1), -torch.inf)),
+    ...     power=0.5,
+    ... )
+    >>> log_predictive(tables, torch.tensor([2])).exp()  # (0.5 · 4 + 0.5 · 1) (2/3 · 4 + 1/3 · 1), by √4 : √1
+    tensor([7.5000], dtype=torch.float64)
+    """
+    density = joint_density(tables.control)
+    if tables.depth:
+        density = log_sum((fused.predicted(tables, lengths) + density).flatten(2))
+    alive = torch.arange(density.shape[1]) < lengths[:, None]
+    return torch.where(alive, density, 0.0).sum(1)
+
+
 class Decomposition(NamedTuple):
     """log p(ξ) of N demonstrations in parts, float64 nats in the control's own units.
 
-    With the posterior q of the latents and their prior p(ζ), the product of selections and terminations,
+    p_t is the belief over options before the control of step t, q_t the belief after it:
 
-        log p(ξ) = Σ_d E_q[Σ_t log π(a_td)] − KL(q ‖ p(ζ)).
+        log p(ξ) = Σ_t log Σ_h p_t(h) π_h(a_t) = Σ_d Σ_t E_q_t[log π(a_td)] − Σ_t KL(q_t ‖ p_t).
 
-    :param dimensions: E_q[Σ_t log π(a_td)] of the control dimensions in the model, [N, A'].
-    :param options: −KL(q ‖ p(ζ)), at most 0; 0 without options, [N].
+    :param dimensions: Σ_t E_q_t[log π(a_td)] of the control dimensions in the model, [N, A'].
+    :param options: −Σ_t KL(q_t ‖ p_t), at most 0; 0 without options, [N].
     """
 
     dimensions: Tensor
@@ -92,11 +120,13 @@ class Decomposition(NamedTuple):
 
 def decompose(outputs: Outputs, batch: Batch) -> Decomposition:
     """The parts of each demonstration's log-likelihood, given the networks' outputs for the batch."""
+    exact, actions = outputs.map(lambda tensor: tensor.detach().double()), batch.actions.double()
+    tables = exact.tables(actions)
+    control = tuple(table.detach().requires_grad_() for table in tables.control)
+    value = log_predictive(replace(tables, control=control), batch.lengths)
+    actors = torch.autograd.grad(value.sum(), control)
     with torch.no_grad():
-        exact, actions = outputs.map(Tensor.double), batch.actions.double()
-        tables = exact.tables(actions)
-        elimination = fused.posteriors(tables, batch.lengths)
-        value, actors = elimination.value, elimination.tables.control[-len(exact.emissions) :]
+        value = value.detach()
         alive = (batch.inputs.time < batch.lengths[:, None])[..., None, None]
         dimensions = sum(
             torch.where(alive, weight.unsqueeze(-1) * emission.by_dimension(actions), 0.0).sum((1, 2))

@@ -198,6 +198,8 @@ def _terminate(t: int, now: Step, previous: tuple[Tensor, ...], rows: Tensor) ->
 def ahmm(chain: Chain, emissions: Sequence[Steps | None], actions: Tensor | None = None) -> None:
     """The joint probability p(ζ, ξ) of latents and controls of §4.1, without the dynamics p(s' | s, a).
 
+    The log-density of controls counts β times, the chain's ``power``: a coarsened posterior (Miller and Dunson 2019).
+
     Sample sites ``b_{d}_{t}``, ``h_{d}_{t}`` [N] and ``a_{t}`` [N, A], the control in scaled units.
 
     :param chain: the log-probabilities of selections and terminations; the controls' are not used.
@@ -217,7 +219,8 @@ def run(chain: Chain, emissions: Sequence[Steps | None], actions: Tensor | None 
     choices: tuple[Tensor, ...] | None = None
     for t in pyro.markov(range(len(steps))):
         choices = choose(t, steps[t], choices)
-        pyro.sample(f"a_{t}", Acting(emitting[t], choices).mask(steps[t].alive), obs=applied[t])
+        with pyro.poutine.scale(scale=chain.power):
+            pyro.sample(f"a_{t}", Acting(emitting[t], choices).mask(steps[t].alive), obs=applied[t])
         if (evidence := steps[t].evidence) is not None:
             rows = torch.arange(len(evidence))
             pyro.factor(f"evidence_{t}", Vindex(evidence)[(rows, *reversed(choices))])

@@ -132,6 +132,9 @@ class Hierarchy(nn.Module):
     :raises SpecError: a user's network does not take its options.
     """
 
+    power: Tensor
+    """β of :class:`~ddco_pyro.model.tables.Tables`, a number."""
+
     def __init__(
         self,
         spec: Spec,
@@ -145,6 +148,8 @@ class Hierarchy(nn.Module):
         self.steps, self.device = steps, HOST
         self._reduced = spec.training.precision == "bfloat16"
         self.encoder = ObservationEncoder(spec.observations, shapes)
+        power = spec.control.power if spec.hierarchy is not None else 1.0  # nothing is latent in a flat policy
+        self.register_buffer("power", torch.tensor(power, dtype=torch.float64))
         varying = [dimension for dimension in range(control_size) if dimension not in constant]
         parts = all_gaussian(varying) if parts is None else parts
         self.scaling = scaling = ControlScaling(spec.control, control_size, dict(constant), parts)
@@ -300,7 +305,7 @@ class Hierarchy(nn.Module):
             endings.append(None if level.termination is None else next(each).squeeze(-1))
         top = raw[-1]
         last = _uniform(top, levels[-1].count) if discovering else self.meta_policy(top, self.scaling)
-        return Outputs((*callers, last), tuple(endings))
+        return Outputs((*callers, last), tuple(endings), float(self.power))
 
 
 def _bytes_at_once(device: torch.device) -> float:

@@ -34,12 +34,14 @@ class Tables:
         [N, T, 1]; -inf for callers that emit no control; empty where no control is known.
     :param evidence: log-likelihood of each choice by other evidence, shapes [N, T, 1 + k_d]; None for a level without.
         Hard labels are 0 and -inf.
+    :param power: β, how many times the log-density of each control counts in posteriors.
     """
 
     selection: tuple[Tensor, ...]
     termination: tuple[Tensor, ...]
     control: tuple[Tensor, ...] = ()
     evidence: tuple[Tensor | None, ...] = field(default=())
+    power: float = 1.0
 
     @property
     def depth(self) -> int:
@@ -57,11 +59,11 @@ class Tables:
         return int((self.selection or self.control)[-1].shape[1])
 
     @classmethod
-    def of(cls, depth: int, leaves: Sequence[Tensor | None]) -> Tables:
+    def of(cls, depth: int, leaves: Sequence[Tensor | None], power: float = 1.0) -> Tables:
         """The tables of a hierarchy of ``depth`` levels from their :meth:`leaves`."""
         selection, termination = leaves[:depth], leaves[depth : 2 * depth]
         control, evidence = leaves[2 * depth : 3 * depth + 1], leaves[3 * depth + 1 :]
-        return cls(_present(selection), _present(termination), _present(control), tuple(evidence))
+        return cls(_present(selection), _present(termination), _present(control), tuple(evidence), power)
 
     def leaves(self) -> tuple[Tensor | None, ...]:
         """Every table: selections, terminations, controls and, where there is any, the evidence."""
@@ -100,8 +102,8 @@ class Tables:
         *lower, top = self.selection
         uniform = torch.full_like(top, -math.log(top.shape[-1] - 1))
         uniform[..., 0] = NEVER
-        fixed = Tables.of(self.depth, [None if table is None else table.detach() for table in self.leaves()])
-        levels = Tables((*lower, uniform), self.termination, self.control, self.evidence)
+        fixed = Tables.of(self.depth, [None if one is None else one.detach() for one in self.leaves()], self.power)
+        levels = replace(self, selection=(*lower, uniform))
         return levels, replace(fixed, selection=(*fixed.selection[:-1], top))
 
     def trajectory(self, n: int, length: int) -> Tables:
@@ -110,7 +112,7 @@ class Tables:
         def cut(tables: Sequence[Tensor | None]) -> Any:
             return tuple(None if table is None else table[n : n + 1, :length] for table in tables)
 
-        return Tables(cut(self.selection), cut(self.termination), cut(self.control), cut(self.evidence))
+        return Tables(cut(self.selection), cut(self.termination), cut(self.control), cut(self.evidence), self.power)
 
 
 def always_ending(shape: torch.Size) -> Tensor:
@@ -136,9 +138,10 @@ class Chain:
         the highest level's has one caller.
     :param termination: log-probabilities of b^d = 0 and 1 given h^d, shapes [N, T, C_d, 2].
     :param evidence: log-likelihood of the joint choice by other evidence, [N, T, C_D, ..., C_1]; None for none.
-    :param emission: log-probability of the control given the joint choice, evidence included, [N, T, C_D, ..., C_1];
-        None where no control is known.
+    :param emission: β times the log-density of the control given the joint choice, and the evidence,
+        [N, T, C_D, ..., C_1]; None where no control is known.
     :param alive: whether a step is within its trajectory's length, [N, T].
+    :param power: β.
     """
 
     selection: tuple[Tensor, ...]
@@ -146,6 +149,7 @@ class Chain:
     evidence: Tensor | None
     emission: Tensor | None
     alive: Tensor
+    power: float = 1.0
 
     @property
     def depth(self) -> int:
@@ -188,10 +192,10 @@ def complete(tables: Tables, lengths: Tensor) -> Chain:
     )
     termination = tuple(_keep_past_the_end(_control_lasts_one_step(t.double()), alive) for t in tables.termination)
     evidence = _only(alive, tables.joint_evidence())
-    emission = _only(alive, _emission(tables.control)) if tables.control else None
+    emission = _only(alive, tables.power * joint_density(tables.control)) if tables.control else None
     if emission is not None and evidence is not None:
         emission = emission + evidence
-    return Chain(selection, termination, evidence, emission, alive)
+    return Chain(selection, termination, evidence, emission, alive, tables.power)
 
 
 def _only(alive: Tensor, table: Tensor | None) -> Tensor | None:
@@ -217,8 +221,8 @@ def _keep_past_the_end(termination: Tensor, alive: Tensor) -> Tensor:
     return torch.where(_like(alive, termination), termination, keep)
 
 
-def _emission(control: Sequence[Tensor]) -> Tensor:
-    """log p(a_t | h^D_t, ..., h^1_t): the lowest level whose choice is not 0 acts."""
+def joint_density(control: Sequence[Tensor]) -> Tensor:
+    """log π(a_t | h^D_t, ..., h^1_t) float64 [N, T, C_D, ..., C_1]: the lowest level whose choice is not 0 acts."""
     depth = len(control) - 1
     emission = control[-1].double().squeeze(-1)
     for level in range(depth, 0, -1):

@@ -252,6 +252,9 @@ class ControlSpec(Model):
     scale: Scale = "standardize"
     """``standardize`` (by the training demonstrations), ``none``, or a list with a positive divisor for each control
     dimension."""
+    power: float = Field(default=1.0, gt=0, le=1)
+    """β: how many times the log-density of the control counts in training and in posteriors of the options (a power, or
+    coarsened, likelihood). The less it counts, the longer segments are. Reported log-likelihoods are of densities."""
     parts: Items[PartSpec] = ()
     """Groups of dimensions with their own distribution; the settings above hold for all other dimensions."""
 

@@ -315,12 +315,15 @@ class Expectation:
             std.value = torch.where(std.value == old, old, longer)
 
     def _penalty(self, sums: Mapping[str, Sums]) -> float:
-        """The log-density of the prior that the ridges stand for, up to a constant, of what is trained."""
+        """The log-density of the prior that the ridges stand for, up to a constant, of what is trained.
+
+        That of policies counts β times, as the density of their controls does.
+        """
         total = 0.0
         for name, network in self._networks.items():
             if not network.trained:
                 continue
-            weight = network.weight
+            weight, log_stds = network.weight, 0.0
             each = _penalties(weight, network.ridge)
             for group in sums[name].groups.values():
                 if group.std and group.columns.stop > group.columns.start:
@@ -328,8 +331,11 @@ class Expectation:
                     sigma = std.value[:, places]
                     each[:, group.columns] = _penalties(weight[..., group.columns], self._ridge.policy) / sigma.square()
                     learned = [place for place in places if place in (*std.module.own, *std.module.shared)]
-                    total -= self._prior_count(weight) * float(std.value[:, learned].log().sum())
-            total -= 0.5 * float(each.sum())
+                    log_stds += float(std.value[:, learned].log().sum())
+            caller = self._callers.get(name)
+            choices = each.shape[1] if caller is None else caller.sizes[0]
+            policy = 0.5 * float(each[:, choices:].sum()) + self._prior_count(weight) * log_stds
+            total -= 0.5 * float(each[:, :choices].sum()) + float(self.model.power) * policy
         return total
 
     def _prior_count(self, weight: Tensor) -> int:
@@ -364,7 +370,8 @@ class Expectation:
         if self._discovering:
             uniform = torch.zeros(*piece.inputs.batch, 1, levels[-1].count, dtype=torch.float64)
             top = CallerOutputs(levels[-1].count, uniform, None)
-        outputs = Outputs((*(callers[f"{name}.policy"] for name in named), top), tuple(logits))
+        power = float(self.model.power)
+        outputs = Outputs((*(callers[f"{name}.policy"] for name in named), top), tuple(logits), power)
         tables = outputs.tables(piece.actions)
         value = self._score(tables, piece, rows)
         every_leaf = *said.values(), *stds.values(), *tables.leaves()
@@ -383,6 +390,7 @@ class Expectation:
             if name not in sums or of[name] is None:
                 continue
             caller, groups = self._callers[name], list[Information]()
+            of[name][..., caller.sizes[0] :] /= power  # the M-step of policies is the same whatever the power
             choices, columns = selection.get(name), slice(0, caller.sizes[0])
             if caller.sizes[0] and choices is not None:
                 probabilities = said[name].detach()[..., columns].softmax(-1)
@@ -391,8 +399,10 @@ class Expectation:
             if caller.std is not None and acting is not None:
                 emission = callers[name].emission
                 assert emission is not None  # it has parameters
-                groups.extend(_emitted(caller, emission.map(Tensor.detach), said[name].detach(), acting, piece.actions))
-            sums[name].add_gradient(xs[self._networks[name].reads].x, of[name], of_std.get(name))
+                emission, numbers = emission.map(Tensor.detach), said[name].detach()
+                groups.extend(_emitted(caller, emission, numbers, acting / power, piece.actions))
+            std = of_std.get(name)
+            sums[name].add_gradient(xs[self._networks[name].reads].x, of[name], None if std is None else std / power)
             learned[name] = groups
         for prefix, end in zip(named, ended, strict=True):
             name = f"{prefix}.termination"

@@ -10,7 +10,7 @@ random starts is kept.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -82,7 +82,7 @@ class Constants:
             selection[level] = pad(chosen.log(), (1, 0), value=NEVER).expand(tables.selection[level].shape)
         for level, ended in enumerate(self.termination, start=1):
             termination[level] = torch.stack([1 - ended, ended], -1).log().expand(tables.termination[level].shape)
-        return Tables(tuple(selection), tuple(termination), tables.control, tables.evidence)
+        return replace(tables, selection=tuple(selection), termination=tuple(termination))
 
 
 def fitted(pieces: Sequence[Piece], seed: int) -> Constants:

@@ -6,7 +6,7 @@ import functools
 import itertools
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -39,6 +39,35 @@ def random_tables(
     logits = [normal(count) for count in counts]
     termination = [torch.stack([(-x).sigmoid().log(), x.sigmoid().log()], -1) for x in logits]
     return Tables(tuple(selection), tuple(termination), tuple(control if counts else [normal(1)]))
+
+
+@dataclass
+class Predicted:
+    """Of each joint choice: its probability before a control, and the control's log-density."""
+
+    probability: dict[tuple[int, ...], float]
+    log_density: dict[tuple[int, ...], float]
+
+    @property
+    def value(self) -> float:
+        """log p(a_t | s_0..t, a_0..t-1)."""
+        return math.log(sum(p * math.exp(self.log_density[h]) for h, p in self.probability.items()))
+
+
+def predictions(tables: Tables, n: int, length: int) -> list[Predicted]:
+    """Of each step of a trajectory, by summing over all paths up to it."""
+    found, sizes = [], list(tables.sizes)
+    for t in range(length):
+        known = [table.clone() for table in tables.control]
+        for table in known:
+            table[:, t] = torch.where(table[:, t] > NEVER, 0.0, NEVER)
+        weights: dict[tuple[int, ...], float] = {}
+        for h, _, probability in paths(replace(tables, control=tuple(known)), n, t + 1, sizes):
+            weights[h[-1]] = weights.get(h[-1], 0.0) + probability
+        density = {h: log_density(_lists(tables, n), t, h) for h in weights}
+        total = sum(weights.values())
+        found.append(Predicted({h: weight / total for h, weight in weights.items()}, density))
+    return found
 
 
 @dataclass
@@ -76,7 +105,11 @@ def paths(tables: Tables, n: int, length: int, sizes: list[int]) -> Iterator[tup
     joint = list(itertools.product(*map(range, sizes)))
     ends = list(itertools.product((0, 1), repeat=len(sizes)))
     known = Tables(
-        *(tuple(table[n].tolist() for table in part) for part in (tables.selection, tables.termination, tables.control))
+        *(
+            tuple(table[n].tolist() for table in part)
+            for part in (tables.selection, tables.termination, tables.control)
+        ),
+        power=tables.power,
     )
 
     @functools.cache
@@ -92,6 +125,12 @@ def paths(tables: Tables, n: int, length: int, sizes: list[int]) -> Iterator[tup
             yield from walk((*h, choices), (*b, ended), probability * p)
 
     yield from walk((), (), 1.0)
+
+
+def _lists(tables: Tables, n: int) -> Tables:
+    """The tables of one trajectory as lists."""
+    parts = (tables.selection, tables.termination, tables.control)
+    return Tables(*(tuple(table[n].tolist() for table in part) for part in parts), power=tables.power)
 
 
 def _step(tables: Tables, t: int, h: tuple[int, ...], b: tuple[int, ...], before: tuple[int, ...] | None) -> float:
@@ -111,10 +150,11 @@ def _step(tables: Tables, t: int, h: tuple[int, ...], b: tuple[int, ...], before
             probability *= float(h[d] == 0)
         else:
             probability *= math.exp(tables.selection[d][t][0 if caller is None else caller - 1][h[d]])
-    return probability * math.exp(_control(tables, t, h))
+    return probability * math.exp(tables.power * log_density(tables, t, h))
 
 
-def _control(tables: Tables, t: int, h: tuple[int, ...]) -> float:
+def log_density(tables: Tables, t: int, h: tuple[int, ...]) -> float:
+    """log π(a_t | h_t) of tables as lists of one trajectory."""
     for d, choice in enumerate(h):
         if choice != 0:
             return tables.control[d][t][choice - 1]
