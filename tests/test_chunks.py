@@ -30,6 +30,7 @@ NETWORKS: dict[str, dict[str, Any]] = {
     },
     "lstm over branches, read by all": {"whole": {"network": "lstm", "over": {**BRANCHES, "hidden": [5]}, "hidden": 4}},
     "branches": {"policy": {**BRANCHES, "hidden": [7]}},
+    "constant": {"policy": {"network": "constant"}, "whole": CONV},
     "per_timestep": {"policy": {"network": "per_timestep", "hidden": [4], "inputs": ["state"]}},
 }
 TRAJECTORIES, STEPS = 2, 13

@@ -25,6 +25,8 @@ from ddco_pyro.inference import log_likelihood, segment
 from ddco_pyro.model.batch import Batch, encode
 from ddco_pyro.model.emissions import KINDS
 from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.networks import Inputs
+from ddco_pyro.model.outputs import bounded
 from ddco_pyro.spec import RidgeSpec, SpecError, parse_spec, with_overrides
 from ddco_pyro.training import em
 from ddco_pyro.training.checkpoint import Progress, Restart
@@ -35,6 +37,7 @@ from ddco_pyro.training.restarts import Trainer
 from ddco_pyro.training.ridge import cross_validated
 
 EVERYTHING = ("levels.", "meta_policy.")
+CONSTANT = {"network": "constant"}
 LEARNED = {"learn": True, "floor": 0.01}
 CLIPPED = (ControlPart("arm", (0, 1), "clipped", (-0.8, -np.inf), (0.9, 1.0)),)
 MIXED = (ControlPart("arm", (0,), "clipped", (-0.8,), (0.9,)), ControlPart("jaw", (1,), "binary", (0.0,), (1.0,)))
@@ -68,18 +71,21 @@ def in_double(batch):
     return Batch(inputs, batch.actions.double(), batch.lengths)
 
 
-def linear(counts, parts=None, emits=("options",), memoryless=(), **control):
-    """A random hierarchy of linear networks over three features, with these kinds of control."""
-    caller, whole = LINEAR | {"emits": list(emits)}, {"control": {"std": 0.7} | control}
+def linear(counts, parts=None, emits=("options",), memoryless=(), above=LINEAR, lowest=LINEAR, **control):
+    """A random hierarchy of linear networks over three features, with these kinds of control.
+
+    ``lowest`` are the policies that act, ``above`` all other networks.
+    """
+    caller, whole = above | {"emits": list(emits)}, {"control": {"std": 0.7} | control}
     if counts:
-        ends = ["always" if d in memoryless else LINEAR for d in range(1, 1 + len(counts))]
+        ends = ["always" if d in memoryless else above for d in range(1, 1 + len(counts))]
         levels = [
-            {"name": f"level-{d}", "count": count, "policy": caller if d else LINEAR, "termination": end}
+            {"name": f"level-{d}", "count": count, "policy": caller if d else lowest, "termination": end}
             for d, (count, end) in enumerate(zip(counts, ends, strict=True))
         ]
         whole["hierarchy"] = {"levels": levels, "meta_policy": caller}
     torch.manual_seed(0)
-    return Hierarchy(small_spec(counts, **whole), SHAPES, 2, steps=9, parts=parts)
+    return Hierarchy(small_spec(counts, lowest, **whole), SHAPES, 2, steps=9, parts=parts)
 
 
 def score(tables, piece, rows=None):
@@ -148,6 +154,14 @@ CASES = {
     "mixture": ((3,), None, {"std": {**LEARNED, "per_option": True}, "memoryless": (1,)}),
     "a power": ((3,), CLIPPED, {"std": {**LEARNED, "per_option": True}, "power": 0.3}),
     "a power, two levels": ((2, 2), MIXED, {"std": LEARNED, "power": 0.5}),
+    "a hidden Markov model": ((3,), None, {"std": LEARNED, "above": CONSTANT}),
+    "two levels of constants, hybrid": (
+        (2, 2),
+        None,
+        {"std": LEARNED, "emits": ("options", "control"), "above": CONSTANT},
+    ),
+    "constant controls": ((3,), None, {"std": LEARNED, "lowest": CONSTANT}),
+    "one constant control": ((), None, {"std": LEARNED, "lowest": CONSTANT}),
 }
 
 
@@ -162,11 +176,62 @@ def test_steps_never_lower_the_penalised_likelihood_and_end_where_its_gradient_i
     assert np.diff(values).min() > -1e-9 * abs(values[-1])
     assert values[-1] > values[0] + 1
     value = penalised(model, in_double(batch), ridge)
-    free = [(name, one) for name, one in model.named_parameters() if "raw" not in name or not _at_floor(model, name)]
+    learned = [(name, one) for name, one in model.named_parameters() if one.numel()]  # a constant has no weights
+    free = [(name, one) for name, one in learned if "raw" not in name or not _at_floor(model, name)]
     gradients = torch.autograd.grad(value, [one for _, one in free])
     for (name, _), gradient in zip(free, gradients, strict=True):
         assert gradient.abs().max() < 2e-2, name
     assert float(value.detach()) == pytest.approx(made.value, abs=0.1)  # of the weights before the last step
+
+
+def baum_welch(weights, start, ends):
+    """Initial and later choices and ends of an HMM, as numpy's forward-backward expects them of log-densities [T, K].
+
+    An option that ends may be selected again: A = diag(1 - ψ) + ψ η^T, and η is also the distribution of the first.
+    """
+    stay, switch = np.diag(1 - ends), np.outer(ends, start)
+    selected, ended, active, total = np.zeros_like(start), np.zeros_like(ends), np.zeros_like(ends), 0.0
+    for densities in weights:
+        scale = densities.max(1, keepdims=True)
+        b = np.exp(densities - scale)
+        forward, backward = [start * b[0]], [np.ones(len(start))]
+        for t in range(1, len(b)):
+            forward.append(forward[-1] @ (stay + switch) * b[t])
+            backward.insert(0, (stay + switch) @ (b[-t] * backward[0]))
+        evidence = forward[-1].sum()
+        total += np.log(evidence) + scale.sum()
+        selected += forward[0] * backward[0] / evidence
+        for t in range(1, len(b)):
+            joint = forward[t - 1][:, None] * switch * (b[t] * backward[t]) / evidence
+            selected, ended = selected + joint.sum(0), ended + joint.sum(1)
+            active += forward[t - 1] * backward[t - 1] / evidence
+    return total, selected / selected.sum(), ended / active
+
+
+def test_constant_gates_and_terminations_are_the_hidden_markov_model_that_baum_welch_fits():
+    """Beside policies that read; by numpy: the likelihood, and at its maximum the fixed point of Baum and Welch."""
+    model, batch = linear((3,), above=CONSTANT, std=LEARNED).double(), batch_for(None, 20, 12)
+    skills = (torch.arange(12) + torch.arange(20)[:, None]) // torch.tensor([5, 3, 2]).repeat(7)[:20, None] % 3
+    batch = Batch(batch.inputs, batch.actions + skills[..., None], batch.lengths)
+    expectation(model, RidgeSpec(gate=7.0, termination=7.0), batch)  # ridges are of weights: constants have none
+    (policy,), gate = model.option_levels(), model.meta_policy.network.layers[0].bias[0, 0].detach()
+    start, ends = (
+        gate.softmax(0).numpy(),
+        bounded(policy.termination.layers[0].bias[:, 0, 0].detach()).sigmoid().numpy(),
+    )
+    layer, std = policy.policy.network.layers[0], policy.policy.std().detach().numpy()
+    x, actions = batch.inputs.vectors["state"].double(), batch.actions.double().numpy()
+    means = (torch.einsum("ntf,kfa->ntka", x, layer.weight.double()) + layer.bias[:, 0]).detach().numpy()
+    densities = stats.norm.logpdf(actions[:, :, None], means, std).sum(-1)
+    total, selected, ended = baum_welch(
+        [own[:length] for own, length in zip(densities, batch.lengths, strict=True)], start, ends
+    )
+    with torch.no_grad():
+        own = log_likelihood(model.tabulate(in_double(batch)), batch.lengths).sum()
+    assert float(own) == pytest.approx(total, abs=1e-6)
+    np.testing.assert_allclose(start, selected, atol=2e-3)
+    np.testing.assert_allclose(ends, ended, atol=2e-3)
+    assert ends.min() < 0.7  # options last
 
 
 @pytest.mark.parametrize("case", ["sigma of each option", "clipped", "hybrid, two levels"])
@@ -206,7 +271,7 @@ def test_moments_of_features_are_those_of_einsum(monkeypatch, room):
     monkeypatch.setattr(em, "BLOCK", 100)  # 16 steps
     generator = torch.Generator().manual_seed(0)
     vector, weights = (torch.randn(*shape, generator=generator) for shape in ((5, 7, 2), (35, 4)))
-    features = em.Features(vector, room)
+    features = em.Features(Inputs({"state": vector}, {}, torch.arange(7)), ["state"], room)
     x = torch.cat([vector, torch.ones(5, 7, 1)], -1).double().flatten(0, 1)
     for _ in range(2):
         torch.testing.assert_close(
@@ -411,6 +476,8 @@ def test_linear_networks_are_trained_by_em_unless_the_spec_asks_for_gradient_ste
     def chosen(counts=(2,), **sections):
         return small_spec(counts, **sections).training.optimizer.name
 
+    constant = own | {"meta_policy": CONSTANT, "levels": [level | {"termination": CONSTANT}]}
+    assert chosen(hierarchy=constant) == "em"
     assert chosen() == chosen(()) == chosen(training={"optimizer": {"ridge": {"policy": 2}}}) == "em"
     for asked in ({"optimizer": {"lr": 0.1}}, {"optimizer": {"name": "adam"}}, {"average": 0.9}, {"clip_gradient": 1}):
         assert chosen(training=asked) == "adam"

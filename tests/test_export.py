@@ -34,7 +34,7 @@ PROGRAMS = ("read by all",)
 )
 def test_every_form_acts_as_the_controller_does(name, tmp_path):
     """On other observations than those that it was compared on when it was written, past the longest demonstration."""
-    onnx = name in ("conv", "lstm", "trunk", "σ of the state", "per_timestep")
+    onnx = name in ("conv", "lstm", "trunk", "σ of the state", "per_timestep", "constant")
     forms(name, tmp_path, ["numpy", "torch", *(["onnx"] if onnx else [])])
 
 

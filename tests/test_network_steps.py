@@ -59,11 +59,12 @@ def branches():
     return st.fixed_dictionaries({"network": st.just("branches"), "of": of, "hidden": some})
 
 
-assert set(CLASSES) == {"linear", "mlp", "per_timestep", "conv", "lstm", "branches"}, (
+assert set(CLASSES) == {"linear", "constant", "mlp", "per_timestep", "conv", "lstm", "branches"}, (
     "a new network belongs in every_kind"
 )
 every_kind = st.one_of(
     st.tuples(st.just({"network": "linear"}) | perceptrons | users, some_vectors, st.just({})),
+    st.tuples(st.just({"network": "constant"}), some_vectors, pictures | st.just({})),
     st.tuples(lstm(st.none() | perceptrons | users | lstm(perceptrons)), some_vectors, st.just({})),
     st.tuples(branches(), st.just({"pose": 2, "goal": 3}), st.just({"camera": (7, 6, 2)})),
     st.tuples(convolutions | lstm(convolutions), some_vectors | st.just({}), pictures),

@@ -31,10 +31,13 @@ from ddco_pyro.model.networks.perceptrons import StackedLinear
 from ddco_pyro.spec import Activation, network_spec
 
 
-@pytest.mark.parametrize("settings", [{"network": "linear"}, {"hidden": [8]}, {"hidden": [8, 6], "dropout": 0.5}])
+@pytest.mark.parametrize(
+    "settings", [{"network": "linear"}, {"network": "constant"}, {"hidden": [8]}, {"hidden": [8, 6], "dropout": 0.5}]
+)
 def test_stacked_networks_are_separate_networks(settings):
     network, inputs = make(**settings), make_inputs()
-    expected = torch.stack([separate(network.layers, k)(inputs.vector) for k in range(COPIES)], dim=2)
+    read = inputs.vector[..., :0] if "constant" in settings.values() else inputs.vector
+    expected = torch.stack([separate(network.layers, k)(read) for k in range(COPIES)], dim=2)
     assert_close(network(inputs)[0], expected)
 
 

@@ -289,6 +289,7 @@ networks = st.one_of(
     having(branches, network="branches"),
     having(memories, network="lstm"),
     having(keys(), network="linear"),
+    having(keys(), network="constant"),
     keys(network=st.just("per_timestep"), hidden=widths, dropout=shares),
     having(keys(filters=counts, kernel=counts, hidden=st.lists(counts)), network="conv"),
     having(keys(options=st.dictionaries(texts, values, max_size=3)), network="a.b:C"),
@@ -415,6 +416,11 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"hierarchy.meta_policy.emits": ["option"]}, "hierarchy.meta_policy.emits.0: must be options or control"),
     ({"hierarchy.meta_policy.emits": ["options", "options"]}, "hierarchy.meta_policy.emits: 'options' is given twice"),
     ({"hierarchy.meta_policy.network": "mpl"}, "hierarchy.meta_policy.network: no network is called 'mpl'"),
+    ({"hierarchy.trunk": {"network": "constant"}}, "hierarchy.trunk.network: a constant has no features for others"),
+    (
+        {"hierarchy.meta_policy": {"network": "constant", "inputs": ["a"]}},
+        "hierarchy.meta_policy.inputs: a constant re",
+    ),
     ({"hierarchy.meta_policy": {"network": "linear", "hidden": [8]}}, "hierarchy.meta_policy.hidden: does not apply"),
     ({"control.parts": [{"name": "arm", "dims": [0, 1], "scale": [1.0]}]}, "control.parts.0.scale: has 1 numbers"),
     ({"control.parts": [{"name": "jaw", "dims": [0], "kind": "binary", "scale": [1]}]}, "control.parts.0.scale: does"),
@@ -428,7 +434,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"hierarchy.meta_policy": {"network": "branches"}}, "hierarchy.meta_policy.of: missing; it has to be given"),
     (
         {"hierarchy.levels.0.trunk": {"network": "mlp"}, "hierarchy.levels.0.policy": {"network": "lstm"}},
-        "hierarchy.levels.0.policy.network: reads the trunk: use one of linear, mlp, got 'lstm'",
+        "hierarchy.levels.0.policy.network: reads the trunk: use one of linear, mlp, constant, got 'lstm'",
     ),
     ({"hierarchy.meta_policy.dropout": 1}, "hierarchy.meta_policy.dropout: must be less than 1, got 1"),
     ({"hierarchy": None}, "hierarchy: missing; declare a hierarchy, or a baseline in its place"),

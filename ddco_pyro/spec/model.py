@@ -8,12 +8,13 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, SerializerFunctionWrapHandler, field_validator, model_serializer
 
 from ddco_pyro.spec.base import Count, Emission, Items, Model, Problems, Text, bare, nested
-from ddco_pyro.spec.networks import LinearSpec, MlpSpec, Network, NetworkSpec, PolicySpec
+from ddco_pyro.spec.networks import LinearSpec, MlpSpec, Network, NetworkSpec, PolicySpec, TrunkSpec
 from ddco_pyro.spec.settings import LearnedStd
 from ddco_pyro.spec.training import OptimizerSpec
 
-HEADS = ("linear", "mlp")
-"""The networks that can read a trunk."""
+PERCEPTRONS = ("linear", "mlp")
+HEADS = (*PERCEPTRONS, "constant")
+"""The networks that can stand above a trunk."""
 
 ALWAYS: Literal["always"] = "always"
 """The termination of options that end after every step, ψ = 1."""
@@ -31,9 +32,9 @@ class LevelSpec(Model):
     """Name of the level in reports and files: a letter, then letters, digits, ``_`` and ``-``."""
     count: Count
     """Number of options, k."""
-    trunk: NetworkSpec | None = None
-    """A network for each option whose last hidden layer ``policy`` and ``termination`` read. Both are then ``linear``
-    or ``mlp``. Null: ``policy`` and ``termination`` read the observations."""
+    trunk: TrunkSpec | None = None
+    """A network for each option whose last hidden layer ``policy`` and ``termination`` read. Both are then ``linear``,
+    ``mlp`` or ``constant``. Null: ``policy`` and ``termination`` read the observations."""
     policy: PolicySpec = MlpSpec()
     """The options' policies, π: one network for each option."""
     termination: Termination = LinearSpec(network="linear")
@@ -55,10 +56,10 @@ class LevelSpec(Model):
 class HierarchySpec(Model):
     """Levels of options below a meta-policy."""
 
-    trunk: NetworkSpec | None = None
+    trunk: TrunkSpec | None = None
     """A single network whose last hidden layer replaces the observations for all other networks: the levels' trunks,
-    policies and terminations without a trunk, and the meta-policy. These are then ``linear`` or ``mlp``. Null: every
-    network reads the observations."""
+    policies and terminations without a trunk, and the meta-policy. These are then ``linear``, ``mlp`` or ``constant``.
+    Null: every network reads the observations."""
     levels: Items[LevelSpec] = Field(min_length=1)
     """The levels, lowest first."""
     meta_policy: PolicySpec = MlpSpec(emits=("options",))
@@ -158,8 +159,8 @@ class BaselineSpec(Model):
         if self.kind == "flat_equal" and not self.policy.hidden_sizes:
             text = f"flat_equal widens hidden layers, and network {network!r} has none; give it some"
             yield "policy", f"{text}, such as {{network: mlp, hidden: [64]}}"
-        if self.kind == "per_timestep" and network not in (*HEADS, "per_timestep"):
-            text = f"per_timestep has a perceptron for each step: use one of {', '.join(HEADS)}"
+        if self.kind == "per_timestep" and network not in (*PERCEPTRONS, "per_timestep"):
+            text = f"per_timestep has a perceptron for each step: use one of {', '.join(PERCEPTRONS)}"
             yield "policy.network", f"{text}, got {network!r}, or say kind: flat"
         for key in _OF_A_MIXTURE:
             if key in self.model_fields_set and self.kind != "mixture":

@@ -93,6 +93,17 @@ class LinearSpec(Network):
     network: Literal["linear"]
 
 
+class ConstantSpec(Network):
+    """A bias alone, which reads no observation."""
+
+    network: Literal["constant"]
+
+    def problems(self) -> Problems:
+        yield from super().problems()
+        if self.inputs:
+            yield "inputs", "a constant reads no observation; leave it out"
+
+
 class MlpSpec(Network):
     """A multi-layer perceptron."""
 
@@ -159,7 +170,7 @@ class LstmSpec(Network):
     """An LSTM."""
 
     network: Literal["lstm"]
-    over: NetworkSpec | None = None
+    over: TrunkSpec | None = None
     """The network whose last hidden layer the LSTM reads; null: the LSTM reads the vector observations."""
     hidden: Annotated[Sizes, Field(min_length=1)] = (64,)
     """Sizes of the recurrent layers, first layer first; a bare number is a single layer."""
@@ -176,7 +187,7 @@ class BranchesSpec(MlpSpec):
     """Several networks whose last hidden layers are joined by a perceptron."""
 
     network: Literal["branches"]  # type: ignore[assignment]
-    of: dict[str, NetworkSpec] = Field(min_length=1)
+    of: dict[str, TrunkSpec] = Field(min_length=1)
     """A network for each observation, by the observation's name. A network under another name lists its observations in
     ``inputs``."""
 
@@ -213,6 +224,7 @@ class UserNetworkSpec(Network):
 
 SETTINGS: dict[str, type[Network]] = {
     "linear": LinearSpec,
+    "constant": ConstantSpec,
     "mlp": MlpSpec,
     "per_timestep": PerTimestepSpec,
     "conv": ConvSpec,
@@ -240,8 +252,15 @@ def _emits_nothing(network: Network) -> Network:
     return network
 
 
+def _has_features(network: Network) -> Network:
+    if network.network == "constant":
+        raise invalid(("network", "a constant has no features for others to read; use linear or mlp"))
+    return network
+
+
 PolicySpec: TypeAlias = Annotated[
     Annotated[LinearSpec, Tag(tag_of(LinearSpec))]
+    | Annotated[ConstantSpec, Tag(tag_of(ConstantSpec))]
     | Annotated[MlpSpec, Tag(tag_of(MlpSpec))]
     | Annotated[PerTimestepSpec, Tag(tag_of(PerTimestepSpec))]
     | Annotated[ConvSpec, Tag(tag_of(ConvSpec))]
@@ -254,6 +273,9 @@ PolicySpec: TypeAlias = Annotated[
 
 NetworkSpec: TypeAlias = Annotated[PolicySpec, AfterValidator(_emits_nothing)]
 """A network from observations to numbers, such as the parameters of a distribution or features."""
+
+TrunkSpec: TypeAlias = Annotated[NetworkSpec, AfterValidator(_has_features)]
+"""A network whose features another network reads."""
 
 LstmSpec.model_rebuild()
 BranchesSpec.model_rebuild()

@@ -23,6 +23,9 @@ from ddco_pyro.spec.settings import (
 )
 from ddco_pyro.spec.training import TrainingSpec
 
+_LINEAR = ("linear", "constant")
+"""The networks that EM trains."""
+
 
 class Spec(Model):
     """Everything that determines a run.
@@ -96,13 +99,13 @@ class Spec(Model):
 
     @property
     def _is_linear(self) -> bool:
-        """Whether every network is declared ``linear`` or constant."""
+        """Whether every network is declared ``linear`` or ``constant``."""
         if self.hierarchy is None:
             baseline = self.baseline
-            return baseline is not None and baseline.kind == "flat" and baseline.policy.network == "linear"
+            return baseline is not None and baseline.kind == "flat" and baseline.policy.network in _LINEAR
         trunks = (self.hierarchy.trunk, *(level.trunk for level in self.hierarchy.levels))
         networks = [network for level in self.hierarchy.levels for network in level.networks.values()]
-        return not any(trunks) and all(n.network == "linear" for n in (*networks, self.hierarchy.meta_policy))
+        return not any(trunks) and all(n.network in _LINEAR for n in (*networks, self.hierarchy.meta_policy))
 
     def problems(self) -> Problems:
         checks = (self._choices, self._baselines, self._observed, self._labelled, self._durations, self._segments)

@@ -27,6 +27,7 @@ from torch.nn.functional import softplus
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.emissions import Emission, Information
 from ddco_pyro.model.hierarchy import Caller, Hierarchy
+from ddco_pyro.model.networks.inputs import Inputs
 from ddco_pyro.model.networks.perceptrons import Mlp, StackedLinear
 from ddco_pyro.model.outputs import TERMINATION_BOUND, CallerOutputs, Outputs, bounded
 from ddco_pyro.model.tables import Tables
@@ -60,7 +61,7 @@ Score = Callable[[Tables, Batch, Tensor], Tensor]
 
 
 def is_linear(model: Hierarchy) -> bool:
-    """Whether every network of a hierarchy is linear in the observations, so that EM applies."""
+    """Whether every network of a hierarchy is linear in the observations, or constant, so that EM applies."""
     return model.trunk is None and all(
         isinstance(network, Mlp) and network.trunk_size is None and len(network.layers) == 1
         for network in model.networks().values()
@@ -70,13 +71,14 @@ def is_linear(model: Hierarchy) -> bool:
 class Features:
     """The features of a piece of the demonstrations and their products, in float64.
 
-    :param vector: what networks read, [N, T, F - 1].
+    :param reads: the vectors that networks read; none for constants.
     :param room: the most products that are kept.
-    :ivar x: with a 1 at the end, [N, T, F].
+    :ivar x: the vectors with a 1 at the end, [N, T, F].
     """
 
-    def __init__(self, vector: Tensor, room: int) -> None:
-        self.x = torch.cat([vector.double(), vector.new_ones(*vector.shape[:-1], 1).double()], dim=-1)
+    def __init__(self, inputs: Inputs, reads: Sequence[str], room: int) -> None:
+        vectors = (inputs.vectors[name].double() for name in reads)
+        self.x = torch.cat([*vectors, torch.ones(*inputs.batch, 1, dtype=torch.float64)], dim=-1)
         self._rows = self.x.flatten(0, 1)
         self._first, self._second = torch.tril_indices(self.x.shape[-1], self.x.shape[-1])
         place = torch.empty(self.x.shape[-1], self.x.shape[-1], dtype=torch.long)
@@ -358,7 +360,7 @@ class Expectation:
         for name, network in self._networks.items():
             if network.reads not in xs:
                 room = KEPT // (len(self._pieces) * len(self._networks))
-                xs[network.reads] = Features(piece.inputs.select(network.reads).vector, room)
+                xs[network.reads] = Features(piece.inputs, network.reads, room)
             said[name] = network.outputs(xs[network.reads].x).requires_grad_()
         stds = {name: std.value.clone().requires_grad_() for name, std in self._stds.items()}
         callers = {

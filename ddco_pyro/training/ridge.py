@@ -32,10 +32,10 @@ def cross_validated(model: Hierarchy, batch: Batch, ridge: float, seed: int) -> 
     """
     scaling = model.scaling
     dims = [dim for own, part in zip(scaling.groups, scaling.parts, strict=True) if part.continuous for dim in own]
-    if len(batch) < 2 or not dims or not ridge:
-        return ridge
     (policy, *_), count = model.networks().values(), model.option_levels()[0].count if model.depth else 1
     assert isinstance(policy, Mlp)  # EM trains no other
+    if len(batch) < 2 or not dims or not ridge or not policy.reads:
+        return ridge
     given = batch.inputs.select(policy.reads).vector.double()
     x = torch.cat([given, given.new_ones(*given.shape[:-1], 1)], dim=-1)
     alive = batch.inputs.time < batch.lengths[:, None]

@@ -106,6 +106,7 @@ BOTH = ("options", "control")
 FITS = {
     "linear": make("linear", options="most_likely"),
     "mlp": make("mlp", control="sample", options="sample"),
+    "constant": make("constant", (2, 3), BOTH, camera=True, vectors=False, endings={"network": "constant"}),
     "per_timestep": make("per_timestep", steps=30),
     "bins": make("mlp", bins=4),
     "angles and quaternions": make("mlp", turns=True),

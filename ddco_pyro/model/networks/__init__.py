@@ -10,7 +10,7 @@ from typing import Any
 from ddco_pyro.model.networks.conv import Conv
 from ddco_pyro.model.networks.inputs import Inputs, InputShape, ShapeError
 from ddco_pyro.model.networks.lstm import Lstm
-from ddco_pyro.model.networks.perceptrons import Branches, Linear, Mlp, Network, PerTimestep, State, States
+from ddco_pyro.model.networks.perceptrons import Branches, Constant, Linear, Mlp, Network, PerTimestep, State, States
 from ddco_pyro.model.networks.user import UserNetwork
 from ddco_pyro.spec import NetworkSpec, SpecError
 from ddco_pyro.spec.networks import UserNetworkSpec
@@ -31,6 +31,7 @@ __all__ = [
 
 CLASSES: dict[str, type[Network]] = {
     "linear": Linear,
+    "constant": Constant,
     "mlp": Mlp,
     "per_timestep": PerTimestep,
     "conv": Conv,

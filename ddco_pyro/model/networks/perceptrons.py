@@ -160,6 +160,22 @@ class Linear(Mlp):
         super().__init__(shape, copies)
 
 
+class Constant(Mlp):
+    """K biases: linear maps of no observation, and of no feature of a trunk."""
+
+    def __init__(self, shape: InputShape | Network, copies: int) -> None:
+        super().__init__(InputShape({}), copies)
+        self.trunk_size = (shape.copies, shape.features) if isinstance(shape, Network) else None
+
+    def forward(self, seen: Inputs | Tensor, state: State = ()) -> tuple[Tensor, State]:
+        """[N, T, K, features], and the state."""
+        return super().forward(seen[..., :0] if isinstance(seen, Tensor) else seen.vector[..., None, :0], state)
+
+    def numpy_form(self) -> NumpyForm:
+        """Perceptrons over no vector."""
+        return self.layers.numpy_form(vectors((), self.copies))
+
+
 class PerTimestep(Network):
     """K × T perceptrons over the vectors: the per-timestep policy of SM 1.3.
 
