@@ -518,7 +518,7 @@ def test_ridges_are_raised_where_demonstrations_are_few_for_their_observations(t
     def fitted(demos, *overrides):
         path = tmp_path / f"{len(demos)}.hdf5"
         demos.write(path)
-        spec = parse_spec(yaml.safe_load(starting_spec(inspect(path), path)))
+        spec = parse_spec(yaml.safe_load(starting_spec(inspect(path), path).text))
         return ddco_pyro.fit(
             with_overrides(spec, {"compare_with": [], "training.epochs": 16, **dict(overrides)})
         ).metrics

@@ -85,7 +85,7 @@ def test_inspect_says_so(path: Path) -> None:
 
 
 def test_init_leaves_them_out(path: Path) -> None:
-    text = starting_spec(inspect(path), path)
+    text = starting_spec(inspect(path), path).text
     assert "  # - resting   # is constant up to rounding\n" in text
     assert all(f"  - {{key: {key}, differences: true}}\n" in text for key in ("half", "place", "distance"))
 

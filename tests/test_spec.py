@@ -416,6 +416,14 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"hierarchy.meta_policy.emits": ["option"]}, "hierarchy.meta_policy.emits.0: must be options or control"),
     ({"hierarchy.meta_policy.emits": ["options", "options"]}, "hierarchy.meta_policy.emits: 'options' is given twice"),
     ({"hierarchy.meta_policy.network": "mpl"}, "hierarchy.meta_policy.network: no network is called 'mpl'"),
+    (
+        {"demonstrations": {"path": "a", "hold_out_by": "b", "valid_fraction": 0}},
+        "demonstrations.hold_out_by: holds out",
+    ),
+    (
+        {"demonstrations": {"path": "a", "hold_out_by": "b", "leave_one_out": True}},
+        "demonstrations.hold_out_by: stands",
+    ),
     ({"hierarchy.trunk": {"network": "constant"}}, "hierarchy.trunk.network: a constant has no features for others"),
     (
         {"hierarchy.meta_policy": {"network": "constant", "inputs": ["a"]}},

@@ -22,7 +22,9 @@ from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
 from ddco_pyro.data.inspection import inspect
 from ddco_pyro.data.starting import starting_spec
 from ddco_pyro.report.likelihood import stds
-from ddco_pyro.spec import Spec, load_spec
+from ddco_pyro.spec import Spec, load_spec, with_overrides
+from ddco_pyro.training.data import demonstrations as read_demonstrations
+from ddco_pyro.training.data import outline, parts, seen
 
 
 @pytest.fixture
@@ -77,7 +79,9 @@ def test_what_it_writes_finds_what_was_planted_as_it_is(path: Path, tmp_path: Pa
     """
     two_skills(path)
     spec = tmp_path / "spec.yaml"
-    assert call("init", path, "--out", spec).out == f"{spec}: fit it with: ddco-pyro fit {spec} --out runs/spec\n"
+    assert call("init", path, "--out", spec).out == (
+        f"2 options, as many as the values of labels/skill\n{spec}: fit it with: ddco-pyro fit {spec} --out runs/spec\n"
+    )
     ended = call("fit", spec, "--out", tmp_path / "run")
     assert ended.status == 0, ended.err
     assert ended.out.splitlines()[-1] == f"next: ddco-pyro segment {tmp_path / 'run'} '{path}' --html segments.html"
@@ -107,7 +111,7 @@ def test_what_it_writes_lets_every_method_converge(tmp_path: Path) -> None:
 def test_it_says_what_it_leaves_out(path: Path, tmp_path: Path) -> None:
     add(path, "goal", 3.0)
     add(path, "1e3", np.nan)
-    spec = load_spec(write(tmp_path, text := starting_spec(inspect(path), path)))
+    spec = load_spec(write(tmp_path, text := starting_spec(inspect(path), path).text))
     assert [(one.key, one.differences) for one in spec.observations] == [("pose", True)]
     assert spec.demonstrations.path == str(path)
     assert "# - goal   # is constant" in text
@@ -121,7 +125,7 @@ def broken(path: Path, number: int, names: list[str], key: str = "obs/pose", **m
     with h5py.File(path, "r+") as file:
         for name in names:
             file[f"data/{name}/{key}"][1, 1] = np.nan
-    return starting_spec(inspect(path), path)
+    return starting_spec(inspect(path), path).text
 
 
 def test_options_are_compared_with_the_labels_that_know_most(path: Path) -> None:
@@ -135,10 +139,11 @@ def test_options_are_compared_with_the_labels_that_know_most(path: Path) -> None
             for name, values in {"all": 0 * halves, **full}.items():
                 group[f"labels/{name}"] = values
     facts = inspect(path)
-    text, steps = starting_spec(facts, path), sum(facts.lengths.values())
+    text, steps = starting_spec(facts, path).text, sum(facts.lengths.values())
     assert "  labels: whole                  # compared" in text
     assert f"  # the fullest of the labels: known in {steps} of {steps} steps\n" in text
     assert "  # labels 0, 1, ...: go, take\\nit\n" in text
+    assert "      count: 2                      # as many as the values of labels/whole; try others:" in text
     few = sum(list(facts.lengths.values())[:2])
     known = {"other": steps, "phase": few, "all": steps, "option": steps, "option_boundary": steps}
     assert re.findall(r"# labels: (\w+)   # known in (\d+) of", text) == [(key, str(known[key])) for key in known]
@@ -234,7 +239,7 @@ def test_what_jumps_as_an_angle_or_a_quaternion_is_read_without_its_jumps(path: 
         "obs/pose: dimensions 3-6 change sign",
         "obs/yaw: dimension 1 jumps by 2π",
     ]
-    spec = load_spec(write(tmp_path, starting_spec(inspect(path), path)), ["training.epochs=2", "compare_with=[]"])
+    spec = load_spec(write(tmp_path, starting_spec(inspect(path), path).text), ["training.epochs=2", "compare_with=[]"])
     read = {one.key: (one.angles, one.quaternions) for one in spec.observations if one.angles or one.quaternions}
     assert read == {"pose": ((), (3,)), "yaw": ((1,), ())}
     encoder = ddco_pyro.fit(spec).hierarchy.encoder
@@ -289,11 +294,88 @@ def test_few_demonstrations_all_train(path: Path, tmp_path: Path) -> None:
         records = tuple(demonstration(f"demo_{n}", length, n) for n, length in enumerate(steps))
         vectors = (replace(one, observations={"pose": one.observations["pose"]}) for one in records)
         Demonstrations(tuple(vectors)).write(path)
-        return load_spec(write(tmp_path, starting_spec(inspect(path), path)))
+        return load_spec(write(tmp_path, starting_spec(inspect(path), path).text))
 
     few, more = spec(*[20] * 7), spec(*[20] * 8)
     assert [one.demonstrations.leave_one_out for one in (few, more)] == [True, False]
     assert [one.training.tune_fraction for one in (few, more)] == [0, 0.1]
+
+
+@pytest.mark.parametrize(
+    ("labels", "count"), [({}, 4), ({"one": 1}, 4), ({"many": 21}, 4), ({"coarse": 2, "fine": 6, "one": 1}, 6)]
+)
+def test_there_are_as_many_options_as_labels(labels: dict[str, int], count: int, path: Path, tmp_path: Path) -> None:
+    """Of the labelling that knows most; ``coarse`` knows no label in the first step."""
+    records = []
+    for number in range(9):
+        seen, actions = {"pose": np.random.default_rng(number).normal(size=(24, 2))}, np.arange(24.0)[:, None] % 5
+        given = {name: (np.arange(24) * most // 24) - 10 * (name == "fine") for name, most in labels.items()}
+        if "coarse" in given:
+            given["coarse"][0] = -1
+        records.append((seen, actions, given))
+    numbered(records).write(path)
+    ended = call("init", path, "--out", tmp_path / "spec.yaml")
+    assert load_spec(tmp_path / "spec.yaml").hierarchy.levels[0].count == count
+    said = [] if count == 4 else [f"{count} options, as many as the values of labels/fine"]
+    assert ended.out.splitlines()[:-1] == said
+
+
+def of_operators(path: Path, operators: str) -> Path:
+    """A demonstration by each operator; the file has another division in masks."""
+    owned = tuple(
+        replace(one, attributes={"operator": who, "robot": "left"})
+        for one, who in zip(demonstrations(len(operators)), operators, strict=True)
+    )
+    Demonstrations(owned, {"train": ("demo_0", "demo_1"), "valid": ("demo_2",)}).write(path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("operators", "held_out"),
+    [("ABCDEABCDE", {2}), ("AAB", {1}), ("AAAAAAAB", {1}), ("ABBBBBBBBBBB", {1}), ("ABCDEFGHIJKLMNOPQRST", {4})],
+)
+def test_no_operator_is_on_both_sides(operators: str, held_out: set[int], path: Path, tmp_path: Path) -> None:
+    """About a fifth is held out, the same in every call, and a fit has this division."""
+    ended = [
+        call("init", of_operators(path, operators), "--out", tmp_path / f"{n}.yaml", "--hold-out-by", "operator")
+        for n in "01"
+    ]
+    first, again = ((tmp_path / f"{n}.yaml").read_text() for n in "01")
+    assert first.replace("0.yaml", "1.yaml") == again
+    said = re.fullmatch(
+        rf"held out: operator (.*), (\d+) of {len(operators)} demonstrations", ended[0].out.splitlines()[-2]
+    )
+    spec = load_spec(tmp_path / "0.yaml")
+    for demos in (read_demonstrations(spec), outline(spec), seen(spec, Demonstrations.read(path))):
+        train, valid = ([one.attributes["operator"] for one in part] for part in parts(spec, demos).values())
+        assert {*train} | {*valid} == {*operators}
+        assert not {*train} & {*valid}
+        assert (", ".join(sorted({*valid})), str(len(valid))) == said.groups()
+        assert len(valid) in held_out
+    drawn = {read_demonstrations(with_overrides(spec, {"seed": seed})).masks["valid"] for seed in range(9)}
+    assert (len(drawn) > 1) == (len({*operators}) > 2)
+
+
+@pytest.mark.parametrize(
+    ("attribute", "says"),
+    [
+        ("operater", "demo_0 has no attribute 'operater' (did you mean 'operator'?); there is: operator, robot"),
+        ("robot", "attribute 'robot' is left in all demonstrations; hold out by another one"),
+    ],
+)
+def test_what_cannot_be_held_out_by(attribute: str, says: str, path: Path, tmp_path: Path) -> None:
+    spec = tmp_path / "spec.yaml"
+    ended = call("init", of_operators(path, "ABCAB"), "--out", spec, "--hold-out-by", attribute)
+    assert (ended.status, ended.out, ended.err) == (2, "", f"ddco-pyro: {path}: {says}\n")
+    assert not spec.exists()
+    asked = [f"demonstrations.hold_out_by={attribute}", "demonstrations.leave_one_out=false"]
+    assert call("init", path, "--out", spec).status == 0
+    for command in ("check", "fit"):
+        out = ["--out", tmp_path / "run"] if command == "fit" else []
+        ended = call(command, spec, *out, *(word for one in asked for word in ("--set", one)))
+        assert (ended.status, ended.err.count("\n")) == (2, 1)
+        assert says in ended.err
+    assert not (tmp_path / "run").exists()
 
 
 # --- ``init``, ``check`` and ``fit`` ask the same questions -----------------------------------------------------------

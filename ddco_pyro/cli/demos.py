@@ -67,7 +67,7 @@ def inspect(
         print(f"\nto fit to it, import it first: {command('import', file, '--out', 'demos.hdf5')}")
         return
     try:
-        print(f"\n{starting_spec(facts, file)}\nnext: {command('init', file, '--out', f'{file.stem}.yaml')}")
+        print(f"\n{starting_spec(facts, file).text}\nnext: {command('init', file, '--out', f'{file.stem}.yaml')}")
     except DemonstrationsError as error:
         print(f"\nno spec to start with: {str(error).removeprefix(f'{file}: ')}")
 
@@ -75,6 +75,14 @@ def inspect(
 def init(
     file: SourcePath,
     out: Annotated[Path, written(out_file, "Where to write the spec.")] = Path("spec.yaml"),
+    hold_out_by: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ATTRIBUTE",
+            help="Hold out all demonstrations with some values of an attribute, such as the operator.",
+            show_default=False,
+        ),
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace a file that is there already.")] = False,
 ) -> None:
     """Write a commented spec for a file of demonstrations, ready to fit."""
@@ -87,8 +95,10 @@ def init(
         raise BadInput(f"{out}: exists; choose another --out, or replace it with --force")
     facts = look(file)
     refuse_foreign(file)
-    text = starting_spec(facts, file).replace("THIS_FILE", quote(str(out)))
-    write_text(out, text)
+    starting = starting_spec(facts, file, hold_out_by)
+    write_text(out, starting.text.replace("THIS_FILE", quote(str(out))))
+    for note in starting.notes:
+        print(note)
     fit = command("fit", out, "--out", f"runs/{out.stem}")
     print(f"{out}{hint(f': fit it with: {fit}')}")
 

@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 
 from ddco_pyro.data.controls import number
-from ddco_pyro.data.hdf5 import DemonstrationsError, natural
+from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError, natural
 from ddco_pyro.data.pictures import PICTURE_DIMENSIONS
 from ddco_pyro.data.sources.recording import NUMBERS, Column, Recording
 from ddco_pyro.errors import nearest
@@ -249,6 +249,41 @@ def divided(names: Sequence[str], masks: Mapping[str, Sequence[str]]) -> tuple[t
     if both:
         raise DemonstrationsError(f"{min(both, key=natural)} is in mask/train and in mask/valid; remove it from one")
     return tuple(train), tuple(valid)
+
+
+def with_values(
+    attribute: str, known: Mapping[str, Mapping[str, Attribute]], fraction: float, seed: int
+) -> dict[str, tuple[str, ...]]:
+    """Demonstrations to hold out by some values of an attribute, about a fraction of all: their names by value.
+
+    :param known: the attributes of each demonstration by its name.
+    :param seed: draws the order in which values are tried.
+    :raises DemonstrationsError: a demonstration lacks the attribute, or all have one value.
+    """
+    members: dict[str, tuple[str, ...]] = {}
+    for name, own in known.items():
+        if attribute not in own:
+            there = ", ".join(dict.fromkeys(key for one in known.values() for key in one)) or "none"
+            raise DemonstrationsError(
+                f"{name} has no attribute {attribute!r}{nearest(attribute, own)}; there is: {there}"
+            )
+        value = str(own[attribute])
+        members[value] = (*members.get(value, ()), name)
+    if len(members) == 1:
+        (value,) = members
+        raise DemonstrationsError(f"attribute {attribute!r} is {value} in all demonstrations; hold out by another one")
+    values, wanted, chosen, number = (
+        sorted(members, key=natural),
+        fraction * len(known),
+        dict[str, tuple[str, ...]](),
+        0,
+    )
+    for place in np.random.default_rng(seed).permutation(len(values)):
+        more = number + len(members[values[place]])
+        if abs(more - wanted) < abs(number - wanted) and more < len(known):
+            chosen[values[place]], number = members[values[place]], more
+    chosen = chosen or dict([min(members.items(), key=lambda one: len(one[1]))])
+    return {value: chosen[value] for value in values if value in chosen}
 
 
 def _without(names: Sequence[str], others: Collection[str]) -> dict[str, None]:

@@ -41,7 +41,7 @@ from ddco_pyro.data.controls import (
     number,
     same,
 )
-from ddco_pyro.data.hdf5 import DemonstrationsError, outside_files
+from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError, outside_files
 from ddco_pyro.data.pictures import MOVED, blocks
 from ddco_pyro.data.sources import Column, Source, open_source
 from ddco_pyro.data.sources.metadata import rate
@@ -65,6 +65,7 @@ class Field:
     :param demonstrations: number of demonstrations that have the array.
     :param video: whether the array is in video files, which are not decoded.
     :param unknown: number of steps of labels without ground truth.
+    :param values: the labels that occur, without the unknown one.
     :param names: of labels 0, 1, ..., where the file names them.
     """
 
@@ -82,6 +83,7 @@ class Field:
     demonstrations: int = 0
     video: bool = False
     unknown: int = 0
+    values: set[int] = field(default_factory=set)
     names: list[str] = field(default_factory=list)
 
     @property
@@ -150,6 +152,7 @@ class Field:
             self.affected += [name] if name not in self.affected[-1:] else []
         if self.place.startswith("labels/"):
             self.unknown += int((values == UNKNOWN).sum())
+            self.values |= {int(value) for value in np.unique(values[usable(values)]) if value != UNKNOWN}
         self.still = self.still and bool((values == first).all())
 
     def as_json(self) -> dict[str, Any]:
@@ -164,6 +167,7 @@ class Field:
             "shape": list(self.shape),
             "constant": self.constant,
             "rounding": self.rounding,
+            "values": sorted(self.values),
         }
         return data | ends | shown
 
@@ -183,6 +187,7 @@ class Inspection:
     :param external: other files that the HDF5 file names as parts of itself; they are not read.
     :param turns: the angles in radians and the first numbers of quaternions that jump, by place of the array.
     :param odd: names of demonstrations that are dead or padded and change the model of all, and why.
+    :param attributes: of each demonstration by its name.
     """
 
     path: Path
@@ -200,6 +205,7 @@ class Inspection:
     external: tuple[str, ...] = ()
     odd: Mapping[str, str] = field(default_factory=dict)
     turns: Mapping[str, tuple[tuple[int, ...], tuple[int, ...]]] = field(default_factory=dict)
+    attributes: Mapping[str, Mapping[str, Attribute]] = field(default_factory=dict)
 
     @property
     def exclusions(self) -> list[str]:
@@ -351,6 +357,7 @@ class _Inspector:
         self.source, self.exclude = source, exclude
         self.fields: dict[str, Field] = {}
         self.lengths: dict[str, int] = {}
+        self.attributes: dict[str, Mapping[str, Attribute]] = {}
         self.problems: dict[tuple[str, str], list[str]] = {}  # messages by kind and subject
         self.controls: dict[str, np.ndarray] = {}
         self.coincidences = _Coincidences()
@@ -399,6 +406,7 @@ class _Inspector:
             unreadable=tuple(unreadable),
             external=tuple(sorted(external)),
             odd=self._odd(dimensions),
+            attributes=self.attributes,
         )
 
     def _odd(self, dimensions: Sequence[ControlDimension]) -> dict[str, str]:
@@ -478,6 +486,7 @@ class _Inspector:
         """Read a demonstration; the places of its arrays."""
         recording = self.source.recording(name)
         steps = self.lengths[name] = recording.actions.shape[0] if recording.actions.shape else 0
+        self.attributes[name] = recording.attributes
         self.coincidences.begin(name, steps)
         if frequency := rate(recording.attributes):
             self.periods.setdefault("its attributes", {})[name] = 1 / frequency

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jinja2
 import numpy as np
 
-from ddco_pyro.data.checks import LEAST, check_division
+from ddco_pyro.data.checks import LEAST, check_division, with_values
 from ddco_pyro.data.controls import all_constant
 from ddco_pyro.data.hdf5 import DemonstrationsError, natural, printable
 from ddco_pyro.data.inspection import Field, Inspection, inspect
@@ -25,6 +25,12 @@ MANY = 100
 
 FEW = 8
 """Of fewer demonstrations none is held out from the fit: a part to tune by and a part to validate leave too few."""
+
+OPTIONS = 4
+"""Options where no labels say how many."""
+
+MOST_OPTIONS = 20
+"""Labels with more values than that do not decide the number of options."""
 
 MOST_EPOCHS = 2000
 """Largest budget of epochs."""
@@ -63,13 +69,21 @@ PICTURES = Recipe(batch_steps=250, gradient_steps=4000, epochs=20)
 """About six minutes on one core for each model, with pictures of 48 × 64 pixels."""
 
 
-def starting_spec(inspection: Inspection, path: str | Path) -> str:
-    """The commented YAML text of a spec for the inspected demonstrations, with ``path`` as its file.
+class Starting(NamedTuple):
+    """The commented YAML text of a spec, and a line for each thing that the demonstrations decided."""
+
+    text: str
+    notes: list[str]
+
+
+def starting_spec(inspection: Inspection, path: str | Path, hold_out_by: str | None = None) -> Starting:
+    """A spec for the inspected demonstrations, with ``path`` as its file.
 
     Unreadable and odd demonstrations are excluded. Demonstrations with unusable values are excluded if they are few;
     otherwise the affected observations are left out. Comments say why.
 
-    :raises DemonstrationsError: nothing can be fitted to the demonstrations.
+    :param hold_out_by: the attribute of demonstrations whose values are not to be on both sides of the split.
+    :raises DemonstrationsError: nothing can be fitted to the demonstrations, or the attribute cannot divide them.
     """
     odd = list(inspection.odd) if _divides(inspection, inspection.odd) else []
     excluded = sorted({*inspection.unreadable, *_few_affected(inspection), *odd}, key=natural)
@@ -92,13 +106,36 @@ def starting_spec(inspection: Inspection, path: str | Path) -> str:
     if not used:
         why = next((f": {field.place} {_left_out(inspection, field)}" for field in observed), "")
         raise DemonstrationsError(f"{inspection.path}: no observation can be used{why}; see all with: {look}")
-    text = _filled(inspection, str(path), observed, used, reasons)
+    labels = _fullest_first([field for field in inspection.labels if not _unusable(inspection, field)])
+    counted = labels[0] if labels and 1 < len(labels[0].values) <= MOST_OPTIONS else None
+    many = f"as many as the values of {counted.place}" if counted else ""
+    apart = _held_out(inspection, hold_out_by) if hold_out_by else ""
+    filled = {"labels": labels, "count": len(counted.values) if counted else OPTIONS, "many": many}
+    text = _filled(inspection, str(path), observed, used, reasons, filled | {"by": hold_out_by, "apart": apart})
     parse_spec(read_yaml(text))  # the text is a valid spec
-    return text
+    return Starting(text, [*([f"{filled['count']} options, {many}"] if many else []), *([apart] if apart else [])])
+
+
+def _held_out(inspection: Inspection, attribute: str) -> str:
+    """What a fit holds out by an attribute of demonstrations, in words.
+
+    :raises DemonstrationsError: the demonstrations cannot be divided by this attribute.
+    """
+    try:
+        found = with_values(attribute, inspection.attributes, _valid_fraction(len(inspection.lengths)), 0)
+    except DemonstrationsError as error:
+        raise DemonstrationsError(f"{inspection.path}: {error}") from None
+    number = sum(map(len, found.values()))
+    return printable(f"held out: {attribute} {', '.join(found)}, {number} of {len(inspection.lengths)} demonstrations")
 
 
 def _filled(
-    inspection: Inspection, path: str, observed: Sequence[Field], used: Sequence[Field], reasons: Sequence[str]
+    inspection: Inspection,
+    path: str,
+    observed: Sequence[Field],
+    used: Sequence[Field],
+    reasons: Sequence[str],
+    decided: Mapping[str, Any],
 ) -> str:
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("ddco_pyro.data", "."),
@@ -108,7 +145,7 @@ def _filled(
         keep_trailing_newline=True,
     )
     environment.filters |= {"yaml": _text, "seen": _seen, "printable": printable}
-    lengths, masks = list(inspection.lengths.values()), list(inspection.masks)
+    lengths, masks = list(inspection.lengths.values()), [] if decided["by"] else list(inspection.masks)
     vectors, images = ([field for field in used if field.image is image] for image in (False, True))
     recipe = VECTORS if vectors else PICTURES
     batch = _batch(np.array(lengths), recipe)
@@ -121,8 +158,7 @@ def _filled(
         reasons=reasons,
         masks=[name for name in ("train", "valid") if name in masks],
         other_masks=[name for name in masks if name not in ("train", "valid")],
-        valid_fraction=f"{_valid_fraction(len(lengths)):.2g}",
-        labels=_fullest_first([field for field in inspection.labels if not _unusable(inspection, field)]),
+        valid_fraction=_valid_fraction(len(lengths)),
         steps=sum(lengths),
         unusable_labels=unusable_labels,
         vectors=vectors,
@@ -135,8 +171,9 @@ def _filled(
         notes=[printable(note) for note in inspection.notes],
         batch=batch,
         em=em,
-        few=em and len(lengths) < FEW and not {"train", "valid"} & set(masks),
+        few=em and len(lengths) < FEW and not {"train", "valid"} & set(masks) and not decided["by"],
         epochs=max(_epochs(np.array(lengths), batch, recipe), EXACT_EPOCHS if em else 0),
+        **decided,
     )
 
 
@@ -165,7 +202,8 @@ def _seen(shape: Sequence[int]) -> tuple[list[int] | None, int]:
 
 
 def _valid_fraction(number: int) -> float:
-    return max(0.2 if number < MANY else 0.1, (1.5 if number > LEAST else 1) / number)  # at least one demonstration
+    least = (1.5 if number > LEAST else 1) / number  # one demonstration
+    return float(f"{max(0.2 if number < MANY else 0.1, least):.2g}")
 
 
 def _batch(lengths: np.ndarray, recipe: Recipe) -> int:

@@ -149,8 +149,9 @@ def _score_all(
 
 
 def final_spec(chosen: Candidate) -> Spec:
-    """The spec of the final fit: the chosen candidate on all demonstrations except those that the file sets apart."""
-    return with_overrides(chosen.spec, {"demonstrations.valid_fraction": 0.0, "demonstrations.leave_one_out": False})
+    """The spec of the final fit: the chosen candidate on all demonstrations but those that are set apart."""
+    apart = {} if chosen.spec.demonstrations.hold_out_by else {"demonstrations.valid_fraction": 0.0}
+    return with_overrides(chosen.spec, {**apart, "demonstrations.leave_one_out": False})
 
 
 def _write(folder: Path, spec: Spec, choice: Choice, folds: Folds, stop_early: bool) -> None:

@@ -44,6 +44,9 @@ class DemonstrationsSpec(Model):
     """Which of the task's scripted policies is recorded."""
     valid_fraction: Share = 0.1
     """Fraction of the demonstrations held out for validation, unless the file has ``mask/valid``; 0 for none."""
+    hold_out_by: Text | None = None
+    """An attribute of demonstrations, such as the operator: all demonstrations with some of its values are held out,
+    about ``valid_fraction`` of all, whatever masks the file has. The spec's ``seed`` draws the values."""
     leave_one_out: bool = False
     """Whether every demonstration trains the model. Held-out results of a demonstration are then of a further fit,
     which leaves it out. For few demonstrations; ``valid_fraction`` does not apply."""
@@ -52,6 +55,12 @@ class DemonstrationsSpec(Model):
     labels: Labels | None = None
     """Ground-truth labels in the file, with which discovered options are compared: one name for all levels, or a list
     with a name for each level, lowest first. Steps labelled −1 are ignored."""
+
+    def problems(self) -> Problems:
+        if self.hold_out_by is not None and self.leave_one_out:
+            yield "hold_out_by", "stands beside leave_one_out; keep one of the two"
+        elif self.hold_out_by is not None and not self.valid_fraction:
+            yield "hold_out_by", "holds out about valid_fraction, which is 0; raise valid_fraction"
 
     @property
     def file(self) -> Path | None:

@@ -393,7 +393,7 @@ class Folder:
         base = study.base
         if base is None:
             facts = replace(inspect(file, exclude=[*valid, *unused]), excluded=(), masks={})  # no others are shown
-            base = parse_spec(read_yaml(starting_spec(facts, file)))
+            base = parse_spec(read_yaml(starting_spec(facts, file).text))
         placed = self._placed(cell, own.path or file.relative_to(self.path).as_posix())
         spec = with_overrides(base, {**study.changes(cell.of, dict(cell.point)), **placed})
         reading = {"demonstrations.path": str(file), "demonstrations.exclude": unused}

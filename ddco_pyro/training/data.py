@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ddco_pyro.data.checks import check, check_trained, reading
+from ddco_pyro.data.checks import check, check_trained, reading, with_values
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError, extent
 from ddco_pyro.data.memory import refuse_too_much
 from ddco_pyro.data.sources.recording import Recording
@@ -116,7 +116,7 @@ def demonstrations(spec: Spec, on_event: OnEvent = ignore) -> Demonstrations:
     if path is None or not in_file(spec):
         path = collect(str(spec.demonstrated_task), sought, path, on_event, spec.observed)
     _refuse_what_cannot_be_read(spec, path)
-    return Demonstrations.read(path, spec.trained_with, _labels(spec), sought.exclude)
+    return _set_apart(spec, Demonstrations.read(path, spec.trained_with, _labels(spec), sought.exclude))
 
 
 def outline(spec: Spec) -> Demonstrations:
@@ -130,7 +130,7 @@ def outline(spec: Spec) -> Demonstrations:
     controls = Demonstrations.read(path, (), _labels(spec), spec.demonstrations.exclude)
     with open_robomimic(path) as source:
         outlined = (_outlined(source.recording(demo.name, spec.trained_with, ()), demo) for demo in controls)
-        return replace(controls, demonstrations=tuple(outlined))
+        return _set_apart(spec, replace(controls, demonstrations=tuple(outlined)))
 
 
 def _outlined(recording: Recording, demo: Demonstration) -> Demonstration:
@@ -151,7 +151,7 @@ def seen(spec: Spec, demos: Demonstrations) -> Demonstrations:
     keys, labels, exclude = spec.trained_with, _labels(spec), set(spec.demonstrations.exclude)
     first = demos[0]
     if (first.observations.keys(), first.labels.keys(), exclude) == ({*keys}, {*labels}, set()):
-        return demos
+        return _set_apart(spec, demos)
     for kind, names, there in (("obs", keys, first.observations), ("labels", labels, first.labels)):
         for name in names:
             if name not in there:
@@ -169,7 +169,21 @@ def seen(spec: Spec, demos: Demonstrations) -> Demonstrations:
         if demo.name not in exclude
     )
     masks = {mask: tuple(name for name in names if name not in exclude) for mask, names in demos.masks.items()}
-    return replace(demos, demonstrations=kept, masks=masks)
+    return _set_apart(spec, replace(demos, demonstrations=kept, masks=masks))
+
+
+def _set_apart(spec: Spec, demos: Demonstrations) -> Demonstrations:
+    """The demonstrations with the mask ``valid`` that ``hold_out_by`` asks for, in place of masks of the file.
+
+    :raises DemonstrationsError: the demonstrations cannot be divided by this attribute.
+    """
+    given, own = spec.demonstrations, {demo.name: demo.attributes for demo in demos}
+    if given.hold_out_by is None:
+        return demos
+    found = with_values(given.hold_out_by, own, given.valid_fraction, spec.seed)
+    held_out = {name for members in found.values() for name in members}
+    others = {mask: names for mask, names in demos.masks.items() if mask != "train"}
+    return replace(demos, masks={**others, "valid": tuple(name for name in demos.names if name in held_out)})
 
 
 def _labels(spec: Spec) -> tuple[str, ...]:
