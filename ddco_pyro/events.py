@@ -81,6 +81,15 @@ class OptionsCompared:
 
 
 @dataclass(frozen=True)
+class LengthTried:
+    """A power of the control's log-density, and gates that are constant or not, gave this median segment, steps."""
+
+    power: float
+    constant: bool
+    median: float
+
+
+@dataclass(frozen=True)
 class SelectionBegan:
     """A selection of ``total`` (candidate, fold) pairs begins; ``kept`` of them are scored already."""
 
@@ -146,6 +155,7 @@ Event = (
     | RestartDiverged
     | TrainingEnded
     | OptionsCompared
+    | LengthTried
     | SelectionBegan
     | FoldScored
     | CandidateGivenUp

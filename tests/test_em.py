@@ -119,11 +119,11 @@ def penalised(model, batch, ridge, discovering=None):
         for part in model.scaling.parts if std is not None else ():
             if part.exact or not part.continuous:
                 last = at + (1 if part.exact else KINDS[part.kind].size(part))
-                value = value - power * 0.5 * ridge.gate * parameter[..., at:last].square().sum()
+                value = value - power * 0.5 * ridge.policy * parameter[..., at:last].square().sum()
                 at = last
             for _ in part.dims if part.continuous else ():
                 if place in std.of_state:
-                    value = value - power * 0.5 * ridge.gate * parameter[..., at].square().sum()
+                    value = value - power * 0.5 * ridge.policy * parameter[..., at].square().sum()
                 else:
                     sigma = std().expand(parameter.shape[0], -1)[:, place]
                     square = parameter[..., at].square().sum(1)
@@ -133,7 +133,7 @@ def penalised(model, batch, ridge, discovering=None):
                 at, place = at + 1, place + 1
             place += part.kind == "student"  # ν
         if std is not None and std.of_state:
-            value = value - power * 0.5 * ridge.gate * parameter[..., -len(std.of_state) :].square().sum()
+            value = value - power * 0.5 * ridge.policy * parameter[..., -len(std.of_state) :].square().sum()
     return value
 
 
@@ -373,7 +373,7 @@ def test_a_flat_clipped_policy_is_the_censored_regression_that_scipy_finds():
 def test_a_flat_switch_is_the_logistic_regression_of_scikit_learn():
     parts = (ControlPart("jaw", (0,), "binary", (0.0,), (1.0,)), ControlPart("b", (1,), "gaussian"))
     model, batch = linear((), parts), batch_for(parts)
-    expectation(model, RidgeSpec(gate=2.0), batch)
+    expectation(model, RidgeSpec(policy=2.0), batch)
     x, a = rows_of(batch)
     truth = LogisticRegression(C=0.5, tol=1e-10, max_iter=1000).fit(x, a[:, 0])
     layer = model.meta_policy.network.layers[0]

@@ -28,6 +28,7 @@ from ddco_pyro.events import (
     EpochEnded,
     Event,
     FoldScored,
+    LengthTried,
     OptionsCompared,
     RestartDiverged,
     RestartStopped,
@@ -113,6 +114,9 @@ class Progress:
                 self.end()
             case OptionsCompared(done, total):
                 self._advance("comparing options", total, done)
+            case LengthTried(power, constant, median):
+                gates = ", constant gates" if constant else ""
+                self._advance("trying lengths", note=f"power {power:g}{gates}: median segment {median:g} steps")
             case SelectionBegan(total, kept):
                 self._begin(f"cross-validation{f' ({kept} of {total} kept)' if kept else ''}", total - kept)
             case FoldScored(candidate, fold, failed):

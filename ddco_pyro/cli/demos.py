@@ -6,15 +6,20 @@ import json
 import sys
 from pathlib import Path
 from shlex import quote
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from ddco_pyro.cli import AllowCode, AllowExternal, Overrides, SpecPath, hint, out_file, written
 from ddco_pyro.data.files import Output, check_outputs, write_text
 from ddco_pyro.data.formats import FORMATS
-from ddco_pyro.errors import BadInput, command
-from ddco_pyro.spec import SpecError, load_spec
+from ddco_pyro.errors import BadInput, Failed, command
+from ddco_pyro.spec import Spec, SpecError, load_spec, parse_spec
+from ddco_pyro.spec.yaml import read_yaml
+
+if TYPE_CHECKING:
+    from ddco_pyro.data.inspection import Inspection
+    from ddco_pyro.data.starting import Lengths
 
 SourcePath = Annotated[
     Path, typer.Argument(metavar="FILE", help=f"Demonstrations: {', '.join(about.text for about in FORMATS.values())}.")
@@ -83,9 +88,24 @@ def init(
             show_default=False,
         ),
     ] = None,
+    segment: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LENGTH",
+            help="How long options last, by the median: such as 2s, or 20 for steps. Small fits find the settings.",
+            show_default=False,
+        ),
+    ] = None,
+    segments: Annotated[
+        int | None,
+        typer.Option(min=1, help="The same by the number of segments in a demonstration.", show_default=False),
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace a file that is there already.")] = False,
 ) -> None:
-    """Write a commented spec for a file of demonstrations, ready to fit."""
+    """Write a commented spec for a file of demonstrations, ready to fit.
+
+    Without --segment or --segments, options last at least half a second, or five steps.
+    """
     from ddco_pyro.data.inspection import inspect as look
     from ddco_pyro.data.sources import refuse_foreign
     from ddco_pyro.data.starting import starting_spec
@@ -96,11 +116,45 @@ def init(
     facts = look(file)
     refuse_foreign(file)
     starting = starting_spec(facts, file, hold_out_by)
+    spec = parse_spec(read_yaml(starting.text))
+    if spec.training.optimizer.name == "em":
+        lengths = _lengths(spec, facts, segment, segments)
+        starting = starting_spec(facts, file, hold_out_by, lengths)
+        print(lengths.why)
+    elif segment or segments:
+        raise BadInput(f"{file}: --segment needs vectors to observe, since small fits find the settings")
     write_text(out, starting.text.replace("THIS_FILE", quote(str(out))))
     for note in starting.notes:
         print(note)
     fit = command("fit", out, "--out", f"runs/{out.stem}")
     print(f"{out}{hint(f': fit it with: {fit}')}")
+
+
+def _lengths(spec: Spec, facts: Inspection, segment: str | None, segments: int | None) -> Lengths:
+    """What makes options last as long as is asked for, by small fits."""
+    from ddco_pyro.cli import console
+    from ddco_pyro.data.starting import Lengths
+    from ddco_pyro.drawing.words import duration
+    from ddco_pyro.selection.lengths import in_steps, lasting
+    from ddco_pyro.training.data import demonstrations
+
+    if segment and segments:
+        raise BadInput("--segment and --segments exclude each other; keep one")
+    rate = facts.frequency
+    steps = in_steps("--segment", segment, rate) if segment else None
+    if segments:
+        steps = sum(facts.lengths.values()) / len(facts.lengths) / segments
+    least = max(5.0, 0.5 * rate) if rate else 5.0
+    try:
+        with console.Progress() as progress:
+            found = lasting(spec, demonstrations(spec), steps, least, progress)
+    except (BadInput, Failed):
+        if steps is not None:
+            raise
+        return Lengths()  # the fit will say what is wrong
+    asked = "" if steps is None else f"; asked: {duration(rate, steps)}"
+    why = f"median segment {duration(rate, found.median)} in small fits{asked}"
+    return Lengths(found.power, found.constant, why)
 
 
 def import_(

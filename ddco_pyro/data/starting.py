@@ -69,6 +69,19 @@ PICTURES = Recipe(batch_steps=250, gradient_steps=4000, epochs=20)
 """About six minutes on one core for each model, with pictures of 48 × 64 pixels."""
 
 
+class Lengths(NamedTuple):
+    """What decides how long options last.
+
+    :param power: β of the control's log-density.
+    :param constant: whether gates and terminations are constant.
+    :param why: what came of it, in words.
+    """
+
+    power: float = 0.5
+    constant: bool = False
+    why: str = "times the control's log-density counts: less makes options last longer, as init --segment 2s does"
+
+
 class Starting(NamedTuple):
     """The commented YAML text of a spec, and a line for each thing that the demonstrations decided."""
 
@@ -76,7 +89,9 @@ class Starting(NamedTuple):
     notes: list[str]
 
 
-def starting_spec(inspection: Inspection, path: str | Path, hold_out_by: str | None = None) -> Starting:
+def starting_spec(
+    inspection: Inspection, path: str | Path, hold_out_by: str | None = None, lengths: Lengths | None = None
+) -> Starting:
     """A spec for the inspected demonstrations, with ``path`` as its file.
 
     Unreadable and odd demonstrations are excluded. Demonstrations with unusable values are excluded if they are few;
@@ -111,7 +126,14 @@ def starting_spec(inspection: Inspection, path: str | Path, hold_out_by: str | N
     many = f"as many as the values of {counted.place}" if counted else ""
     apart = _held_out(inspection, hold_out_by) if hold_out_by else ""
     filled = {"labels": labels, "count": len(counted.values) if counted else OPTIONS, "many": many}
-    text = _filled(inspection, str(path), observed, used, reasons, filled | {"by": hold_out_by, "apart": apart})
+    text = _filled(
+        inspection,
+        str(path),
+        observed,
+        used,
+        reasons,
+        filled | {"by": hold_out_by, "apart": apart, "lasting": lengths or Lengths()},
+    )
     parse_spec(read_yaml(text))  # the text is a valid spec
     return Starting(text, [*([f"{filled['count']} options, {many}"] if many else []), *([apart] if apart else [])])
 

@@ -13,9 +13,10 @@ class RidgeSpec(Model):
     """Ridges of EM: precisions of a normal prior on the weights of linear maps, biases left out."""
 
     policy: float = Field(default=1.0, ge=0)
-    """Of the means of controls: as many steps, of observations with unit variance, that say 0; in units of 1/σ²."""
+    """Of the means of controls: as many steps, of observations with unit variance, that say 0; in units of 1/σ².
+    Also of the logits of switches and discrete actions."""
     gate: float = Field(default=1.0, ge=0)
-    """Of logits: of options, switches and discrete actions."""
+    """Of the logits of options."""
     termination: float = Field(default=1.0, ge=0)
     """Of terminations."""
     cross_validated: bool = False

@@ -329,7 +329,11 @@ class Study:
 
     def changes(self, method: str, point: dict[str, Any]) -> dict[str, Any]:
         """What a method with a point of the grid changes in the spec, by key path."""
-        alone = {"demonstrations.leave_one_out": False, "demonstrations.hold_out_by": None, "selection.grid": {}}
+        alone: dict[str, Any] = {
+            "demonstrations.leave_one_out": False,
+            "demonstrations.hold_out_by": None,
+            "selection.grid": {},
+        }
         return {**alone, **self.declared.overrides, **self.declared.methods[method].overrides, **point}
 
     def overridden_code(self) -> dict[str, str]:

@@ -327,6 +327,9 @@ class Expectation:
                 continue
             weight, log_stds = network.weight, 0.0
             each = _penalties(weight, network.ridge)
+            caller = self._callers.get(name)
+            choices = each.shape[1] if caller is None else caller.sizes[0]
+            each[:, choices:] = _penalties(weight[..., choices:], self._ridge.policy)
             for group in sums[name].groups.values():
                 if group.std and group.columns.stop > group.columns.start:
                     std, places = self._stds[name], list(group.std)
@@ -334,8 +337,6 @@ class Expectation:
                     each[:, group.columns] = _penalties(weight[..., group.columns], self._ridge.policy) / sigma.square()
                     learned = [place for place in places if place in (*std.module.own, *std.module.shared)]
                     log_stds += float(std.value[:, learned].log().sum())
-            caller = self._callers.get(name)
-            choices = each.shape[1] if caller is None else caller.sizes[0]
             policy = 0.5 * float(each[:, choices:].sum()) + self._prior_count(weight) * log_stds
             total -= 0.5 * float(each[:, :choices].sum()) + float(self.model.power) * policy
         return total
@@ -454,7 +455,9 @@ class Expectation:
                     assert value is not None
                     value = std.updated(value, square, count + self._prior_count(weight), group.std)
                 else:
-                    solved = _damped(information, gradient, weight, network.ridge)
+                    emitted = name in self._callers and columns.start >= self._callers[name].sizes[0]
+                    strength = self._ridge.policy if emitted else network.ridge
+                    solved = _damped(information, gradient, weight, strength)
                 change[..., columns] = solved
             network.weight = network.weight + change
             if std is not None and std.trained and value is not None:

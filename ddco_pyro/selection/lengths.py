@@ -1,0 +1,155 @@
+"""How long options last: the power of the control's log-density, and gates, that give segments of a length asked for.
+
+The less the control counts, the more a change of option costs beside what it explains. What gates and terminations read
+of the observations costs nothing, so where even a small power leaves segments too short, both become constant.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ddco_pyro.acting.monitor import run_lengths
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.errors import BadInput
+from ddco_pyro.events import LengthTried, OnEvent, ignore
+from ddco_pyro.fitting.fit import fit
+from ddco_pyro.fitting.fitted import Fit
+from ddco_pyro.spec import Spec, with_overrides
+from ddco_pyro.training.data import parts
+
+LEAST = 0.003
+"""The smallest power that is tried."""
+FIRST = 0.1
+"""The power that is tried first."""
+TRIES = 5
+"""Powers that are tried with gates of one kind."""
+NEAR, FAR = 1.15, 1.5
+"""Factors between the median and what is asked: a search ends within the first; gates stay as they are within the
+second."""
+LADDER = ((0.5, False), (0.1, False), (0.1, True), (0.03, True))
+"""Powers, and whether gates are constant, that are tried in this order where no length is asked for."""
+STEPS = 3000
+"""Steps of the demonstrations that are used, about."""
+EPOCHS = 30
+"""Most epochs of a fit."""
+
+
+class Lasting(NamedTuple):
+    """How much the control counts, and the median segment that comes of it.
+
+    :param power: β.
+    :param constant: whether gates and terminations are constant.
+    :param median: length of the lowest level's segments, steps.
+    """
+
+    power: float
+    constant: bool
+    median: float
+
+    def overrides(self, spec: Spec) -> dict[str, Any]:
+        """The key paths of a spec that have these values."""
+        values: dict[str, Any] = {"control.power": self.power}
+        if self.constant and spec.hierarchy is not None:
+            levels = enumerate(spec.hierarchy.levels)
+            gates = [f"levels.{n}.{part}" for n, level in levels for part in _gates(n, level.lasts)]
+            values |= {f"hierarchy.{gate}.network": "constant" for gate in (*gates, "meta_policy")}
+        return values
+
+
+def _gates(number: int, lasts: bool) -> list[str]:
+    return [*(["policy"] if number else []), *(["termination"] if lasts else [])]
+
+
+def median_segment(trained: Fit, demos: Demonstrations) -> float:
+    """The median length of the lowest level's segments in demonstrations, steps."""
+    level = trained.segment(demos)[0]
+    return float(np.median(np.concatenate(run_lengths(level, len(level.names) - 1))))
+
+
+def lasting(
+    spec: Spec, demos: Demonstrations, steps: float | None, least: float, on_event: OnEvent = ignore
+) -> Lasting:
+    """The power, and gates, with which a fit's median segment has a length that is asked for.
+
+    Fits are of the model alone, to some of the training demonstrations.
+
+    :param steps: the length, in steps; None for the first of :data:`LADDER` that gives at least ``least``.
+    :raises BadInput: the spec has no options that last.
+    """
+    if spec.hierarchy is None or not spec.hierarchy.levels[0].lasts:
+        raise BadInput("lengths of segments are of a spec whose lowest level has options that last")
+    some = _some(parts(spec, demos)["train"])
+    sketch = with_overrides(
+        spec,
+        {
+            "compare_with": [],
+            "demonstrations.valid_fraction": 0,
+            "demonstrations.leave_one_out": False,
+            "demonstrations.hold_out_by": None,
+            "training.epochs": min(EPOCHS, spec.training.epochs or EPOCHS),
+        },
+    )
+
+    def tried(power: float, constant: bool) -> Lasting:
+        settings = Lasting(power, constant, 0.0).overrides(spec)
+        found = Lasting(power, constant, median_segment(fit(with_overrides(sketch, settings), some), some))
+        on_event(LengthTried(power, constant, found.median))
+        return found
+
+    if steps is not None:
+        return _bisected(tried, steps)
+    for power, constant in LADDER:
+        found = tried(power, constant)
+        if found.median >= least:
+            break
+    return found
+
+
+def in_steps(place: str, length: str, frequency: float | None) -> float:
+    """The steps of a length such as ``2s`` or ``20``.
+
+    :param frequency: steps per second (Hz); None where unknown.
+    :raises BadInput: the text is no length, or seconds are given and the frequency is unknown.
+    """
+    number, seconds = length.removesuffix("s"), length.endswith("s")
+    try:
+        value = float(number)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < math.inf:
+        raise BadInput(f"{place} {length}: give seconds, such as 2s, or steps, such as 20")
+    if seconds and not frequency:
+        raise BadInput(f"{place} {length}: the demonstrations do not say how many steps a second has; give steps")
+    return value * frequency if seconds and frequency else value
+
+
+def _bisected(tried: Callable[[float, bool], Lasting], steps: float) -> Lasting:
+    found: list[Lasting] = []
+    for constant in (False, True):
+        low, high = LEAST, 1.0
+        for number in range(TRIES):
+            one = tried(float(f"{math.sqrt(low * high):.2g}") if number else FIRST, constant)
+            low, high = (low, one.power) if one.median < steps else (one.power, high)
+            found.append(one)
+            if _off(one, steps) < NEAR:
+                return one
+        best = min(found, key=lambda one: _off(one, steps))
+        if _off(best, steps) < FAR:
+            break
+    return best
+
+
+def _off(found: Lasting, steps: float) -> float:
+    """The factor between a median and the length asked for, at least 1."""
+    return max(found.median / steps, steps / found.median)
+
+
+def _some(demos: Demonstrations) -> Demonstrations:
+    """Demonstrations of about :data:`STEPS` steps, from all parts of their order, at least four where there are."""
+    number = max(4, round(STEPS / np.mean([len(demo) for demo in demos])))
+    chosen = np.unique(np.linspace(0, len(demos) - 1, number).round().astype(int))
+    return Demonstrations(tuple(demos[place] for place in chosen), attributes=demos.attributes)
