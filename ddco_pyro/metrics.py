@@ -308,6 +308,14 @@ class Use(Record):
     within: Finite | None
 
 
+class Segments(Record):
+    """Segments of a level on the most likely paths: the ``median`` of their steps, and their ``number`` in all."""
+
+    median: Finite
+    number: AtLeastOne
+    demonstrations: AtLeastOne
+
+
 class Alike(Record):
     """The divergence of two options in nats per step."""
 
@@ -450,11 +458,17 @@ class Confusion(Record):
 
 
 class Agreement(Record):
-    """Agreement of each level's segments with the labels so named; None where no label is known."""
+    """Agreement of each level's segments with the labels so named; None where no label is known.
+
+    ``equal_train`` and ``equal_valid`` are of demonstrations that are cut into equal parts, as many as there are
+    options.
+    """
 
     labels: list[str]
     train: list[Scores | None]
     valid: LeftOut[list[Scores | None] | None] = None
+    equal_train: LeftOut[list[Scores | None]] = []
+    equal_valid: LeftOut[list[Scores | None] | None] = None
     confusion: list[Confusion]
 
 
@@ -477,6 +491,7 @@ class Metrics(Record, frozen=False):
     worth: LeftOut[Worth | None] = None
     branches: LeftOut[list[BranchUse]] = []
     options: LeftOut[list[list[Use]]] = []
+    segments: LeftOut[list[Segments]] = []
     divergences: LeftOut[list[list[Alike]]] = []
     agreement: LeftOut[Agreement | None] = None
     control_frequency: LeftOut[Finite | None] = None

@@ -12,11 +12,11 @@ from oracle import brute_force, predictions, random_tables
 from random_demonstrations import numbered
 from scipy import stats
 
-from ddco_pyro.evaluation.options import Finding, diagnose, divergences, option_use
+from ddco_pyro.evaluation.options import Finding, diagnose, divergences, option_use, segments_of
 from ddco_pyro.evaluation.worth import paired
 from ddco_pyro.inference import Posterior, posterior
 from ddco_pyro.inference.posteriors import decompose
-from ddco_pyro.metrics import Alike, Use
+from ddco_pyro.metrics import Alike, Segments, Use
 from ddco_pyro.model.batch import Batch, encode
 from ddco_pyro.model.emissions import Gaussian
 from ddco_pyro.model.hierarchy import Hierarchy
@@ -299,6 +299,41 @@ def lasting(duration):
 )
 def test_signs_of_a_degenerate_solution(levels, found):
     assert diagnose(levels) == found
+
+
+@pytest.mark.parametrize(
+    ("lengths", "rate", "brief"),
+    [
+        ([4] * 6, None, True),
+        ([5] * 6, None, False),
+        ([4] * 5, None, False),  # too few to be said to switch
+        ([3] * 7 + [60] * 6, None, True),
+        ([3] * 6 + [60] * 7, None, False),
+        ([4] * 6, 10.0, True),
+        ([5] * 6, 10.0, False),
+        ([24] * 6, 50.0, True),
+        ([25] * 6, 50.0, False),
+        ([4] * 6, 8.0, False),
+    ],
+)
+def test_options_that_switch_all_the_time_are_a_sign(lengths, rate, brief):
+    """Half a second where the rate is known, else five steps, for a level of a hierarchy whose options last."""
+    path = np.concatenate([np.full(steps, 1 + n % 2) for n, steps in enumerate(lengths)])
+    segments = segments_of([path, path])
+    assert (segments.median, segments.number) == (np.median(lengths), 2 * len(lengths))
+    found = [
+        one for one in diagnose([level(0.0, 0.5, 0.5)], segments=[segments], frequency=rate) if one.kind == "brief"
+    ]
+    assert found == ([Finding("brief", 1, 0, float(np.median(lengths)))] if brief else [])
+
+
+@pytest.mark.parametrize(("demonstrations", "found"), [(100, True), (48, True), (47, False)])
+def test_an_option_of_most_steps_of_some_demonstrations_is_a_sign(demonstrations, found):
+    """Two thirds count where no more than half of the demonstrations have the option."""
+    own = use([(1, 300), (2, 130)], [(2, 40)])[0]
+    own[1] = own[1].model_copy(update={"having": 24})
+    signs = diagnose([own], segments=[Segments(median=100, number=200, demonstrations=demonstrations)])
+    assert [one.kind for one in signs] == (["whole"] if found else [])
 
 
 @pytest.mark.parametrize(

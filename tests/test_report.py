@@ -452,6 +452,66 @@ def test_a_fit_that_fell_apart_comes_first(ours, flat, first, concludes, capsys)
     assert verdicts.verdict(metrics).startswith(first)
 
 
+@pytest.mark.parametrize("median", [3.0, 9.0])
+def test_very_short_options_are_not_said_to_last(median, capsys):
+    """On the page and the console, in one fit and over training seeds."""
+    worth = {"memory": {"nats_per_step": 0.5, "standard_error": 0.01}}
+    segments = [{"median": median, "number": 90, "demonstrations": 3}]
+    seeds = {"training_seeds": [0, 1, 2], "held_out": {"ddco": [1.0] * 3}}
+    seeds |= {"worth": {"memory": [0.5, 0.51, 0.52]}, "standard_error": {"memory": [0.01] * 3}}
+    found = {
+        "worth": worth,
+        "segments": segments,
+        "comparison": {"mixture": compared(0.5, 0.01)},
+        "control_frequency": 10.0,
+    }
+    for metrics in (made_metrics(10, **found), made_metrics(10, **found, seeds=seeds)):
+        spec = SimpleNamespace(hierarchy=None, control=SimpleNamespace(learned_stds={}))
+        console.log_likelihoods(SimpleNamespace(name="ddco", spec=spec, baselines={}, metrics=metrics))
+        console.seeds(metrics)
+        for said in (verdicts.verdict(metrics), verdicts.headline(metrics), capsys.readouterr().out):
+            assert ("they switch every 3 steps, 0.3 s, and are no skills" in " ".join(said.split())) == (median == 3)
+            assert ("options that last" in said.replace("from options that last", "")) == (median == 9)
+
+
+@pytest.mark.parametrize(("left_out", "train", "few"), [(True, 4, True), (True, 8, False), (False, 4, False)])
+def test_few_demonstrations_that_are_each_left_out_are_said_to_be_few(left_out, train, few):
+    """Where the fits without one of them fell apart; a sound fit needs no more."""
+    counts = {"train": train, "tune": 0, "valid": train, "left_out": left_out}
+    apart, sound = (
+        verdicts.verdict(
+            made_metrics(train, demonstrations=counts, log_likelihood_per_step={"train": 6.0, "valid": value})
+        )
+        for value in (-16.0, 5.0)
+    )
+    said = f" {train} demonstrations are too few here: each held-out one leaves {train - 1} to train with. Record at "
+    assert (said in apart) == few
+    assert "too few" not in sound
+
+
+def test_equal_parts_that_agree_better_are_a_sign():
+    measures = dict.fromkeys(("ari", "boundary_f1_1", "boundary_f1_3", "boundary_f1_5"), 0.1)
+    matched = dict.fromkeys(("accuracy", "iou", "f1_10", "f1_25", "f1_50", "edit"), 0.1)
+    measures |= {"matched_globally": matched, "matched_per_demonstration": matched}
+    level = SimpleNamespace(name="skill", lasts=True)
+    spec = SimpleNamespace(hierarchy=SimpleNamespace(levels=[level]), training=TrainingSpec())
+
+    def signs(**nmi):
+        own = {part: [measures | {"nmi": value}] for part, value in nmi.items()}
+        confusion = {"labels": [], "options": [], "steps": [], "matched": []}
+        found = made_metrics(agreement={"labels": ["phase"], "confusion": [confusion], **own})
+        return [said for said, _ in degeneracies(found, spec, {"skill": []})]
+
+    (said,) = signs(train=0.9, equal_train=0.2, valid=0.41, equal_valid=0.52)
+    assert said == (
+        "Equal parts of each demonstration agree better with labels/phase than options of level “skill” do: normalised "
+        "mutual information 0.52 against 0.41, held out."
+    )
+    (said,) = signs(train=0.41, equal_train=0.52)
+    assert said.endswith("in training.")
+    assert signs(train=0.1, equal_train=0.2, valid=0.6, equal_valid=0.52) == signs(train=0.1) == []
+
+
 def test_like_warnings_are_one_with_a_list():
     """Of nineteen unused options the ten least used; a finding alone is a sentence of its own."""
     use = {"selected": 1.0, "demonstrations": 1.0, "duration": 9.0, "segments": 1, "steps": 9, "length": 9.0}

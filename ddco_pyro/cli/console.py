@@ -254,8 +254,7 @@ def log_likelihoods(fit: Fit) -> None:
     if caution := verdicts.caution(metrics):
         say(caution)
     if metrics.worth:
-        ours, rate = method(metrics.model), metrics.control_frequency
-        said = verdicts.worth(metrics.worth, ours, len(metrics.valid), verdicts.sound(metrics), rate)
+        said = verdicts.worth_of(metrics)
         say(said if metrics.seeds else f"{said} {ONE_FIT}")
     if differ := stds(fit):
         say(differ)
@@ -272,7 +271,8 @@ def seeds(metrics: Metrics) -> None:
     rows = [[method(name), *words.spread(values)] for name, values in found.held_out.items()]
     title = f"held-out nats per step over training seeds {words.listed(map(str, found.training_seeds))}"
     show(Table(["Method", "mean", "95 % interval", "range"], rows, title=title))
-    say(verdicts.over_seeds(found, method(metrics.model), len(metrics.valid), verdicts.sound(metrics)))
+    sound, brief = verdicts.sound(metrics), verdicts.brief(metrics)
+    say(verdicts.over_seeds(found, method(metrics.model), len(metrics.valid), sound, brief))
 
 
 def merged(pair: Pair, before: Fit, after: Fit) -> None:

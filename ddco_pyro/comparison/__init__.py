@@ -125,7 +125,11 @@ def compare(runs: Sequence[str | Path], allow_code: bool = False) -> Comparison:
     order = sorted(range(len(fits)), key=lambda run: -float(values[run].sum()))
     rows = [_row(rank, fits[run], values[run], best, demos[0].lengths) for rank, run in enumerate(order)]
     ranked = [fits[run] for run in order]
-    agreement = [level for fit in ranked for level in _agreement(fit)]
+    agreement: list[dict[str, Any]] = []
+    for fit in ranked:
+        agreement += [
+            row for row in _agreement(fit) if row not in agreement
+        ]  # equal parts are the same in several runs
     sorted_by = next((fit.place for fit in ranked if fit.spec.hierarchy), ranked[0].place)
     return Comparison(rows, demos[0].names, demos[0].lengths, agreement, _paired_rollouts(ranked), sorted_by)
 
@@ -218,15 +222,19 @@ def _log_likelihoods(fit: Fit, demos: Demonstrations) -> np.ndarray:
 def _agreement(fit: Fit) -> Iterator[dict[str, Any]]:
     """For each level of options: the measures that need no matching, and ``accuracy`` with options matched globally.
 
+    The same is given for equal parts of each demonstration, as many as options.
     A measure is None where no label is known.
     """
     record = fit.metrics.agreement
     if not record or not record.valid or fit.spec.hierarchy is None:
         return
-    for level, labels, scores in zip(fit.spec.hierarchy.levels, record.labels, record.valid, strict=True):
+    equal = (f"equal lengths, {level.count} parts" for level in fit.spec.hierarchy.levels)
+    rows = zip([fit.place] * len(record.labels), fit.spec.hierarchy.levels, record.labels, record.valid, strict=True)
+    others = zip(equal, fit.spec.hierarchy.levels, record.labels, record.equal_valid or (), strict=True)
+    for run, level, labels, scores in (*rows, *others):
         found = {key: scores and getattr(scores, key) for key in UNMATCHED}
         accuracy = scores and scores.matched_globally.accuracy
-        yield {"run": fit.place, "level": level.name, "labels": labels, **found, "accuracy": accuracy}
+        yield {"run": run, "level": level.name, "labels": labels, **found, "accuracy": accuracy}
 
 
 def _paired_rollouts(fits: Sequence[Fit]) -> list[dict[str, Any]]:

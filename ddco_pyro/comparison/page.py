@@ -30,7 +30,8 @@ FILES = ("compare.png", "compare.json", "compare.md", "compare.html")
 AGREEMENT = (
     "Agreement of options with labels on the same trajectories, 1 where it is perfect; runs are not ranked by it. NMI: "
     "normalised mutual information. ARI: adjusted Rand index, 0 by chance. Boundary F1: the steps at which segments "
-    "begin, within so many steps. Accuracy: share of steps that agree where each option stands for one label."
+    "begin, within so many steps. Accuracy: share of steps that agree where each option stands for one label. Equal "
+    "lengths: what equal parts of each demonstration reach, as many as options."
 )
 
 

@@ -68,6 +68,16 @@ def agreement(segments: Sequence[np.ndarray], labels: Sequence[np.ndarray]) -> S
     )
 
 
+def equal_lengths(steps: int, count: int) -> np.ndarray:
+    """The number of the part, from 0 on, of each step [T] of a demonstration that is cut into equal parts."""
+    return np.arange(steps) * count // steps
+
+
+def of_equal_lengths(labels: Sequence[np.ndarray], count: int) -> Scores | None:
+    """The agreement with labels [T] of demonstrations that are cut into ``count`` equal parts."""
+    return agreement([equal_lengths(len(own), count) for own in labels], labels)
+
+
 def confusion(segments: Sequence[np.ndarray], labels: Sequence[np.ndarray]) -> Confusion:
     """Steps of each label (rows) in each option (columns), and the label with which each option is matched globally."""
     pairs = _known(segments, labels)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -14,7 +14,7 @@ from ddco_pyro.acting.monitor import run_lengths
 from ddco_pyro.drawing.words import capital, duration, listed, number, percent
 from ddco_pyro.events import OnEvent, OptionsCompared, ignore
 from ddco_pyro.inference import Posterior
-from ddco_pyro.metrics import Alike, Metrics, Use
+from ddco_pyro.metrics import Agreement, Alike, Metrics, Segments, Use
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
 from ddco_pyro.names import numbered_name
 from ddco_pyro.spec import Spec, TrainingSpec
@@ -70,6 +70,12 @@ def option_use(posterior: Posterior, paths: Iterable[Sequence[np.ndarray]]) -> l
             ]
         )
     return uses
+
+
+def segments_of(paths: Sequence[np.ndarray]) -> Segments:
+    """The segments of a level on the most likely paths [T] of demonstrations."""
+    lengths = np.concatenate(run_lengths(paths, max(int(path.max()) for path in paths)))
+    return Segments(median=float(np.median(lengths)), number=len(lengths), demonstrations=len(paths))
 
 
 MANY = 20
@@ -141,8 +147,16 @@ SMALLEST_DIVERGENCE = 0.1
 
 WHOLE = 0.9
 """An option with this share of the steps of its demonstrations takes them whole."""
+MOSTLY = 2 / 3
+"""The same share where no more than half of the demonstrations have the option."""
 
-Kind = Literal["unused", "redundant", "dominating", "whole", "never_persisting", "high_fitting"]
+BRIEF_SECONDS = 0.5
+BRIEF_STEPS = 5
+"""Options are brief where their median segment is shorter: by the first where the rate is known, else by the second."""
+OFTEN = 6
+"""Segments in a demonstration from which on options switch often; a few brief ones may be meant."""
+
+Kind = Literal["unused", "redundant", "dominating", "whole", "never_persisting", "brief", "high_fitting"]
 
 ADVICE: Mapping[Kind, str] = {
     "unused": "Fewer options may do: compare hierarchy.levels.*.count by cross-validation (ddco-pyro select), or try "
@@ -156,6 +170,8 @@ ADVICE: Mapping[Kind, str] = {
     "alone, into the file, and leave the originals out of observations.",
     "never_persisting": "A simpler termination (network: linear), fewer options, or observations that change more "
     "slowly (differences: false) let options last.",
+    "brief": "Options so short are parts of one movement, not skills. Ask for longer ones (training.duration), take "
+    "fewer options, or import at a lower rate (ddco-pyro import --hz).",
     "high_fitting": "Train layer by layer (training.layerwise: true), give the calling policy less capacity, or let it "
     "emit options only (emits: [options]).",
 }
@@ -203,6 +219,8 @@ class Finding:
         if self.kind == "never_persisting":
             lasts = duration(frequency, self.value)
             return f"{lasts}, selected {number(self.times, 1)} times a demonstration"
+        if self.kind == "brief":
+            return duration(frequency, self.value)
         if self.kind == "whole":
             return f"{percent(self.value)} of the {self.times:.0f} demonstrations that have it"
         return percent(self.value, 1)
@@ -212,34 +230,54 @@ class Finding:
         return f"{SIGNS[self.kind][0]} {self.amount(frequency)}"
 
 
-def diagnose(options: Sequence[Sequence[Use]], divergences: Sequence[Sequence[Alike]] = ()) -> list[Finding]:
+def is_brief(segments: Segments, frequency: float | None) -> bool:
+    """Whether options switch often, and most segments are too short for a skill."""
+    shortest = BRIEF_SECONDS * frequency if frequency else BRIEF_STEPS
+    return segments.median < shortest and segments.number >= OFTEN * segments.demonstrations
+
+
+def diagnose(
+    options: Sequence[Sequence[Use]],
+    divergences: Sequence[Sequence[Alike]] = (),
+    segments: Sequence[Segments] = (),
+    frequency: float | None = None,
+) -> list[Finding]:
     """The signs of a degenerate solution in the ``options`` and ``divergences`` of a run, lowest level first.
 
     - unused: an option that is active less than 1 % of the time;
     - dominating: one of several options that is active more than 90 % of the time;
     - never persisting: an option with an expected duration below 1.5 steps and at least three selections in each
       demonstration with the option, so that its caller does all the work;
-    - whole: an option that takes at least 90 % of the demonstrations that have it, where others lack it;
+    - whole: an option that takes at least 90 % of the demonstrations that have it, where others lack it; or at least
+      two thirds of them, where no more than half of all have it;
     - redundant: two used options with a divergence below 0.1 nats per step;
+    - brief: a level whose median segment is below 0.5 s, or 5 steps where the rate is unknown, and that has at least
+      six segments in a demonstration;
     - high-fitting: a caller that emits the control itself more than half of the time that it acts.
+
+    :param frequency: of the control, Hz; None where unknown.
     """
     findings: list[Finding] = []
     for level, use in enumerate(options, start=1):
+        everything = segments[level - 1].demonstrations if segments else 0
         for option in use[1:]:
-            findings += _of_option(level, option, alone=len(use) == 2)
+            least = MOSTLY if 2 * option.having <= everything else WHOLE
+            findings += _of_option(level, option, least, alone=len(use) == 2)
         findings += _of_pairs(level, use, divergences[level - 1] if divergences else ())
+        if segments and is_brief(segments[level - 1], frequency):
+            findings.append(Finding("brief", level, 0, segments[level - 1].median))
         above = options[level][0].share if level < len(options) else 0.0
         findings += _of_caller(level, use[0].share, above)
     return findings
 
 
-def _of_option(level: int, use: Use, alone: bool) -> list[Finding]:
+def _of_option(level: int, use: Use, least: float, alone: bool) -> list[Finding]:
     if use.share < UNUSED_SHARE:
         return [Finding("unused", level, use.choice, use.share)]
     findings = []
     if use.share > DOMINATING_SHARE and not alone:
         findings.append(Finding("dominating", level, use.choice, use.share))
-    if use.within is not None and use.within >= WHOLE:
+    if use.within is not None and use.within >= least:
         findings.append(Finding("whole", level, use.choice, use.within, times=use.having))
     selections = use.selected / use.demonstrations if use.demonstrations else 0.0
     if use.duration is not None and use.duration < SHORTEST_DURATION and selections >= AGAIN_AND_AGAIN:
@@ -290,15 +328,31 @@ def degeneracies(metrics: Metrics, spec: Spec, names: Mapping[str, Sequence[str]
     """
     levels = spec.hierarchy.levels if spec.hierarchy else ()
     groups: dict[tuple[int, Kind], list[Finding]] = {}
-    for finding in diagnose(metrics.options, metrics.divergences):
-        if finding.kind != "never_persisting" or levels[finding.level - 1].lasts:
+    rate = metrics.control_frequency
+    for finding in diagnose(metrics.options, metrics.divergences, metrics.segments, rate):
+        if finding.kind not in ("never_persisting", "brief") or levels[finding.level - 1].lasts:
             groups.setdefault((finding.level, finding.kind), []).append(finding)
     signs = []
     for (number_of_level, _), findings in groups.items():
         level = levels[number_of_level - 1].name
-        text = _sign(findings, level, names[level], metrics.control_frequency)
+        text = _sign(findings, level, names[level], rate)
         signs.append((text, findings[0].advice(spec.training)))
-    return signs
+    return [*signs, *(_less_than_equal_parts(metrics.agreement, [*names]) if metrics.agreement else ())]
+
+
+def _less_than_equal_parts(found: Agreement, levels: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """The levels that agree less with their labels than equal parts of each demonstration do, with a remedy."""
+    ours, equal, part = found.train, found.equal_train, "in training"
+    if found.valid and found.equal_valid:
+        ours, equal, part = found.valid, found.equal_valid, "held out"
+    for level, labels, own, other in zip(levels, found.labels, ours, equal, strict=False):  # earlier runs have none
+        if own and other and own.nmi < other.nmi:
+            yield (
+                f"Equal parts of each demonstration agree better with labels/{labels} than options of level “{level}” "
+                f"do: normalised mutual information {number(other.nmi)} against {number(own.nmi)}, {part}.",
+                "Equal parts know nothing but the time. Observe what tells the labels apart, start from some of them "
+                "(training.labels), or start from equal parts (training.initialize: equal_parts).",
+            )
 
 
 def _sign(findings: Sequence[Finding], level: str, names: Sequence[str], frequency: float | None) -> str:
@@ -307,6 +361,8 @@ def _sign(findings: Sequence[Finding], level: str, names: Sequence[str], frequen
     if kind == "high_fitting":
         share = first.amount(frequency)
         return f"High-fitting: the caller of level “{level}” emits the control itself in {share} of its steps."
+    if kind == "brief":
+        return f"Options of level “{level}” switch every {first.amount(frequency)} (the median segment)."
     if many == 1:
         return f"{capital(first.options(names))} of level “{level}” {first.deed(frequency)}."
     ordered = sorted(findings, key=lambda finding: finding.value)[:LISTED]

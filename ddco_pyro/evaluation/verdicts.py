@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ddco_pyro.data.starting import FEW
 from ddco_pyro.drawing.words import (
     capital,
     duration,
@@ -23,6 +24,7 @@ from ddco_pyro.drawing.words import (
     with_error,
 )
 from ddco_pyro.evaluation.effort import rising
+from ddco_pyro.evaluation.options import is_brief
 from ddco_pyro.metrics import Counts, Difference, Metrics, PerStep, Rollouts, Seeds, SuccessWorth, Worth
 from ddco_pyro.names import FLAT, MIXTURE, method
 from ddco_pyro.statistics import mean_interval, t_quantile, wider_interval
@@ -51,7 +53,14 @@ def caution(metrics: Metrics) -> str:
     lowest = min(flats, key=lambda name: flats[name].nats_per_step, default=None)
     below = {} if lowest is None else {ours: (method(lowest), flats[lowest])}
     values = {capital(method(name)): one.log_likelihood_per_step for name, one in metrics.methods.items()}
-    return cautions(values, below, len(metrics.valid))
+    said = cautions(values, below, len(metrics.valid))
+    number_of = metrics.demonstrations.train
+    if said and metrics.demonstrations.left_out and number_of < FEW:
+        said += (
+            f" {number_of} demonstrations are too few here: each held-out one leaves {number_of - 1} to train with. "
+            f"Record at least {FEW}, and until then take two options and the fewest observations."
+        )
+    return said
 
 
 def cautions(values: Mapping[str, PerStep], flats: Mapping[str, tuple[str, Difference]], held_out: int) -> str:
@@ -102,10 +111,10 @@ def headline(metrics: Metrics) -> str:
     if not sound(metrics):
         return caution(metrics)
     if seeds and "memory" in seeds.worth:
-        decided = _verdict(*_range(seeds.worth["memory"], seeds.standard_error["memory"], held_out))
-        decided = decided.removeprefix("So ").replace("It is", "it is")
-        return f"Over {len(seeds.training_seeds)} training seeds {decided}"
-    said = DECIDED[_direction(metrics.worth.memory, held_out)] if metrics.worth else _explained(metrics)
+        said = _verdict(*_range(seeds.worth["memory"], seeds.standard_error["memory"], held_out), brief(metrics))
+        said = said.removeprefix("So ").replace("It is", "it is")
+        return f"Over {len(seeds.training_seeds)} training seeds {said}"
+    said = decided(metrics.worth, held_out, brief(metrics)) if metrics.worth else _explained(metrics)
     return f"{caution(metrics)} {said}".lstrip()
 
 
@@ -140,9 +149,9 @@ def _explained(metrics: Metrics) -> str:
     if metrics.demonstrations.left_out:
         said.append("Every demonstration trains the model; each is held out from a fit without it.")
     if metrics.worth:
-        said.append(worth(metrics.worth, ours, held_out, sound(metrics), metrics.control_frequency))
+        said.append(worth_of(metrics))
     if metrics.seeds:
-        said.append(over_seeds(metrics.seeds, ours, held_out, sound(metrics)))
+        said.append(over_seeds(metrics.seeds, ours, held_out, sound(metrics), brief(metrics)))
     return " ".join(said)
 
 
@@ -160,6 +169,27 @@ def explains(name: str, differences: Mapping[str, Difference], held_out: int) ->
     return f"{text} (± is one standard error over {held_out} held-out demonstrations, for one fit of each model)."
 
 
+def brief(metrics: Metrics) -> str:
+    """The median segment in words where the options of every level are too short for skills; else empty."""
+    rate = metrics.control_frequency
+    short = bool(metrics.segments) and all(is_brief(one, rate) for one in metrics.segments)
+    return duration(rate, metrics.segments[0].median) if short else ""
+
+
+def decided(found: Worth, held_out: int, brief: str = "") -> str:
+    """The verdict of one fit on options that last, by the direction of their lead.
+
+    :param brief: as of :func:`brief`.
+    """
+    direction = _direction(found.memory, held_out)
+    if brief and direction > 0:
+        return (
+            f"In this fit very short options explain held-out controls better: they switch every {brief}, and are no "
+            "skills."
+        )
+    return DECIDED[direction]
+
+
 DECIDED = {
     1: "In this fit options that last explain held-out controls better; one fit of each model is no verdict.",
     0: "This fit does not show that options that last are worth anything.",
@@ -168,22 +198,31 @@ DECIDED = {
 """The verdict of one fit on options that last, by the direction of their lead."""
 
 
-def worth(found: Worth, ours: str, held_out: int, sound: bool = True, frequency: float | None = None) -> str:
+def worth_of(metrics: Metrics) -> str:
+    """:func:`worth` of a run; empty without a mixture."""
+    ours, held_out, rate = method(metrics.model), len(metrics.valid), metrics.control_frequency
+    return worth(metrics.worth, ours, held_out, sound(metrics), rate, brief(metrics)) if metrics.worth else ""
+
+
+def worth(
+    found: Worth, ours: str, held_out: int, sound: bool = True, frequency: float | None = None, brief: str = ""
+) -> str:
     """The worth of several policies and of options that last, in one fit of each model.
 
     :param ours: what the hierarchy is called.
     :param sound: whether neither model fell apart; otherwise nothing is concluded.
+    :param brief: as of :func:`brief`.
     """
     total = signed(found.total.nats_per_step) if found.total else ""
     parts = _divided(found, ours, f"{total} nats per step", "Held-out nats per step", with_error)
     if not sound:
         return parts
-    decided = DECIDED[_direction(found.memory, held_out)]
+    said = decided(found, held_out, brief)
     rows = found.steps_in_a_row
     if rows and all(row.options <= row.mixture for row in rows):
         own, mixture = (duration(frequency, steps) for steps in (rows[0].options, rows[0].mixture))
-        decided += f" Options stay active no longer ({own}) than the mixture keeps to one policy ({mixture})."
-    return f"{parts} {decided}"
+        said += f" Options stay active no longer ({own}) than the mixture keeps to one policy ({mixture})."
+    return f"{parts} {said}"
 
 
 def success_worth(rollouts: Rollouts, ours: str) -> str:
@@ -226,12 +265,13 @@ def _parts(worth: Mapping[str, Sequence[float]], ours: str, scale: float = 1, di
     return [f"{names[part]} {mean_and_interval(worth[part], scale, digits)}" for part in worth if part in names]
 
 
-def over_seeds(found: Seeds, ours: str, held_out: int, sound: bool = True) -> str:
+def over_seeds(found: Seeds, ours: str, held_out: int, sound: bool = True, brief: str = "") -> str:
     """The parts of the worth over training seeds, and the verdict, which is about options that last.
 
     :param ours: what the hierarchy is called.
     :param held_out: number of held-out demonstrations.
     :param sound: as of :func:`worth`.
+    :param brief: as of :func:`brief`.
     """
     parts = _parts(found.worth, ours)
     said = f": {listed(parts)} nats per step" if parts else ""
@@ -241,7 +281,7 @@ def over_seeds(found: Seeds, ours: str, held_out: int, sound: bool = True) -> st
     memory = found.worth["memory"]
     low, high = _range(memory, found.standard_error["memory"], held_out)
     wider = f" Over held-out demonstrations it is {interval((low, high))}." if high > mean_interval(memory)[1] else ""
-    return f"{text}{wider} {_verdict(low, high)}"
+    return f"{text}{wider} {_verdict(low, high, brief)}"
 
 
 def _range(memory: Sequence[float], errors: Sequence[float | None], held_out: int) -> tuple[float, float]:
@@ -253,10 +293,14 @@ def _range(memory: Sequence[float], errors: Sequence[float | None], held_out: in
     return wider_interval(memory, float(np.mean(known)) if known else 0.0, held_out)
 
 
-def _verdict(low: float, high: float) -> str:
+def _verdict(low: float, high: float, brief: str) -> str:
     """The verdict on options that last by the interval of their worth and :data:`SMALLEST`."""
     if low > -SMALLEST and high < SMALLEST:
         return f"So options that last make no difference here: less than {SMALLEST} nats per step."
+    if low > 0 and brief:
+        return (
+            f"So very short options explain these demonstrations better: they switch every {brief}, and are no skills."
+        )
     if low > 0:
         return "So options that last are worth it on these demonstrations."
     if high < 0:

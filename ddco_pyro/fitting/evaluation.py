@@ -12,10 +12,10 @@ from torch import Tensor
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.errors import Failed
-from ddco_pyro.evaluation.agreement import agreement, confusion
+from ddco_pyro.evaluation.agreement import agreement, confusion, of_equal_lengths
 from ddco_pyro.evaluation.branch_use import branch_use
 from ddco_pyro.evaluation.inferred import Inferred, infer
-from ddco_pyro.evaluation.options import divergences, option_use
+from ddco_pyro.evaluation.options import divergences, option_use, segments_of
 from ddco_pyro.evaluation.worth import mean_run, paired, worth
 from ddco_pyro.events import OnEvent, ignore
 from ddco_pyro.fitting.fitted import Fit
@@ -32,6 +32,7 @@ from ddco_pyro.metrics import (
     Listed,
     Metrics,
     PerStep,
+    Segments,
     TrainedLabels,
     Use,
     Worth,
@@ -149,8 +150,9 @@ def evaluate(
     by_dimension = {name: _by_dimension(fitted, part.each, parts[name]) for name, part in ours.items()}
     held_out = {} if valid is None else {name: each["valid"] for name, each in by_method.items()}
     lengths = np.array([] if valid is None else valid.lengths, dtype=float)
-    options, alike = _options(fitted, demos, on_event) if depth else ([], [])
+    options, segments, alike = _options(fitted, demos, on_event) if depth else ([], [], [])
     labels = fitted.spec.demonstrations.labels_by_level(depth) if depth else ()
+    counts = [level.count for level in fitted.hierarchy.option_levels()]
     return Metrics(
         model=fitted.name,
         log_likelihood_per_step=PerStep(train=per_step["train"], valid=per_step.get("valid")),
@@ -172,8 +174,9 @@ def evaluate(
         worth=_worth(fitted, held_out, ours["valid"], valid) if valid else None,
         branches=branch_use(fitted.hierarchy, infer(fitted.hierarchy, valid or demos)),
         options=options,
+        segments=segments,
         divergences=alike,
-        agreement=_agreement(labels, ours, parts) if labels else None,
+        agreement=_agreement(labels, counts, ours, parts) if labels else None,
         control_frequency=demos.frequency,
         trained_labels=_trained_labels(fitted, demos),
         **about,
@@ -190,8 +193,10 @@ def _worth(fit: Fit, values: Mapping[str, np.ndarray], ours: _Part, valid: Demon
     return found.model_copy(update={"steps_in_a_row": rows})
 
 
-def _options(fit: Fit, demos: Demonstrations, on_event: OnEvent) -> tuple[list[list[Use]], list[list[Alike]]]:
-    """The use and the divergences of options."""
+def _options(
+    fit: Fit, demos: Demonstrations, on_event: OnEvent
+) -> tuple[list[list[Use]], list[Segments], list[list[Alike]]]:
+    """The use, the segments and the divergences of options."""
     sums: list[Posterior] = []
     paths: list[list[np.ndarray]] = [[] for _ in fit.names]
 
@@ -204,7 +209,7 @@ def _options(fit: Fit, demos: Demonstrations, on_event: OnEvent) -> tuple[list[l
 
     alike = divergences(pieces(), on_event, len(demos))
     whole = Posterior(*(tuple(map(torch.cat, zip(*kind, strict=True))) for kind in zip(*sums, strict=True)))
-    return option_use(whole, paths), alike
+    return option_use(whole, paths), [segments_of(level) for level in paths], alike
 
 
 def _worst_first(
@@ -239,10 +244,14 @@ def _by_dimension(fit: Fit, each: Decomposition, demos: Demonstrations) -> Dimen
     return Dimensions(by_dimension=values, options=float(each.options.sum()) / steps)
 
 
-def _agreement(names: Sequence[str], ours: dict[str, _Part], parts: dict[str, Demonstrations]) -> Agreement:
+def _agreement(
+    names: Sequence[str], counts: Sequence[int], ours: dict[str, _Part], parts: dict[str, Demonstrations]
+) -> Agreement:
     """All measures of each level's segments against its labels, and the confusion matrix of the held-out part.
 
     Without a held-out part the confusion matrix is of the training part.
+
+    :param counts: the number of options of each level.
     """
     pairs = {
         name: [
@@ -253,7 +262,18 @@ def _agreement(names: Sequence[str], ours: dict[str, _Part], parts: dict[str, De
     }
     scores = {name: [agreement(*pair) for pair in each] for name, each in pairs.items()}
     tables = [confusion(*pair) for pair in pairs.get("valid", pairs["train"])]
-    return Agreement(labels=list(names), train=scores["train"], valid=scores.get("valid"), confusion=tables)
+    equal = {
+        name: [of_equal_lengths(labels, count) for (_, labels), count in zip(each, counts, strict=True)]
+        for name, each in pairs.items()
+    }
+    return Agreement(
+        labels=list(names),
+        train=scores["train"],
+        valid=scores.get("valid"),
+        equal_train=equal["train"],
+        equal_valid=equal.get("valid"),
+        confusion=tables,
+    )
 
 
 def _trained_labels(fit: Fit, demos: Demonstrations) -> TrainedLabels | None:

@@ -13,8 +13,7 @@ from ddco_pyro.metrics import Confusion, Scores
 from ddco_pyro.names import label_name, option_name
 from ddco_pyro.report.options import quoted
 from ddco_pyro.segmenting.agreement import EXPLAINED, agreement_table, tolerances
-from ddco_pyro.segmenting.baselines import BASELINES, EQUAL, of_equal_lengths
-from ddco_pyro.training.data import parts
+from ddco_pyro.segmenting.baselines import BASELINES, EQUAL
 
 
 def section(fit: Fit, demos: Demonstrations) -> Section | None:
@@ -23,14 +22,14 @@ def section(fit: Fit, demos: Demonstrations) -> Section | None:
     names, truth = list(fit.names), fit.spec.demonstrations.labels_by_level(len(fit.names))
     if not record or not truth:
         return None
-    divided, scores = parts(fit.spec, demos), dict[str, Scores | None]()
-    for place, (level, label) in enumerate(zip(names, truth, strict=True)):
-        before, count = f"{level}: " if len(names) > 1 else "", len(fit.names[level]) - 1
-        for words, part, found in (("held out", "valid", record.valid), ("training", "train", record.train)):
-            if found is not None:
+    scores = dict[str, Scores | None]()
+    sides = (("held out", record.valid, record.equal_valid), ("training", record.train, record.equal_train))
+    for place, level in enumerate(names):
+        before = f"{level}: " if len(names) > 1 else ""
+        for words, found, equal in sides:
+            if found is not None and equal is not None:
                 scores[f"{before}options, {words}"] = found[place]
-                labels = [demo.labels[label] for demo in divided[part]]
-                scores[f"{before}{BASELINES[EQUAL]}, {words}"] = of_equal_lengths(labels, count)
+                scores[f"{before}{BASELINES[EQUAL]}, {words}"] = equal[place]
     known = label_names(demos.attributes)
     compared = quoted(fit.spec.demonstrations.label_names)
     blocks: list[Block] = [Text(f"Options and the ground-truth {compared}."), agreement_table(scores)]

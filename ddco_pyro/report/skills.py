@@ -142,7 +142,11 @@ def section(
     shown, segmented = _Shown(demos, pictures, paths), activity.segmented
     reads = deciding(fit, demos)
     blocks: list[Block] = [note(shown.explained())]
-    whole = {(one.level, one.choice): one for one in diagnose(fit.metrics.options) if one.kind == "whole"}
+    whole = {
+        (one.level, one.choice): one
+        for one in diagnose(fit.metrics.options, segments=fit.metrics.segments)
+        if one.kind == "whole"
+    }
     for place, (level, names) in reversed(list(enumerate(fit.names.items()))):
         if len(fit.names) > 1:
             blocks.append(Text(f"Level “{level}”", "heading"))

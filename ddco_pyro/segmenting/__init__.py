@@ -19,7 +19,7 @@ from ddco_pyro.data.sources.recording import label_names
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.agreement import agreement as scores_of  # a module here has that name
-from ddco_pyro.evaluation.agreement import confusion
+from ddco_pyro.evaluation.agreement import confusion, of_equal_lengths
 from ddco_pyro.evaluation.inferred import Inferred, started
 from ddco_pyro.events import BaselineSegmented, DemonstrationsDone, OnEvent, ignore
 from ddco_pyro.fitting.fitted import Fit
@@ -153,7 +153,7 @@ class Segmented:
                 scores = agreements.setdefault(level, {})
                 scores[f"options, {part}"] = scores_of(options, labels)
                 equal = f"{baselines.BASELINES[baselines.EQUAL]}, {part}"
-                scores[equal] = baselines.of_equal_lengths(labels, self.counts[level])
+                scores[equal] = of_equal_lengths(labels, self.counts[level])
             for part, group in [*groups.items()][:1]:
                 for name, words in baselines.BASELINES.items():
                     if group[0].baselines and name != baselines.EQUAL:

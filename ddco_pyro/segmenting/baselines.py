@@ -16,8 +16,7 @@ import torch
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.errors import BadInput, nearest
-from ddco_pyro.evaluation.agreement import agreement
-from ddco_pyro.metrics import Scores
+from ddco_pyro.evaluation.agreement import equal_lengths
 from ddco_pyro.model.encoder import ObservationEncoder
 from ddco_pyro.spec import ObservationSpec
 from ddco_pyro.training.initialization import block_means, distinct, joined
@@ -63,11 +62,6 @@ def segment(
         return _gripper(train, valid, gripper)
     rows = _rows_of(train, observations)
     return METHODS[name]([rows(demo) for demo in train], [rows(demo) for demo in valid], count, seed)
-
-
-def equal_lengths(steps: int, count: int) -> np.ndarray:
-    """The number of the part, from 0 on, of each step [T] of a demonstration that is cut into equal parts."""
-    return np.arange(steps) * count // steps
 
 
 def _rows_of(
@@ -197,8 +191,3 @@ BASELINES = {
     "gripper": "gripper changes",
 }
 """The baselines and their names in tables."""
-
-
-def of_equal_lengths(labels: Sequence[np.ndarray], count: int) -> Scores | None:
-    """The agreement with labels [T] of demonstrations that are cut into ``count`` equal parts."""
-    return agreement([equal_lengths(len(own), count) for own in labels], labels)
