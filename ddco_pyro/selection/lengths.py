@@ -21,12 +21,10 @@ from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.spec import Spec, with_overrides
 from ddco_pyro.training.data import parts
 
-LEAST = 0.003
-"""The smallest power that is tried."""
-FIRST = 0.1
-"""The power that is tried first."""
-TRIES = 5
-"""Powers that are tried with gates of one kind."""
+FIRST, LEAST = 0.5, 0.005
+"""The largest and the smallest power that are tried."""
+HALVINGS = 2
+"""Powers that are tried between two with gates of one kind."""
 NEAR, FAR = 1.15, 1.5
 """Factors between the median and what is asked: a search ends within the first; gates stay as they are within the
 second."""
@@ -71,7 +69,7 @@ def median_segment(trained: Fit, demos: Demonstrations) -> float:
 
 
 def lasting(
-    spec: Spec, demos: Demonstrations, steps: float | None, least: float, on_event: OnEvent = ignore
+    spec: Spec, demos: Demonstrations, steps: float | None, least: float = 5.0, on_event: OnEvent = ignore
 ) -> Lasting:
     """The power, and gates, with which a fit's median segment has a length that is asked for.
 
@@ -101,7 +99,7 @@ def lasting(
         return found
 
     if steps is not None:
-        return _bisected(tried, steps)
+        return _searched(tried, steps)
     for power, constant in LADDER:
         found = tried(power, constant)
         if found.median >= least:
@@ -127,16 +125,27 @@ def in_steps(place: str, length: str, frequency: float | None) -> float:
     return value * frequency if seconds and frequency else value
 
 
-def _bisected(tried: Callable[[float, bool], Lasting], steps: float) -> Lasting:
+def _searched(tried: Callable[[float, bool], Lasting], steps: float) -> Lasting:
+    """The largest power whose median is about as long as is asked for: down in halves, then between the last two.
+
+    Too small a power makes segments short again, since options then hardly differ.
+    """
     found: list[Lasting] = []
     for constant in (False, True):
-        low, high = LEAST, 1.0
-        for number in range(TRIES):
-            one = tried(float(f"{math.sqrt(low * high):.2g}") if number else FIRST, constant)
-            low, high = (low, one.power) if one.median < steps else (one.power, high)
-            found.append(one)
-            if _off(one, steps) < NEAR:
-                return one
+        shorter, power = 1.0, FIRST
+        while power >= LEAST:
+            found.append(tried(power, constant))
+            if found[-1].median >= steps:
+                break
+            shorter, power = power, power / 2
+        else:
+            power = 0.0
+        for _ in range(HALVINGS if power else 0):
+            if _off(min(found, key=lambda one: _off(one, steps)), steps) < NEAR:
+                break
+            found.append(tried(float(f"{math.sqrt(shorter * power):.2g}"), constant))
+            longer = found[-1].median >= steps
+            shorter, power = (shorter, found[-1].power) if longer else (found[-1].power, power)
         best = min(found, key=lambda one: _off(one, steps))
         if _off(best, steps) < FAR:
             break

@@ -1,0 +1,85 @@
+"""Segments of a length that is asked for: small fits find the power and the gates."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from command_line import call
+from random_demonstrations import numbered
+from sklearn.metrics import normalized_mutual_info_score
+
+import ddco_pyro
+from ddco_pyro.errors import BadInput
+from ddco_pyro.selection.lengths import in_steps, lasting, median_segment
+from ddco_pyro.spec import load_spec, parse_spec, with_overrides
+
+SLOW = 30
+
+
+def skills_within_which_speed_varies(number=6, steps=150, seed=0):
+    """Skills of about 30 steps, each a direction; the speed along it changes every three or four steps."""
+    random = np.random.default_rng(seed)
+    found = []
+    for _ in range(number):
+        skill = np.repeat(np.arange(steps // SLOW + 1) % 2, SLOW)[random.integers(0, SLOW) :][:steps]
+        fast = np.cumsum(random.random(len(skill)) < 0.3) % 2
+        turned = np.stack([np.where(skill, 1.0, -1.0), np.where(skill, -1.0, 1.0)], 1)
+        controls = turned * np.where(fast, 1.2, 0.8)[:, None] + 0.6 * random.normal(size=(len(skill), 2))
+        speed = np.where(fast, 1.0, -1.0)[:, None] + 0.5 * random.normal(size=(len(skill), 2))
+        observed = random.normal(size=(len(skill), 2))
+        found.append(({"state": observed}, np.concatenate([controls, speed], 1), {"skill": skill}))
+    return numbered(found)
+
+
+SPEC = """
+demonstrations: {path: FILE, valid_fraction: 0, labels: skill}
+observations: [state]
+control: {std: {learn: true, floor: 0.01, per_option: true}}
+hierarchy:
+  levels: [{name: option, count: 2, policy: {network: linear}, termination: {network: linear}}]
+  meta_policy: {network: linear}
+training: {initialize: vq_controls, optimizer: {name: em}, epochs: 60}
+"""
+
+
+def test_options_last_as_long_as_is_asked():
+    demos = skills_within_which_speed_varies()
+    spec = parse_spec(yaml.safe_load(SPEC))
+    assert median_segment(ddco_pyro.fit(spec, demos), demos) < 6  # the speed
+    found = lasting(spec, demos, SLOW)
+    assert SLOW / 1.5 < found.median < 1.5 * SLOW
+    fit = ddco_pyro.fit(with_overrides(spec, found.overrides(spec)), demos)
+    options = np.concatenate(fit.segment(demos)[0])
+    assert normalized_mutual_info_score(np.concatenate([demo.labels["skill"] for demo in demos]), options) > 0.7
+    assert lasting(spec, demos, None, least=5).median >= 5
+
+
+@pytest.mark.parametrize(
+    ("length", "frequency", "steps"), [("2s", 10.0, 20.0), ("20", 10.0, 20.0), ("20", None, 20.0), ("0.5s", 30.0, 15.0)]
+)
+def test_lengths_are_seconds_or_steps(length, frequency, steps):
+    assert in_steps("--segment", length, frequency) == steps
+
+
+@pytest.mark.parametrize(
+    ("length", "frequency", "says"),
+    [("2s", None, "do not say how many steps"), ("long", 10.0, "give seconds"), ("-3", 10.0, "give seconds")],
+)
+def test_what_is_no_length_is_refused(length, frequency, says):
+    with pytest.raises(BadInput, match=says):
+        in_steps("--segment", length, frequency)
+
+
+def test_init_writes_what_it_found(tmp_path: Path):
+    file, spec = tmp_path / "demos.hdf5", tmp_path / "spec.yaml"
+    skills_within_which_speed_varies().write(file)
+    ended = call("init", file, "--out", spec, "--segments", "5")
+    assert ended.status == 0, ended.err
+    assert "asked: 30 steps" in ended.out
+    assert load_spec(spec).control.power < 1
+    both = call("init", file, "--out", spec, "--force", "--segments", "5", "--segment", "3s")
+    assert both.status == 2
+    assert "exclude each other" in both.err
