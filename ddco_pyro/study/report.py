@@ -1,24 +1,22 @@
-"""What a study found: tables and figures of a page, and the numbers that other pages quote."""
+"""What a study found: its page, and the numbers that other pages quote."""
 
 from __future__ import annotations
 
-import itertools
 import math
 import re
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from functools import cache
+from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
 from ddco_pyro.data.files import write_text
 from ddco_pyro.drawing import words
-from ddco_pyro.drawing.colours import option_colour
-from ddco_pyro.drawing.figures import GRID, Interval, Panel, blank, interval_plot, save, style
+from ddco_pyro.drawing.figures import Interval, Panel, interval_plot, save, style
 from ddco_pyro.drawing.page import Block, Page, Picture, Section, Table, Text, note
 from ddco_pyro.errors import BadInput, nearest
 from ddco_pyro.evaluation.agreement import MATCHED, UNMATCHED
@@ -31,13 +29,11 @@ from ddco_pyro.study.table import earlier, read_tidy, values
 FILES = ("table.csv", "page.md", "page.html", "contrasts.png", "methods.png")
 """The files of a study's report."""
 
-COLUMNS_OF_PANELS = 4
 NOT_TESTED = "not tested"
 DECIDED = ("holds", "does not hold")
 
 
-@dataclass(frozen=True)
-class Tested:
+class Tested(NamedTuple):
     """A primary contrast with its estimate (None without any cell), its verdict and Holm's adjusted p-value."""
 
     spec: ContrastSpec
@@ -50,18 +46,24 @@ class Tested:
 def tested(study: Study, table: pd.DataFrame) -> list[Tested]:
     """The primary contrasts of a study, in their order."""
     contrasts, counts = study.declared.contrasts, study.declared.demonstrations.counts
-    numbers = [contrast.demonstrations or counts[0] for contrast in contrasts]
+    numbers = [one.demonstrations or counts[0] for one in contrasts]
     estimates = [
-        _estimate(study, one.measure, values(table, one.contrast, one.measure, [number]), lowest=-1.0)
+        _estimate(study, table, one.contrast, one.measure, [number])
         for one, number in zip(contrasts, numbers, strict=True)
     ]
     judged = verdicts([(own, one.bound) for own, one in zip(estimates, contrasts, strict=True)])
-    rows = zip(contrasts, numbers, estimates, judged, strict=True)
-    return [Tested(contrast, number, found, *verdict) for contrast, number, found, verdict in rows]
+    return [Tested(*one, *verdict) for *one, verdict in zip(contrasts, numbers, estimates, judged, strict=True)]
 
 
-def _estimate(study: Study, measure: str, of: pd.Series, lowest: float = 0.0) -> Estimate | None:
-    return estimate(of, trials(study, measure), lowest) if len(of) else None
+def _estimate(
+    study: Study | None, table: pd.DataFrame, what: str, measure: str, demonstrations: Sequence[str | int],
+    task: str | None = None, times: float = 1.0,
+) -> Estimate | None:  # fmt: skip
+    """The mean of a method or of a contrast, some times as large; rates of a study have the trials of their starts."""
+    own = times * values(table, what, measure, demonstrations, task)
+    rates = study is not None and study.declared.starts and measure.startswith("success") and times == 1
+    trials = study.declared.starts.test.count if rates else 0  # type: ignore[union-attr]
+    return estimate(own, trials, -1.0 if " - " in what else 0.0) if len(own) else None
 
 
 def verdicts(family: Sequence[tuple[Estimate | None, float]]) -> list[tuple[str, float]]:
@@ -77,10 +79,7 @@ def verdicts(family: Sequence[tuple[Estimate | None, float]]) -> list[tuple[str,
     return judged
 
 
-def trials(study: Study, measure: str) -> int:
-    """The starts of each fit, where the measure is a rate of them; else 0."""
-    starts = study.declared.starts
-    return starts.test.count if starts and measure.startswith("success") else 0
+# --- the page ---------------------------------------------------------------------------------------------------------
 
 
 def write(folder: Folder, state: State, to: Path) -> Path:
@@ -107,25 +106,19 @@ def write(folder: Folder, state: State, to: Path) -> Path:
 def page(study: Study, table: pd.DataFrame, state: State, to: Path) -> Page:
     """The page of a study; its figures are written into a folder."""
     contrasts = tested(study, table)
-    top: list[Block] = [Text(verdict(contrasts), "verdict")] if contrasts else []
-    sections = [Section("methods", "Every method", _methods(study, table, to))]
-    if any(one.estimate for one in contrasts):
-        sections.insert(0, Section("contrasts", "Primary contrasts", _contrasts(contrasts, to)))
+    sections = [Section("contrasts", "Primary contrasts", _contrasts(contrasts, to))] * any(
+        one.estimate for one in contrasts
+    )
+    sections.append(Section("methods", "Every method", _methods(study, table, to)))
     sections.append(Section("design", "Design", [note(line) for line in design(study, state)]))
+    top: list[Block] = [Text(verdict(contrasts), "verdict")] * bool(contrasts)
     return Page(f"Study {study.name}", top, sections, subtitle=study.declared.question)
 
 
 def verdict(contrasts: Sequence[Tested]) -> str:
     """How many of the primary contrasts hold."""
-    forms = {
-        "holds": ("holds", "hold"),
-        "does not hold": ("does not hold", "do not hold"),
-        "inconclusive": ("is inconclusive", "are inconclusive"),
-        NOT_TESTED: ("is not tested", "are not tested"),
-    }
     counts = Counter(one.verdict for one in contrasts)
-    parts = words.listed(f"{count} {forms[name][count > 1]}" for name, count in counts.items())
-    return f"Of {len(contrasts)} primary contrasts, {parts}."
+    return f"Verdicts on primary contrasts: {', '.join(f'{verdict} {count}' for verdict, count in counts.items())}."
 
 
 def _contrasts(contrasts: Sequence[Tested], to: Path) -> list[Block]:
@@ -150,82 +143,46 @@ def _contrasts(contrasts: Sequence[Tested], to: Path) -> list[Block]:
         "bound that the difference has to exceed."
     )
     drawn = [one for one in contrasts if one.estimate]
-    panels = []
-    for measure in dict.fromkeys(one.spec.measure for one in drawn):
-        lines = [_drawn(one.estimate, one.spec.bound) if one.spec.measure == measure else None for one in drawn]
-        panels.append(Panel(name_of(measure), "difference", lines, line=0))
-    with style():
-        figure = interval_plot([f"{one.spec.contrast}, {one.demonstrations}" for one in drawn], panels)
-        picture = _saved(figure, to / "contrasts.png", verdict(contrasts), caption)
+    panels = {
+        name_of(measure): [
+            _drawn(one.estimate, one.spec.bound) if one.spec.measure == measure else None for one in drawn
+        ]
+        for measure in dict.fromkeys(one.spec.measure for one in drawn)
+    }
+    names = [f"{one.spec.contrast}, {one.demonstrations}" for one in drawn]
+    picture = _plotted(names, panels, to / "contrasts.png", verdict(contrasts), caption, "difference", 0)
     return [Table(head, rows, {0, 1, 3}), picture, note(text)]
+
+
+def _methods(study: Study, table: pd.DataFrame, to: Path) -> list[Block]:
+    """A table and a figure of all means."""
+    labels, measures = study.declared.labels, study.declared.measures
+    rows = [*product(study.declared.demonstrations.counts, labels)]
+    known = {
+        measure: [_estimate(study, table, label, measure, [count]) for count, label in rows] for measure in measures
+    }
+    cells = iter([shown(one) if one else "–" for own in zip(*known.values(), strict=True) for one in own])
+    named = [[str(count), label, *(next(cells) for _ in measures)] for count, label in rows]
+    panels = {name_of(measure): [*map(_drawn, own)] for measure, own in known.items()}
+    caption = "Means with 95 % t intervals, over tasks where there are several, else over training seeds."
+    picture = _plotted(
+        [f"{label}, {count}" for count, label in rows], panels, to / "methods.png",
+        f"{', '.join(measures)} of {', '.join(labels)}", caption,
+    )  # fmt: skip
+    return [Table(["demonstrations", "method", *map(name_of, measures)], named, {1}), picture]
 
 
 def _drawn(known: Estimate | None, bound: float | None = None) -> Interval | None:
     return None if known is None else Interval(known.value, *known.interval, points=known.units, hollow=bound)
 
 
-def _methods(study: Study, table: pd.DataFrame, to: Path) -> list[Block]:
-    """A table for each measure, and one figure."""
-    counts, labels = study.declared.demonstrations.counts, study.declared.labels
-    blocks: list[Block] = []
-    for measure in study.declared.measures:
-        rows = []
-        for label in labels:
-            cells = [_estimate(study, measure, values(table, label, measure, [count])) for count in counts]
-            if any(cells):
-                rows.append([label, *(shown(cell) if cell else "–" for cell in cells)])
-        blocks.append(Table([name_of(measure), *(f"{count} demonstrations" for count in counts)], rows))
-    single = "Single tasks: means and ranges over training seeds." if len(study.tasks) > 1 and len(counts) > 1 else ""
-    caption = "Means with 95 % t intervals, over tasks where there are several, else over training seeds."
-    alt = f"{', '.join(study.declared.measures)} of {', '.join(labels)}"
-    picture = _saved(draw(study, table), to / "methods.png", alt, f"{caption} {single}".rstrip())
-    return [*blocks, picture]
-
-
-def _saved(figure: Figure, path: Path, alt: str, caption: str) -> Picture:
-    return replace(save(figure, path, alt, caption), file=path.name)
-
-
-def draw(study: Study, table: pd.DataFrame) -> Figure:
-    """Curves over demonstrations: a panel for each measure, and for each task by the first measure.
-
-    With a single number of demonstrations, intervals of every method, a panel for each measure.
-    """
-    counts, labels, measures = study.declared.demonstrations.counts, study.declared.labels, study.declared.measures
-    several = len(study.tasks) > 1
-
-    def known(label: str, measure: str, count: int, task: str | None = None) -> Estimate | None:
-        return _estimate(study, measure, values(table, label, measure, [count], task))
-
-    if len(counts) == 1:
-        panels = [Panel("", name_of(m), [_drawn(known(label, m, counts[0])) for label in labels]) for m in measures]
-        with style():
-            return interval_plot(labels, panels)
-    wanted: list[tuple[str, str | None]] = [(measure, None) for measure in measures]
-    wanted += [(measures[0], task) for task in study.tasks] if several else []
-    lines = math.ceil(len(wanted) / COLUMNS_OF_PANELS)
+def _plotted(
+    names: Sequence[str], panels: dict[str, list[Interval | None]], path: Path, alt: str, caption: str,
+    axis: str = "", line: float | None = None,
+) -> Picture:  # fmt: skip
     with style():
-        figure = blank(2.2 * lines + 0.4)
-        all_axes = figure.subplots(lines, min(COLUMNS_OF_PANELS, len(wanted)), squeeze=False).flatten()
-        for axes, (measure, task) in zip(all_axes, wanted, strict=False):
-            for number, label in enumerate(labels):
-                points = {count: own for count in counts if (own := known(label, measure, count, task))}
-                middle = [own.value for own in points.values()]
-                ends = [own.interval if task is None else own.range for own in points.values()]
-                errors = np.nan_to_num(np.abs(np.reshape(ends, (-1, 2)).T - middle))
-                axes.errorbar(
-                    [count * 1.02**number for count in points], middle, errors, marker="o", markersize=3.5,
-                    capsize=2, linewidth=1.2, color=option_colour(number + 1), label=label,
-                )  # fmt: skip
-            axes.set(xscale="log", title=task or name_of(measure) + (", mean of tasks" if several else ""))
-            axes.set_xticks(counts, map(str, counts))
-            axes.set_xticks([], minor=True)
-            axes.grid(axis="y", color=GRID)
-        for axes in all_axes[len(wanted) :]:
-            axes.set_visible(False)
-        figure.supxlabel("demonstrations", fontsize=9)
-        figure.legend(*all_axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=min(len(labels), 6))
-    return figure
+        figure = interval_plot(names, [Panel(title, axis, rows, line=line) for title, rows in panels.items()])
+    return replace(save(figure, path, alt, caption), file=path.name)
 
 
 def design(study: Study, state: State) -> list[str]:
@@ -251,11 +208,10 @@ def design(study: Study, state: State) -> list[str]:
         text = f"The point of each method has the highest {declared.choose} on the development seeds, of"
         points = len(declared.points(next(iter(declared.methods))))
         lines.append(f"{text} {points}: {', '.join(chosen.values()) or 'not yet known'}.")
-        results: dict[str, dict[str, list[Any]]] = {}
+        results: dict[str, dict[str, list[Any]]] = defaultdict(lambda: defaultdict(list))
         for cell, result in done:
             if cell.part == "development":
-                named = cell.task, cell.demonstrations, cell.seed, result.values
-                results.setdefault(cell.of, {}).setdefault(cell.method, []).append(named)
+                results[cell.of][cell.method].append((cell.task, cell.demonstrations, cell.seed, result.values))
         for method, by_point in results.items():
             if (same := len(by_point) - len({*map(repr, by_point.values())})) > 0:
                 lines.append(f"{method}: {same} of {len(by_point)} points gave the results of another one: no trials.")
@@ -277,6 +233,9 @@ def name_of(measure: str) -> str:
     return words.measure(measure) if measure.islower() else measure
 
 
+# --- numbers that other pages quote -----------------------------------------------------------------------------------
+
+
 def shown(known: Estimate, form: str = ".2f") -> str:
     """A mean and its 95 % t interval, such as ``0.82 [0.75, 0.89]``."""
     return _between(known.value, known.interval, form)
@@ -287,12 +246,9 @@ def _between(value: float, ends: tuple[float, float], form: str) -> str:
     return f"{value:{form}}{between}".replace("-", "−")
 
 
-# --- numbers that other pages quote -----------------------------------------------------------------------------------
+def _with(known: Estimate, half: float, form: str) -> str:
+    return f"{known.value:{form}}" + ("" if math.isnan(half) else f" ± {half:{form.replace('+', '')}}")
 
-_QUOTED = re.compile(
-    r"<!-- (?P<kind>study|table) (?P<name>[\w-]+): (?P<what>.*?) -->(?P<text>.*?)<!-- / -->", re.DOTALL
-)
-_SETTING = re.compile(r"(study|task|without|seed|form|show|times|by)=(.*)", re.DOTALL)
 
 _SHOWN: dict[str, Callable[[Estimate, str], str]] = {
     "interval": shown,
@@ -307,142 +263,94 @@ _SHOWN: dict[str, Callable[[Estimate, str], str]] = {
 }
 """How a quotation shows an estimate."""
 
-
-def _with(known: Estimate, half: float, form: str) -> str:
-    return f"{known.value:{form}}" + ("" if math.isnan(half) else f" ± {half:{form.replace('+', '')}}")
+_QUOTED = re.compile(r"<!-- (study|table) ([\w-]+): (.*?) -->.*?<!-- / -->", re.DOTALL)
+_SETTING = re.compile(r"(study|task|without|seed|form|show|times|by)=(.*)", re.DOTALL)
 
 
 def render(text: str, studies: Path, tables: Path = Path()) -> str:
-    """A page's text with every quoted number as the tables have it.
-
-    A quotation is ``<!-- study NAME: options - flat; success; 50 -->…<!-- / -->``: a method or a contrast, a measure,
-    and a number of demonstrations, none where the table has none. A difference is bold where it is not inconclusive
-    after Holm's correction: for the primary contrasts of ``study NAME``, which has no other bold ones, or for all
-    differences of one measure (up to a comma) that the page quotes from one study of ``table NAME``. ``40 - 80`` gives
-    both methods of a contrast a number of their own. Several methods, measures or numbers, between ``|``, make a table,
-    of means and of differences with intervals. These settings may follow:
-
-    - ``study=NAME``, ``task=NAME`` and ``seed=NAME`` take rows of one study of the table, one task or one seed, and
-      ``seed=10-29`` of these; ``without=NAME`` leaves a task out;
-    - ``show`` is ``mean``, ``±`` (half of the interval), ``sd``, ``se``, ``median`` (and its interval), ``range``
-      (least and greatest unit), ``units`` (how many), ``above`` (how many are above 0) or ``verdict``; else mean and
-      interval;
-    - ``times=900`` multiplies, ``form=+.0%`` formats as Python does, and ``by=task`` gives a table rows for each task.
+    """A page's text with every quoted number as the tables have it; docs/studies.md says how a page quotes.
 
     :param studies: the folder of the declarations, whose tables ``kept`` have the numbers of ``study NAME``.
     :param tables: the folder of ``NAME.csv``, which has the numbers of ``table NAME``.
     :raises BadInput: a quotation is wrong, or there is no such value.
     """
-    sources: dict[str, _Source] = {}
+    families: dict[Any, dict[Any, Estimate]] = defaultdict(dict)
+    judged: dict[Any, str] = {}
+
+    @cache
+    def source(kind: str, name: str) -> tuple[Study | None, pd.DataFrame]:
+        if kind == "table":
+            return None, read_tidy(tables / f"{name}.csv")
+        study = Study.load(studies / f"{name}.yaml", allow_code=True)  # nothing of a study is imported for its numbers
+        for one in tested(study, found := earlier(study)):
+            key = " - ".join(one.spec.pair), one.spec.measure, (str(one.demonstrations),), None
+            judged[kind, name, (), key] = one.verdict
+        return study, found
+
+    @cache
+    def known(kind: str, name: str, rows: tuple[tuple[str, str], ...], key: Any, times: float) -> Estimate | None:
+        study, table = source(kind, name)
+        for column, value in rows:
+            first, _, last = value.partition("-")
+            several = first.isdecimal() and last.isdecimal() and column == "seed"
+            taken = [*map(str, range(int(first), int(last) + 1))] if several else [value]
+            table = table[table.task != value] if column == "without" else table[table[column].isin(taken)]
+        what, measure, count, task = key
+        return _estimate(study, table, what, measure, count, task, times)
 
     def quoted(match: re.Match[str]) -> str:
-        kind, name, what, _ = match.groups()
-        named = f"{kind} {name}"
-        if named not in sources:  # nothing of a study is imported for its numbers
-            study = Study.load(studies / f"{name}.yaml", allow_code=True) if kind == "study" else None
-            sources[named] = _Source(named, earlier(study) if study else read_tidy(tables / f"{name}.csv"), study)
-        return f"<!-- {named}: {what} -->{sources[named].quoted(what)}<!-- / -->"
-
-    _QUOTED.sub(quoted, text)  # finds the families
-    for source in sources.values():
-        source.judge()
-    return _QUOTED.sub(quoted, text)
-
-
-class _Source:
-    """The table that quotations name, the families of their differences, and the verdicts on them."""
-
-    def __init__(self, name: str, table: pd.DataFrame, study: Study | None) -> None:
-        self.name, self.table, self.study = name, table, study
-        self.estimates: dict[Any, Estimate | None] = {}
-        self.families: dict[Any, dict[Any, Estimate]] = {}
-        self.verdicts: dict[Any, str] = {}
-
-    def judge(self) -> None:
-        """Give the quoted differences their verdicts."""
-        for family in self.families.values():
-            judged = verdicts([(one, 0.0) for one in family.values()])
-            self.verdicts |= {key: verdict for key, (verdict, _) in zip(family, judged, strict=True)}
-        for one in tested(self.study, self.table) if self.study else ():
-            key = " - ".join(one.spec.pair), one.spec.measure, (str(one.demonstrations),), None
-            self.verdicts.setdefault(key, one.verdict)
-
-    def quoted(self, quotation: str) -> str:
-        """A number, or a table of several."""
-        fields = [part.strip() for part in quotation.split(";")]
+        kind, name, asked = match.groups()
+        study, table = source(kind, name)
+        fields = [part.strip() for part in asked.split(";")]
         settings = {found[1]: found[2] for part in fields if (found := _SETTING.fullmatch(part))}
         plain = [part.split(" | ") for part in fields if not _SETTING.fullmatch(part)]
         methods, measures, numbers = (*plain, [""])[:3] if len(plain) in (2, 3) else ([], [], [])
         counts = [tuple(one.split(" - ")) for one in numbers]
-        forms = (*_SHOWN, "verdict")
         try:
             times, _ = float(settings.get("times", 1)), format(0.0, settings.get("form", ""))
         except ValueError:
             methods = []
-        decimal = all(number.isdecimal() for count in counts for number in count) or len(plain) == 2
-        if not methods or not decimal or settings.get("show", "mean") not in forms:
+        decimal = len(plain) == 2 or all(number.isdecimal() for count in counts for number in count)
+        if not methods or not decimal or settings.get("show", "mean") not in (*_SHOWN, "verdict"):
             raise BadInput(
-                f"{self.name}: {quotation!r}: write a method or contrast, a measure and a number of demonstrations, "
-                f"such as: options - flat; success; 50. After show= stands one of: {', '.join(forms)}; form= is "
-                "Python's"
+                f"{kind} {name}: {asked!r}: write a method or contrast, a measure and a number of demonstrations, "
+                f"such as: options - flat; success; 50. After show= stands one of: {', '.join((*_SHOWN, 'verdict'))}; "
+                "form= is Python's"
             )
-        table = self._chosen(settings)
+        rows = tuple((column, settings[column]) for column in ("study", "without", "seed") if column in settings)
         single, by_task = len(methods) * len(measures) * len(counts) == 1, settings.get("by") == "task"
-        rows = []
-        tasks = sorted({*table.task}) if by_task else [settings.get("task")]
-        for task, count, measure in itertools.product(tasks, counts, measures):
-            cells = [self._cell(table, (what, measure, count, task), settings, times, single) for what in methods]
-            if any(cells):
+
+        def cell(key: Any) -> str:
+            what, measure, _, _ = key
+            difference, number = " - " in what, (kind, name, rows, key)
+            if (found := known(*number, times)) is None:
+                return ""
+            show = settings.get("show") or ("interval" if single or difference else "mean")
+            if difference and show in ("interval", "±", "verdict") and study is None:
+                families[kind, name, rows, measure.partition(",")[0]][number] = found
+            verdict = judged.get(number, NOT_TESTED)
+            if show == "verdict":
+                return verdict
+            form = settings.get("form") or (".0%" if measure.startswith("success") else ".2f")
+            form = f"+{form}" if difference and not (single and "form" in settings) else form
+            text = _SHOWN[show](found, form).replace("-", "−")
+            return f"**{text}**" if show in ("interval", "±") and verdict in DECIDED else text
+
+        tasks: Iterable[str | None] = sorted({*table.task}) if by_task else [settings.get("task")]
+        lines = []
+        for task, count, measure in product(tasks, counts, measures):
+            if any(cells := [cell((what, measure, count, task)) for what in methods]):
                 facts = [str(task), " − ".join(count), name_of(measure)]
-                rows.append([*facts[not by_task :], *(text or "–" for text in cells)])
-        if not rows:
-            raise BadInput(f"{self.name}: its tables have no {quotation!r}; check its names")
-        if single:
-            return rows[0][-1]
+                lines.append([*facts[not by_task :], *(text or "–" for text in cells)])
+        if not lines:
+            raise BadInput(f"{kind} {name}: its tables have no {asked!r}; check its names")
         head = ["task", "demonstrations", "measure", *(what.replace(" - ", " − ") for what in methods)]
-        return f"\n\n{Table(head[not by_task :], rows, {0, 2} if by_task else {1}).markdown()}\n\n"
+        written = Table(head[not by_task :], lines, {0, 2} if by_task else {1}).markdown()
+        shown = lines[0][-1] if single else f"\n\n{written}\n\n"
+        return f"<!-- {kind} {name}: {asked} -->{shown}<!-- / -->"
 
-    def _chosen(self, settings: Mapping[str, str]) -> pd.DataFrame:
-        """The rows of the study and the seeds that are asked for, without the task that is left out."""
-        table = self.table[self.table.task != settings.get("without")]
-        if "study" in settings:
-            table = table[table.study == settings["study"]]
-        if several := re.fullmatch(r"(\d+)-(\d+)", settings.get("seed", "")):
-            return table[table.seed.isin([str(seed) for seed in range(int(several[1]), int(several[2]) + 1)])]
-        return table[table.seed == settings["seed"]] if settings.get("seed") else table
-
-    def _cell(
-        self, table: pd.DataFrame, named: tuple[str, str, tuple[str, ...], str | None],
-        settings: Mapping[str, str], times: float, single: bool,
-    ) -> str:  # fmt: skip
-        """One number; empty where the table has none."""
-        what, measure, _, _ = named
-        difference, form = " - " in what, settings.get("form", "")
-        key = (*named, *((name, settings[name]) for name in ("study", "without", "seed") if name in settings))
-        if (*key, times) not in self.estimates:
-            self.estimates[*key, times] = self._estimate(table, named, times)
-        known = self.estimates[*key, times]
-        show = settings.get("show") or ("interval" if single or difference else "mean")
-        if known is None:
-            return ""
-        if difference and show in ("interval", "±", "verdict") and self.study is None:
-            self.families.setdefault((measure.partition(",")[0], *key[4:]), {})[key] = known
-        verdict = self.verdicts.get(key, NOT_TESTED)
-        if show == "verdict":
-            return verdict
-        if not form:
-            form = ("+" if difference else "") + (".0%" if measure.startswith("success") else ".2f")
-        elif difference and not single:
-            form = f"+{form}"
-        text = _SHOWN[show](known, form).replace("-", "−")
-        return f"**{text}**" if show in ("interval", "±") and verdict in DECIDED else text
-
-    def _estimate(
-        self, table: pd.DataFrame, named: tuple[str, str, tuple[str, ...], str | None], times: float
-    ) -> Estimate | None:
-        what, measure, count, task = named
-        own = times * values(table, what, measure, count, task)
-        seeds = own.index.get_level_values("seed")
-        own = own[(seeds != "") | (seeds == "").all()]  # a row without seed is the summary of the others
-        starts = trials(self.study, measure) if self.study and times == 1 else 0
-        return None if own.empty else estimate(own, starts, -1.0 if " - " in what else 0.0)
+    _QUOTED.sub(quoted, text)  # finds the families
+    for family in families.values():
+        verdict_of = verdicts([(one, 0.0) for one in family.values()])
+        judged |= {number: verdict for number, (verdict, _) in zip(family, verdict_of, strict=True)}
+    return _QUOTED.sub(quoted, text)

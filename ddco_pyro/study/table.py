@@ -65,7 +65,8 @@ def values(
         return rows.groupby(["task", "seed"], sort=False).value.last()
 
     found = of(what, demonstrations[0])
-    if len(found) or " - " not in what:
-        return found
-    ours, _, theirs = what.partition(" - ")
-    return (of(ours, demonstrations[0]) - of(theirs, demonstrations[-1])).dropna()
+    if found.empty and " - " in what:
+        ours, _, theirs = what.partition(" - ")
+        found = (of(ours, demonstrations[0]) - of(theirs, demonstrations[-1])).dropna()
+    seeds = found.index.get_level_values("seed")
+    return found[(seeds != "") | (seeds == "").all()]  # a row without seed is the summary of the others
