@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from ddco_pyro.data.files import write_text
-from ddco_pyro.events import Event, FoldScored
+from ddco_pyro.events import CellDone, Event
 from ddco_pyro.fitting.run import claim
 from ddco_pyro.selection import Workers, folds, grid, select
 from ddco_pyro.spec import load_spec
@@ -67,7 +67,7 @@ class Clock:
 
     def __call__(self, event: Event) -> None:
         """A fold is done, or something else has happened."""
-        if isinstance(event, FoldScored):
+        if isinstance(event, CellDone):
             self.ends.append(time.monotonic())
 
 

@@ -90,19 +90,19 @@ class LengthTried:
 
 
 @dataclass(frozen=True)
-class SelectionBegan:
-    """A selection of ``total`` (candidate, fold) pairs begins; ``kept`` of them are scored already."""
+class CellsBegan:
+    """A ``study`` or a ``cross-validation`` of ``total`` cells begins; ``kept`` of them are done already."""
 
+    work: str
     total: int
     kept: int
 
 
 @dataclass(frozen=True)
-class FoldScored:
-    """A fold of a candidate is scored, or failed for the reason ``failed``."""
+class CellDone:
+    """A cell is done, or failed for the reason ``failed``: of a cross-validation, a fold of a candidate."""
 
-    candidate: str
-    fold: int
+    cell: str
     failed: str
 
 
@@ -129,22 +129,6 @@ class EpisodeEnded:
     total: int
 
 
-@dataclass(frozen=True)
-class StudyBegan:
-    """A study of ``total`` cells begins; ``kept`` of them are done already."""
-
-    total: int
-    kept: int
-
-
-@dataclass(frozen=True)
-class CellDone:
-    """A cell of a study is done, or failed for the reason ``failed``."""
-
-    cell: str
-    failed: str
-
-
 Event = (
     DemonstrationsDone
     | BaselineSegmented
@@ -156,13 +140,11 @@ Event = (
     | TrainingEnded
     | OptionsCompared
     | LengthTried
-    | SelectionBegan
-    | FoldScored
+    | CellsBegan
+    | CellDone
     | CandidateGivenUp
     | SeedFitted
     | EpisodeEnded
-    | StudyBegan
-    | CellDone
 )
 OnEvent = Callable[[Event], None]
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import study
-from cells import Cell, Settings, described
+from study import Cell, Settings, described
 from table import Row
 
 from ddco_pyro.fitting.fit import fit
@@ -44,7 +44,6 @@ Bin = Mapping[str, float]
 class Fitted(Cell):
     """A spec under a training seed."""
 
-    script = "bin_picking.py"
     spec: str
     seed: int
 

@@ -18,11 +18,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from bin_picking import DEMONSTRATIONS, OURS, STARTS
-from cells import described, printed
 from ddco_tasks.bin_picking import task
 from ddco_tasks.bin_picking.geometry import SHOWING
 from ddco_tasks.bin_picking.trials import Attempt
 from joblib import Parallel, delayed
+from study import described, printed
 from table import RESULTS, Row, add, shown
 
 from ddco_pyro.fitting.fitted import Fit, load

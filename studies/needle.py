@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import study
-from cells import Cell, Settings, described
+from study import Cell, Settings, described
 from table import Row
 
 from ddco_pyro.fitting.fit import fit
@@ -47,8 +47,6 @@ DEFAULTS = Settings({"episodes": 200}, Path("runs/needle"))
 @dataclass(frozen=True)
 class NeedleCell(Cell):
     """A model, how many demonstrations it is trained on, and the training seed."""
-
-    script = "needle.py"
 
     model: str
     count: int

@@ -17,14 +17,14 @@ import argparse
 import itertools
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import study
-from cells import Cell, Settings, described
 from ddco_tasks.pushing import environment as pushing
+from study import Cell, Settings, described
 from table import Row
 
 from ddco_pyro.acting.controller import Controller
@@ -87,8 +87,6 @@ VARIANTS: dict[str, tuple[dict[str, Any], int]] = {
 class PushingCell(Cell):
     """A method with k options (0: flat), a number of demonstrations, a training seed, and what is changed."""
 
-    script = "pushing.py"
-
     method: str
     options: int
     demonstrations: int
@@ -103,9 +101,9 @@ class PushingCell(Cell):
         parts = words if self.variant == "base" else (*words, self.variant)
         return "-".join(parts).replace(" ", "-").replace(",", "").replace("/", "-").lower()
 
-    def run(self, settings: Settings) -> dict[str, Any]:
+    def depends(self, settings: Settings) -> dict[str, Any]:
         """As every cell, whichever study it is of."""
-        return super(PushingCell, replace(self, study="")).run(settings)
+        return super().depends(settings) | {"study": ""}
 
     def results(self, settings: Settings, folder: Path) -> dict[str, Any]:
         """Fit, and play without a limit and with 250 steps for each goal."""

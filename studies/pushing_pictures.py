@@ -26,9 +26,9 @@ from typing import Any
 import dm_env
 import numpy as np
 import study
-from cells import Cell, Settings, described, digest
 from ddco_tasks.pushing import environment as pushing
 from pushing import EVALUATION, HELD_OUT, HELD_OUT_SEED, LABELS, POOL, TRAINING, per_step, summary
+from study import Cell, Settings, described
 from table import Row
 
 from ddco_pyro.acting.controller import Controller
@@ -41,6 +41,7 @@ from ddco_pyro.simulation.cameras import Camera, Encoded
 from ddco_pyro.simulation.episodes import play, run_episode
 from ddco_pyro.simulation.task import Task
 from ddco_pyro.spec import Spec, load_spec, with_overrides
+from ddco_pyro.study.cells import work_of
 from ddco_pyro.training.devices import device_of
 from ddco_pyro.training.networks import Dimensions, baseline_spec, parameters
 from ddco_pyro.training.restarts import Trainer, train_model
@@ -87,8 +88,6 @@ DEFAULTS = Settings({"updates": 4000, "episodes": 5}, Path("runs/pushing-picture
 class PictureCell(Cell):
     """A method with k options (0: flat), a number of demonstrations, and a training seed."""
 
-    script = "pushing_pictures.py"
-
     method: str
     options: int
     count: int
@@ -107,7 +106,7 @@ class PictureCell(Cell):
         own, tasks = settings.values, (watched(pushing.task, self.camera), watched(pushing.limited, self.camera))
         demos, test = self.demonstrations(settings), held_out(settings.runs, self.seed, self.camera)
         if self.method.startswith("encoded"):
-            reader = self._reader(settings, folder)
+            reader = self._reader(settings)
             demos, test = encoded(reader, demos, VERSIONS, self.seed), encoded(reader, test)
             tasks = tuple(_seen_through(reader, task) for task in tasks)
         begun, before = time.perf_counter(), time.process_time()
@@ -163,11 +162,10 @@ class PictureCell(Cell):
         spec = spec if self.options else baseline_spec(spec, spec.compare_with[-1], size)
         return spec, train_model(spec, size, demos, checkpoints=folder)
 
-    def _reader(self, settings: Settings, folder: Path) -> FittedReader:
+    def _reader(self, settings: Settings) -> FittedReader:
         """The convolutions of the flat policy of the same demonstrations, which is fitted as its own cell has it."""
         flat, plain = PictureCell("ff_flat", 0, self.count, self.seed), replace(settings, overrides=())
-        its = folder.parents[1] / digest(plain.kept()) / flat.name
-        spec, trained = flat.fitted(plain, flat.demonstrations(plain), its)
+        spec, trained = flat.fitted(plain, flat.demonstrations(plain), work_of(flat.path(plain)))
         return from_fit(Fit(spec, trained.hierarchy), "camera", (*SIZE, 3))
 
 

@@ -13,7 +13,7 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
-from cells import described
+from study import described
 from table import RESULTS, Row, add
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations

@@ -1,53 +1,140 @@
-"""A study of cells: those that are not done are done, some at a time, and its table gets their numbers."""
+"""Studies by scripts: cells are kept as those of ``ddco-pyro study``, and a table gets their numbers."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+import hashlib
+import json
+import sys
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, astuple, dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
-from cells import Cell, Settings, printed, some
-from joblib import Parallel, delayed
-from table import RESULTS, add, shown
+from table import RESULTS, Row, add, shown
+
+from ddco_pyro.cli.console import Progress
+from ddco_pyro.errors import BadInput, Failed
+from ddco_pyro.jobs import Workers
+from ddco_pyro.study import cells
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What all cells of a study share.
+
+    :param values: numbers that decide a result, by the name of their option: a study has its own.
+    :param runs: the folder of everything but the results.
+    :param overrides: of the specs, each KEY=VALUE.
+    """
+
+    values: Mapping[str, float]
+    runs: Path
+    overrides: tuple[str, ...] = ()
+
+    def kept(self) -> dict[str, Any]:
+        """What decides a result."""
+        return {**self.values, "overrides": list(self.overrides)}
+
+    def given(self, own: argparse.Namespace) -> Settings:
+        """What the command line says of all cells."""
+        values = {name: getattr(own, name) for name in self.values}
+        return replace(self, values=values, runs=own.runs, overrides=tuple(own.set))
+
+
+class Cell(ABC):
+    """A cell of a study. Each study has a dataclass of its own, whose fields name a cell."""
+
+    @abstractmethod
+    def results(self, settings: Settings, folder: Path) -> dict[str, Any]:
+        """Do the work; ``folder`` keeps the fits.
+
+        :raises Failed: the simulator cannot be used, or its expert fails.
+        """
+
+    @abstractmethod
+    def rows(self, results: Mapping[str, Any]) -> Iterable[Row]:
+        """Its numbers in the study's table."""
+
+    @property
+    def name(self) -> str:
+        """Of its files."""
+        return "-".join(map(str, astuple(self)))
+
+    def depends(self, settings: Settings) -> dict[str, Any]:
+        """What decides its results."""
+        return asdict(self) | settings.kept()
+
+    def path(self, settings: Settings) -> Path:
+        """Its file; other settings have other files."""
+        digest = hashlib.sha256(json.dumps(settings.kept()).encode()).hexdigest()[:8]
+        return settings.runs / "cells" / f"{self.name}-{digest}.json"
+
+    def do(self, settings: Settings) -> str:
+        """Do it, unless it is done; returns why it failed."""
+        return cells.do(
+            self.path(settings), self.depends(settings), lambda folder: {"values": self.results(settings, folder)}
+        )
+
+    def kept(self, settings: Settings) -> dict[str, Any] | None:
+        """Its results; None where they are missing."""
+        done = cells.kept(self.path(settings), self.depends(settings))
+        return None if done is None or done.failed else done.values
+
+
+def described(text: str | None) -> argparse.ArgumentParser:
+    """A parser whose help is a script's docstring."""
+    return argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
+
+
+def printed(work: Callable[[], str]) -> None:
+    """Print what work gives, or end with the line that says why it cannot be done: with 2 where the input is bad."""
+    try:
+        print(work())
+    except (BadInput, Failed) as error:
+        print(error, file=sys.stderr)
+        raise SystemExit(2 if isinstance(error, BadInput) else 1) from None
 
 
 def main(
     table: str,
     parser: argparse.ArgumentParser,
     defaults: Settings,
-    cells: Callable[[argparse.Namespace], Sequence[Cell]],
+    asked: Callable[[argparse.Namespace], Sequence[Cell]],
     first: Callable[[Settings], object] = lambda settings: None,
 ) -> None:
-    """Run a study as the command line says, and print its means.
+    """Do the cells of a study that are not done, write the rows of every one that is, and print their means.
 
     :param table: ``docs/results/TABLE.csv``.
-    :param parser: has the options that ``cells`` reads.
+    :param parser: has the options that ``asked`` reads.
     :param defaults: the study's settings where nothing else is said.
     :param first: is called before any cell, such as to make a simulator's environment.
     """
+    for name, value in defaults.values.items():
+        parser.add_argument(f"--{name}", type=type(value), default=value)
+    parser.add_argument("--set", action="append", default=list(defaults.overrides), metavar="KEY=VALUE")
+    parser.add_argument("--runs", type=Path, default=defaults.runs)
     parser.add_argument("--jobs", type=int, default=1, help="cells at a time; each works on one thread")
     parser.add_argument("--summarize", action="store_true", help="do nothing that is not done")
     parser.add_argument("--out", type=Path, default=RESULTS / f"{table}.csv")
-    defaults.add_to(parser)
     own = parser.parse_args()
-    printed(lambda: run(own, defaults, cells, first))
 
+    def work() -> str:
+        settings, wanted = defaults.given(own), list(asked(own))
+        if not wanted:
+            raise BadInput(f"{Path(sys.argv[0]).name}: there is nothing to do: a list or a number is empty or 0")
+        calls = {cell.name: partial(cell.do, settings) for cell in wanted if cell.kept(settings) is None}
+        if not own.summarize:
+            first(settings)
+            with Progress() as progress:
+                cells.do_all(calls, len(wanted) - len(calls), Workers(own.jobs), progress)
+        done = {cell: found for cell in wanted if (found := cell.kept(settings)) is not None}
+        rows = [row for cell, found in done.items() for row in cell.rows(found)]
+        add(own.out, rows)
+        if not own.summarize and len(done) < len(wanted):
+            raise Failed(f"{len(wanted) - len(done)} of {len(wanted)} cells failed; the same command tries them again")
+        return shown(rows)
 
-def run(
-    own: argparse.Namespace,
-    defaults: Settings,
-    cells: Callable[[argparse.Namespace], Sequence[Cell]],
-    first: Callable[[Settings], object],
-) -> str:
-    """Do what is not done yet, and write the rows of every cell that is done; their means.
-
-    :raises BadInput: there is no cell to do.
-    """
-    settings, asked = defaults.given(own), some(list(cells(own)))
-    if not own.summarize:
-        first(settings)
-        Parallel(n_jobs=own.jobs, verbose=10)(delayed(cell.run)(settings) for cell in asked)
-    done = [cell for cell in asked if cell.path(settings).exists()]
-    rows = [row for cell in done for row in cell.rows(cell.run(settings))]
-    add(own.out, rows)
-    return shown(rows)
+    printed(work)

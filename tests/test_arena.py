@@ -6,7 +6,7 @@ import functools
 import json
 
 import apart
-import arena_cell
+import arena
 import arena_recording
 import h5py
 import numpy as np
@@ -119,7 +119,7 @@ def test_the_same_demonstrations_are_held_out_from_all_cells(tmp_path):
     with h5py.File(tmp_path / "demos.hdf5", "w") as file:
         file["mask/valid"], file["mask/train"] = np.array(names[:4], "S"), np.array(names[4:], "S")
     used = {
-        (count, seed): arena_cell.chosen(tmp_path / "demos.hdf5", arena_cell.ArenaCell("task", count, seed))
+        (count, seed): arena.chosen(tmp_path / "demos.hdf5", arena.ArenaCell("task", count, seed))
         for count in (2, 5, 8)
         for seed in (0, 1)
     }
@@ -130,7 +130,7 @@ def test_the_same_demonstrations_are_held_out_from_all_cells(tmp_path):
         assert set(used[2, seed][0]) < set(used[5, seed][0]) < set(used[8, seed][0])
     assert used[5, 0] != used[5, 1]
     with pytest.raises(BadInput, match="has 8 demonstrations to train on, 9 are asked for"):
-        arena_cell.chosen(tmp_path / "demos.hdf5", arena_cell.ArenaCell("task", 9, 0))
+        arena.chosen(tmp_path / "demos.hdf5", arena.ArenaCell("task", 9, 0))
 
 
 # --- phases -----------------------------------------------------------------------------------------------------------

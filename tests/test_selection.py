@@ -64,8 +64,10 @@ def test_every_candidate_has_the_same_folds(finished):
     for (_, fold), one in scores.items():
         assert tuple(one["names"]) == made.folds.held_out[fold]
         assert one["steps"] == [len(demo) for demo in two_skills().select(one["names"])]
-    assert told.begun == [(8, 0)]
-    assert {pair[:2] for pair in told.pairs} == {(row.candidate.name, f) for row in made.choice.rows for f in range(4)}
+    assert told.begun == [("cross-validation", 8, 0)]
+    assert {pair[0] for pair in told.pairs} == {
+        f"{row.candidate.name}, fold {f}" for row in made.choice.rows for f in range(4)
+    }
 
 
 def test_the_file_is_what_the_scores_say(finished):
@@ -91,7 +93,7 @@ def test_what_is_there_is_not_done_again(finished, monkeypatch):
     monkeypatch.setattr(folds, "score", None)
     told = Told()
     again = select(spec, folder, told, ONE)
-    assert (told.begun, told.pairs) == ([(8, 8)], [])
+    assert (told.begun, told.pairs) == ([("cross-validation", 8, 8)], [])
     assert (folder / "selection.json").read_bytes() == before
     assert again.choice == made.choice
 
@@ -131,7 +133,7 @@ def test_a_fold_that_fails_is_named_and_the_others_go_on(tmp_path, monkeypatch):
     assert all("is not finite" in reason for reason in failed.values())
     data = json.loads((tmp_path / "run" / "selection.json").read_text())
     assert [(one["candidate"], one["fold"]) for one in data["failed"]] == [(1, 0), (1, 1)]
-    assert {pair[2] for pair in told.pairs if pair[0].startswith("lr = 0.05")} == {""}
+    assert {pair[1] for pair in told.pairs if pair[0].startswith("lr = 0.05")} == {""}
 
 
 def test_where_nothing_is_left_the_first_reason_is_told(tmp_path, monkeypatch):
@@ -203,7 +205,7 @@ def test_a_killed_selection_goes_on_and_gives_the_same(tmp_path):
     arguments = ["select", spec, "--out"]
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     cut = tmp_path / "cut"
-    status, _ = struck([*arguments, cut, "--jobs", "2"], tmp_path, "FoldScored", 2, KILL)
+    status, _ = struck([*arguments, cut, "--jobs", "2"], tmp_path, "CellDone", 2, KILL)
     assert status == -signal.SIGKILL
     done = {path: path.read_bytes() for path in (cut / "folds").glob("*.json")}
     assert len(done) == 2

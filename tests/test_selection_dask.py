@@ -68,7 +68,7 @@ def test_a_worker_that_is_killed_changes_nothing(cluster, tmp_path):
     select(spec, tmp_path / "cluster", told, Workers(scheduler=address))
     assert workers[0].returncode == -signal.SIGKILL
     assert workers[1].poll() is None
-    assert sorted(pair[2] for pair in told.pairs) == [""] * 8
+    assert sorted(pair[1] for pair in told.pairs) == [""] * 8
     select(spec, tmp_path / "here", Told(), Workers(1))
     for name in ("selection.json", "folds.json"):
         assert (tmp_path / "cluster" / name).read_bytes() == (tmp_path / "here" / name).read_bytes()

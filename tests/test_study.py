@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import study
-from cells import Cell, Settings, described
+from study import Cell, Settings, described
 from table import RESULTS, Row, add
 
 from ddco_pyro.study.table import COLUMNS, read_tidy
@@ -19,8 +19,6 @@ DEFAULTS = Settings({"episodes": 3, "noise": 0.5}, Path("unused"))
 @dataclass(frozen=True)
 class Toy(Cell):
     """Says what it was given."""
-
-    script = "toy.py"
 
     task: str
     seed: int

@@ -23,18 +23,16 @@ from ddco_pyro.events import (
     BaselineSegmented,
     CandidateGivenUp,
     CellDone,
+    CellsBegan,
     DemonstrationsDone,
     EpisodeEnded,
     EpochEnded,
     Event,
-    FoldScored,
     LengthTried,
     OptionsCompared,
     RestartDiverged,
     RestartStopped,
     SeedFitted,
-    SelectionBegan,
-    StudyBegan,
     TrainingBegan,
     TrainingEnded,
     UpdatesDone,
@@ -117,12 +115,12 @@ class Progress:
             case LengthTried(power, constant, median):
                 gates = ", constant gates" if constant else ""
                 self._advance("trying lengths", note=f"power {power:g}{gates}: median segment {median:g} steps")
-            case SelectionBegan(total, kept):
-                self._begin(f"cross-validation{f' ({kept} of {total} kept)' if kept else ''}", total - kept)
-            case FoldScored(candidate, fold, failed):
+            case CellsBegan(work, total, kept):
+                self._begin(f"{work}{f' ({kept} of {total} kept)' if kept else ''}", total - kept)
+            case CellDone(cell, failed):
                 if failed:
-                    self._say(f"{candidate}, fold {fold} failed: {failed}")
-                self._advance(note=f"{candidate}, fold {fold}")
+                    self._say(f"{cell} failed: {failed}")
+                self._advance(note=cell)
             case CandidateGivenUp(candidate, folds):
                 self._say(f"{candidate}: stopped early, {folds} folds less")
                 self._advance(by=folds)
@@ -130,12 +128,6 @@ class Progress:
                 self._advance("fitting with other training seeds", total)
             case EpisodeEnded(policy, total):
                 self._advance("rolling out", total, note=method(policy))
-            case StudyBegan(total, kept):
-                self._begin(f"study{f' ({kept} of {total} kept)' if kept else ''}", total - kept)
-            case CellDone(cell, failed):
-                if failed:
-                    self._say(f"{cell} failed: {failed}")
-                self._advance(note=cell)
 
     def _begin(self, label: str, total: int | None) -> None:
         """Begin to count up to ``total``, or without an end for None."""

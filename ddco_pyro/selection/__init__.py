@@ -14,7 +14,7 @@ from pathlib import Path
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import json_text, write_text
 from ddco_pyro.errors import Failed
-from ddco_pyro.events import CandidateGivenUp, FoldScored, OnEvent, SelectionBegan, ignore
+from ddco_pyro.events import CandidateGivenUp, CellDone, CellsBegan, OnEvent, ignore
 from ddco_pyro.fitting.digest import record
 from ddco_pyro.fitting.run import claimed
 from ddco_pyro.inference import compile_all
@@ -124,7 +124,7 @@ def _score_all(
     pairs = [(candidate.number, fold) for candidate in candidates for fold in range(count)]
     kept = {pair: dividing.kept_score(folder, *pair) for pair in pairs}
     done = {pair: score for pair, score in kept.items() if score is not None}
-    on_event(SelectionBegan(len(pairs), len(done)))
+    on_event(CellsBegan("cross-validation", len(pairs), len(done)))
     running = list(candidates)
     compile_all()
     with processes(workers.number(len(pairs))):
@@ -135,7 +135,7 @@ def _score_all(
                 for pair, score in scores:
                     dividing.keep_score(folder, score)
                     done[pair] = score
-                    on_event(FoldScored(candidates[score.candidate].name, score.fold, score.failed))
+                    on_event(CellDone(f"{candidates[score.candidate].name}, fold {score.fold}", score.failed))
             if stop_early:
                 numbers_running = {one.number for one in running}
                 seen = [s for s in done.values() if s.fold <= numbers[-1] and s.candidate in numbers_running]

@@ -12,8 +12,7 @@ import json
 import math
 import shutil
 import time
-from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -30,7 +29,7 @@ from ddco_pyro.data.sources import open_source
 from ddco_pyro.data.starting import starting_spec
 from ddco_pyro.errors import BadInput, reason
 from ddco_pyro.evaluation.agreement import MATCHED, UNMATCHED
-from ddco_pyro.events import CellDone, OnEvent, StudyBegan, ignore
+from ddco_pyro.events import CellDone, CellsBegan, OnEvent, ignore
 from ddco_pyro.fitting.digest import Digest, digest, recorded
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.fitted import Fit
@@ -120,10 +119,68 @@ class Done(Record):
     """
 
     depends: dict[str, Any]
-    values: dict[str, float | None]
+    values: dict[str, Any]
     failed: str = ""
     converged: bool = True
     seconds: float = 0.0
+
+
+def kept(path: Path, depends: Mapping[str, Any]) -> Done | None:
+    """The results in a cell's file, if they depend on the same.
+
+    :raises Damaged: the file is damaged.
+    """
+    if not path.exists():
+        return None
+    done = read_record(path, Done, "remove it and run the study again: this cell alone is done anew")
+    return done if _agrees(done.depends, _as_json(depends)) else None
+
+
+def work_of(path: Path) -> Path:
+    """The folder with the fits of the cell whose results are in ``path``."""
+    return path.parents[1] / "work" / path.stem
+
+
+def do(path: Path, depends: Mapping[str, Any], work: Callable[[Path], Mapping[str, Any]], **named: Any) -> str:
+    """Do a cell on one thread and keep its results; returns why it failed.
+
+    A cell that another process works on is left to it.
+
+    :param path: of its file.
+    :param work: fields of :class:`Done`; given a folder, which keeps the fits.
+    :param named: what its file says besides.
+    """
+    began = time.perf_counter()
+    try:
+        with only_one(folder := work_of(path)):
+            if (before := kept(path, depends)) is not None and not before.failed:  # another process has done it
+                return ""
+            if path.exists() and before is None:  # of other defaults
+                shutil.rmtree(folder / "fit", ignore_errors=True)
+            done = Done(depends=dict(depends), values={})
+            try:
+                with one_thread():
+                    done = done.model_copy(update=dict(work(folder)))
+            except Exception as error:  # other cells go on, and the reason is shown
+                done = done.model_copy(update={"failed": reason(error)})
+            done = done.model_copy(update={"seconds": time.perf_counter() - began})
+            write_text(path, json_text({**named, **done.model_dump()}))
+            return done.failed
+    except Busy:
+        return ""
+
+
+def do_all(calls: Mapping[str, Callable[[], str]], kept: int, workers: Workers, on_event: OnEvent = ignore) -> None:
+    """Make the calls of :func:`do`, some at a time.
+
+    :param calls: by the name of the cell.
+    :param kept: how many other cells there are, which are done.
+    :raises Failed: a process died.
+    """
+    on_event(CellsBegan("study", len(calls) + kept, kept))
+    with run_all(calls, workers, "did a cell") as done:
+        for name, failed in done:
+            on_event(CellDone(name, failed))
 
 
 @dataclass(frozen=True)
@@ -187,26 +244,20 @@ class Folder:
 
     def chosen(self, state: State) -> dict[str, dict[str, Any]]:
         """The point of each method with the highest mean over the development cells."""
-        measure, scores = str(self.study.declared.choose), defaultdict[str, dict[str, list[float]]](dict)
-        for number, done in state.done.items():
-            cell = state.cells[number]
-            if cell.part == "development":
-                value = done.values.get(measure)
-                scores[cell.of].setdefault(json.dumps(cell.point), []).append(-math.inf if value is None else value)
-        return {
-            method: json.loads(max(points, key=lambda point: float(np.mean(points[point]))))
-            for method, points in scores.items()
-        }
+        rows = [
+            (cell.of, json.dumps(cell.point), done.values.get(str(self.study.declared.choose)))
+            for cell, done in ((state.cells[number], done) for number, done in state.done.items())
+            if cell.part == "development"
+        ]
+        scores = pd.DataFrame(rows, columns=["of", "point", "value"]).fillna(-math.inf)
+        means = scores.groupby(["of", "point"], sort=False).value.mean()
+        return {str(of): json.loads(own.idxmax()[1]) for of, own in means.groupby("of")}
 
     def kept(self, cell: Cell) -> Done | None:
         """The results of a cell, if it is done: here, or in the declaration's table ``kept``."""
         if values := self._earlier.get(tuple(map(str, cell.row))):
             return Done(depends={}, values=values)
-        path = self.place(cell)
-        if not path.exists():
-            return None
-        done = read_record(path, Done, "remove it and run the study again: this cell alone is done anew")
-        return done if _agrees(done.depends, self.depends(cell)) else None
+        return kept(self.place(cell), self.depends(cell))
 
     @cached_property
     def _earlier(self) -> dict[tuple[str, ...], dict[str, float | None]]:
@@ -326,39 +377,16 @@ class Folder:
         there = Folder(replace(self.study, path=self.study.path.resolve()), self.path.resolve())  # wherever workers are
         with processes(workers.number(len(cells))):
             while state is None or len(cells) > len(state.cells):
-                before = self._state(cells)
-                on_event(StudyBegan(len(cells), len(before.done)))
-                calls = {n: partial(there.do, cell) for n, cell in enumerate(cells) if n not in before.done}
-                with run_all(calls, workers, "did a cell") as done:
-                    for number, failed in done:
-                        on_event(CellDone(str(cells[number]), failed))
+                done = self._state(cells).done
+                calls = {str(cell): partial(there.do, cell) for n, cell in enumerate(cells) if n not in done}
+                do_all(calls, len(done), workers, on_event)
                 state = self._state(cells)
                 cells = list(self.state().cells)  # development, once done, adds those of the test
         return state
 
     def do(self, cell: Cell) -> str:
-        """Do a cell on one thread and keep its results; returns why it failed.
-
-        A cell that another process works on is left to it.
-        """
-        folder, began = self.path / "work" / self.key(cell), time.perf_counter()
-        try:
-            with only_one(folder):
-                if (kept := self.kept(cell)) is not None and not kept.failed:  # another process has done it
-                    return ""
-                if self.place(cell).exists() and kept is None:  # of other defaults
-                    shutil.rmtree(folder / "fit", ignore_errors=True)
-                done = Done(depends=self.depends(cell), values={})
-                try:
-                    with one_thread():
-                        done = done.model_copy(update=self._measured(cell, folder))
-                except Exception as error:  # other cells go on, and the reason is shown
-                    done = done.model_copy(update={"failed": reason(error)})
-                done = done.model_copy(update={"seconds": time.perf_counter() - began})
-                write_text(self.place(cell), json_text({"cell": asdict(cell), **done.model_dump()}))
-                return done.failed
-        except Busy:
-            return ""
+        """Do a cell, as :func:`do` does."""
+        return do(self.place(cell), self.depends(cell), partial(self._measured, cell), cell=asdict(cell))
 
     def _measured(self, cell: Cell, folder: Path) -> dict[str, Any]:
         """The measures of a cell."""
@@ -438,7 +466,7 @@ def _mean(values: Sequence[float]) -> float | None:
     return float(np.mean(known)) if known else None
 
 
-def _as_json(data: dict[str, Any]) -> dict[str, Any]:
+def _as_json(data: Mapping[str, Any]) -> dict[str, Any]:
     """Plain data as they are read back from a file."""
     return dict(json.loads(json.dumps(data)))
 

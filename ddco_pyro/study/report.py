@@ -46,13 +46,10 @@ class Tested(NamedTuple):
 def tested(study: Study, table: pd.DataFrame) -> list[Tested]:
     """The primary contrasts of a study, in their order."""
     contrasts, counts = study.declared.contrasts, study.declared.demonstrations.counts
-    numbers = [one.demonstrations or counts[0] for one in contrasts]
-    estimates = [
-        _estimate(study, table, one.contrast, one.measure, [number])
-        for one, number in zip(contrasts, numbers, strict=True)
-    ]
-    judged = verdicts([(own, one.bound) for own, one in zip(estimates, contrasts, strict=True)])
-    return [Tested(*one, *verdict) for *one, verdict in zip(contrasts, numbers, estimates, judged, strict=True)]
+    asked = [(one, one.demonstrations or counts[0]) for one in contrasts]
+    found = [_estimate(study, table, one.contrast, one.measure, [number]) for one, number in asked]
+    judged = verdicts([(own, one.bound) for own, one in zip(found, contrasts, strict=True)])
+    return [Tested(*one, own, *verdict) for one, own, verdict in zip(asked, found, judged, strict=True)]
 
 
 def _estimate(
@@ -106,9 +103,9 @@ def write(folder: Folder, state: State, to: Path) -> Path:
 def page(study: Study, table: pd.DataFrame, state: State, to: Path) -> Page:
     """The page of a study; its figures are written into a folder."""
     contrasts = tested(study, table)
-    sections = [Section("contrasts", "Primary contrasts", _contrasts(contrasts, to))] * any(
-        one.estimate for one in contrasts
-    )
+    sections = []
+    if any(one.estimate for one in contrasts):
+        sections.append(Section("contrasts", "Primary contrasts", _contrasts(contrasts, to)))
     sections.append(Section("methods", "Every method", _methods(study, table, to)))
     sections.append(Section("design", "Design", [note(line) for line in design(study, state)]))
     top: list[Block] = [Text(verdict(contrasts), "verdict")] * bool(contrasts)

@@ -8,7 +8,7 @@ from dataclasses import astuple
 import numpy as np
 from random_demonstrations import numbered
 
-from ddco_pyro.events import CandidateGivenUp, FoldScored, SelectionBegan
+from ddco_pyro.events import CandidateGivenUp, CellDone, CellsBegan
 from ddco_pyro.selection.folds import Score
 from ddco_pyro.selection.grid import Candidate
 from ddco_pyro.spec import parse_spec
@@ -21,7 +21,7 @@ class Told:
         self.begun, self.pairs, self.stopped = [], [], []
 
     def __call__(self, event):
-        kinds = {SelectionBegan: self.begun, FoldScored: self.pairs, CandidateGivenUp: self.stopped}
+        kinds = {CellsBegan: self.begun, CellDone: self.pairs, CandidateGivenUp: self.stopped}
         kinds.get(type(event), []).append(astuple(event))
 
 
