@@ -184,9 +184,9 @@ def test_in_a_registered_task_every_training_seed_has_its_own_episodes(tmp_path)
         assert recorded.names == tuple(f"demo_{n}" for n in range(10 + 8 * seed, 16 + 8 * seed))
         controller = load(folder.path / "work" / folder.key(cell) / "fit").controller()
         outcomes = [run_episode(toy_task.task, controller, 500 + 5 * seed + n).outcome for n in range(5)]
-        assert state.done[seed].values["success"] == np.mean([one["success"] for one in outcomes])
+        assert state.done[cell].values["success"] == np.mean([one["success"] for one in outcomes])
         errors = [one["error"] for one in outcomes if not np.isnan(one["error"])]
-        assert state.done[seed].values["error"] == (pytest.approx(np.mean(errors)) if errors else None)
+        assert state.done[cell].values["error"] == (pytest.approx(np.mean(errors)) if errors else None)
 
 
 def test_an_adapter_collects_plays_and_has_methods_of_its_own(made, tmp_path):
@@ -206,7 +206,7 @@ def test_an_adapter_collects_plays_and_has_methods_of_its_own(made, tmp_path):
     folder = made(allow_code=True, **study)
     state = folder.run(HERE)
     assert not state.failed
-    found = {cell.row: state.done[number].values for number, cell in enumerate(state.cells)}
+    found = {cell.row: state.done[cell].values for cell in state.cells}
     for (task, method, _, seed), own in found.items():
         first, start = 100 + 7 * seed, 500 + 4 * seed
         assert own["success"] == {"there": 1, "back": 0}[task] if method == "options" else start / 1000
@@ -410,10 +410,12 @@ def test_a_measure_of_nothing_is_better_than_less(made):
     values = {(7, 0.5): -1.0, (8, 0.5): 0.0, (7, 1.0): -0.4, (8, 1.0): -0.4}
     places = folder.cells("development")
     results = [cells.Done(depends={}, values={"nats": values[one.seed, one.point["control.std"]]}) for one in places]
-    state = cells.State(places, dict(enumerate(results)), {})
+    state = cells.State(places, dict(zip(places, results, strict=True)), {})
     assert folder.chosen(state) == {"options": {"control.std": 1.0}}
     results[0] = cells.Done(depends={}, values={"nats": -0.7})
-    assert folder.chosen(cells.State(places, dict(enumerate(results)), {})) == {"options": {"control.std": 0.5}}
+    assert folder.chosen(cells.State(places, dict(zip(places, results, strict=True)), {})) == {
+        "options": {"control.std": 0.5}
+    }
 
 
 def test_points_that_change_nothing_are_no_trials(made):
@@ -421,7 +423,7 @@ def test_points_that_change_nothing_are_no_trials(made):
     places = folder.cells("development")
     values = {"options": {0.5: -1.0, 1.0: -1.0, 2.0: -0.5}, "flat": {0.5: -3.0, 1.0: -2.0, 2.0: -1.0}}
     done = [cells.Done(depends={}, values={"nats": values[one.of][one.point["control.std"]]}) for one in places]
-    lines = report.design(folder.study, cells.State(places, dict(enumerate(done)), {}))
+    lines = report.design(folder.study, cells.State(places, dict(zip(places, done, strict=True)), {}))
     (line,) = (line for line in lines if "no trials" in line)
     assert line == "options: 1 of 3 points gave the results of another one: no trials."
 
@@ -624,7 +626,7 @@ def test_planted_levels_are_scored_by_their_truth(tmp_path):
     (tmp_path / "planted.yaml").write_text(yaml.safe_dump(study))
     folder = Folder(Study.load(tmp_path / "planted.yaml", allow_code=True), tmp_path / "out")
     state = folder.run(HERE)
-    found = {cell.method: state.done[number].values for number, cell in enumerate(state.cells)}
+    found = {cell.method: state.done[cell].values for cell in state.cells}
     assert {name for name in found if len(found[name]) == 4} == {*found}
     assert found["truth"]["NMI, level 1"] > 0.99
     assert found["truth"]["nats"] >= max(found[name]["nats"] for name in ("limit", "search", "segments"))

@@ -79,10 +79,9 @@ def study(
         print(f"report: {report.write(folder, state, place)}")
         return
     rows: dict[tuple[str, str, int], list[int]] = {}
-    for number, cell in enumerate(state.cells):
-        kinds = (number in state.done, number in state.failed, False)
+    for cell in state.cells:
         counts = rows.setdefault((cell.part, cell.method, cell.demonstrations), [0, 0, 0])
-        counts[kinds.index(True) if True in kinds else 2] += 1
+        counts[0 if cell in state.done else 1 if cell in state.failed else 2] += 1
     shown = [[part, method, str(count), *map(str, counts)] for (part, method, count), counts in rows.items()]
     console.show(Table(["part", "method", "demonstrations", "done", "failed", "missing"], shown, {0, 1}))
     for reason, count in Counter(state.failed.values()).items() if action is Action.STATUS else ():

@@ -63,7 +63,7 @@ class Cell:
     demonstrations: int
     seed: int
     of: str = ""
-    point: Mapping[str, Any] = field(default_factory=dict)
+    point: Mapping[str, Any] = field(default_factory=dict, hash=False)
     place: int = 0
 
     def __str__(self) -> str:
@@ -185,16 +185,16 @@ def do_all(calls: Mapping[str, Callable[[], str]], kept: int, workers: Workers, 
 
 @dataclass(frozen=True)
 class State:
-    """The cells of a study that are done, by number, and the reasons of those that failed."""
+    """The cells of a study, those of them that are done, and the reasons of those that failed."""
 
     cells: Sequence[Cell]
-    done: Mapping[int, Done]
-    failed: Mapping[int, str]
+    done: Mapping[Cell, Done]
+    failed: Mapping[Cell, str]
 
     @property
     def missing(self) -> list[Cell]:
         """The cells that are neither done nor failed."""
-        return [cell for number, cell in enumerate(self.cells) if number not in self.done and number not in self.failed]
+        return [cell for cell in self.cells if cell not in self.done and cell not in self.failed]
 
 
 @dataclass(frozen=True)
@@ -238,15 +238,15 @@ class Folder:
         return "development" if self.study.declared.choose else "test"
 
     def _state(self, cells: Sequence[Cell]) -> State:
-        results = {number: found for number, cell in enumerate(cells) if (found := self.kept(cell))}
-        failed = {number: found.failed for number, found in results.items() if found.failed}
-        return State(cells, {number: one for number, one in results.items() if not one.failed}, failed)
+        found = {cell: one for cell in cells if (one := self.kept(cell))}
+        failed = {cell: one.failed for cell, one in found.items() if one.failed}
+        return State(cells, {cell: one for cell, one in found.items() if not one.failed}, failed)
 
     def chosen(self, state: State) -> dict[str, dict[str, Any]]:
         """The point of each method with the highest mean over the development cells."""
         rows = [
             (cell.of, json.dumps(cell.point), done.values.get(str(self.study.declared.choose)))
-            for cell, done in ((state.cells[number], done) for number, done in state.done.items())
+            for cell, done in state.done.items()
             if cell.part == "development"
         ]
         scores = pd.DataFrame(rows, columns=["of", "point", "value"]).fillna(-math.inf)
@@ -268,8 +268,8 @@ class Folder:
     def table(self, state: State) -> pd.DataFrame:
         """The declared measures of all cells that are done, tidy; methods of the development name their points."""
         rows = [
-            (self.study.name, *map(str, state.cells[number].row), measure, value)
-            for number, done in state.done.items()
+            (self.study.name, *map(str, cell.row), measure, value)
+            for cell, done in state.done.items()
             for measure in self.study.declared.measures
             if (value := done.values.get(measure)) is not None
         ]
@@ -378,7 +378,7 @@ class Folder:
         with processes(workers.number(len(cells))):
             while state is None or len(cells) > len(state.cells):
                 done = self._state(cells).done
-                calls = {str(cell): partial(there.do, cell) for n, cell in enumerate(cells) if n not in done}
+                calls = {str(cell): partial(there.do, cell) for cell in cells if cell not in done}
                 do_all(calls, len(done), workers, on_event)
                 state = self._state(cells)
                 cells = list(self.state().cells)  # development, once done, adds those of the test

@@ -199,23 +199,23 @@ def design(study: Study, state: State) -> list[str]:
         tables = dict.fromkeys(one.table for one in declared.kept)
         text = "have data of their own studies, whose seeds may share them. They may be older than the contrasts"
         lines.append(f"This is so in new cells. Results that are kept in {', '.join(tables)} {text}.")
-    done = [(state.cells[number], result) for number, result in state.done.items()]
     if declared.choose is not None:
         chosen = {cell.of: declared.label(cell.of, dict(cell.point), "") for cell in state.cells if cell.part == "test"}
         text = f"The point of each method has the highest {declared.choose} on the development seeds, of"
         points = len(declared.points(next(iter(declared.methods))))
         lines.append(f"{text} {points}: {', '.join(chosen.values()) or 'not yet known'}.")
-        results: dict[str, dict[str, list[Any]]] = defaultdict(lambda: defaultdict(list))
-        for cell, result in done:
+        results: dict[str, dict[str, str]] = defaultdict(lambda: defaultdict(str))
+        for cell, one in state.done.items():
             if cell.part == "development":
-                results[cell.of][cell.method].append((cell.task, cell.demonstrations, cell.seed, result.values))
-        for method, by_point in results.items():
-            if (same := len(by_point) - len({*map(repr, by_point.values())})) > 0:
-                lines.append(f"{method}: {same} of {len(by_point)} points gave the results of another one: no trials.")
-    tests, done = sum(cell.part == "test" for cell in state.cells), [one for one in done if one[0].part == "test"]
-    if len(done) < tests:
-        lines.append(f"{tests - len(done)} of {tests} cells are missing; contrasts leave their pairs out.")
-    if rising := Counter(cell.method for cell, result in done if not result.converged):
+                results[cell.of][cell.method] += str(one.values)
+        for method, found in results.items():
+            if (same := len(found) - len({*found.values()})) > 0:
+                lines.append(f"{method}: {same} of {len(found)} points gave the results of another one: no trials.")
+    tests = [cell for cell in state.cells if cell.part == "test"]
+    done = {cell: state.done[cell] for cell in tests if cell in state.done}
+    if len(done) < len(tests):
+        lines.append(f"{len(tests) - len(done)} of {len(tests)} cells are missing; contrasts leave their pairs out.")
+    if rising := Counter(cell.method for cell, result in done.items() if not result.converged):
         fits = words.listed(f"{count} of {method}" for method, count in rising.items())
         lines.append(f"Fits that have not converged: {fits}. More epochs may change their results.")
     return lines
