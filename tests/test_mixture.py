@@ -13,12 +13,12 @@ from toy_task import SPEC
 import ddco_pyro
 from ddco_pyro.drawing import words
 from ddco_pyro.evaluation import verdicts
+from ddco_pyro.evaluation.inferred import runs, started
 from ddco_pyro.evaluation.worth import mean_run, worth
 from ddco_pyro.inference import log_likelihood
 from ddco_pyro.inference.engines import compare_engines
 from ddco_pyro.metrics import Worth
 from ddco_pyro.model.tables import always_ends
-from ddco_pyro.segmenting import LevelLabels
 from ddco_pyro.selection.grid import candidates
 from ddco_pyro.spec import DurationSpec, SpecError, parse_spec, with_overrides
 from ddco_pyro.training.networks import (
@@ -212,6 +212,6 @@ def test_a_run_says_what_lasting_is_worth(run):
 def test_its_segments_are_runs_of_one_expert():
     """Every step is a termination, which says nothing: a segment ends where another expert acts."""
     options = np.array([1, 1, 2, 2, 2, 1])
-    ended, active = np.ones(6, int), np.eye(3)[options]
-    assert LevelLabels.of(options, ended, active, lasts=False).runs() == [(1, 0, 2), (2, 2, 5), (1, 5, 6)]
-    assert len(LevelLabels.of(options, ended, active, lasts=True).runs()) == 6
+    ended = np.ones(6, int)
+    assert runs(options, started(options, ended, lasts=False)) == [(1, 0, 2), (2, 2, 5), (1, 5, 6)]
+    assert len(runs(options, started(options, ended, lasts=True))) == 6

@@ -138,8 +138,8 @@ def _fit_and_report(
     resume: bool,
     logs: Mapping[str, MakeLog],
 ) -> None:
-    import ddco_pyro
     from ddco_pyro.cli import console
+    from ddco_pyro.fitting.fit import fit as fitted_to
     from ddco_pyro.fitting.seeds import check_seeds, repeat
 
     if seeds is not None:
@@ -159,7 +159,7 @@ def _fit_and_report(
             for log in logged:
                 log(event)
 
-        fitted = ddco_pyro.fit(loaded, None, folder, listen, jobs, resume)
+        fitted = fitted_to(loaded, None, folder, listen, jobs, resume)
         for log in logged:
             log.scalars(_held_out(fitted))
         if seeds is not None:
@@ -208,9 +208,9 @@ def select(
     ready = processes(workers.number(), *TRAINING) if scheduler is None and workers.number() > 1 else nullcontext()
     folder = out or Path("runs") / f"{spec.stem}-select-{time.strftime('%Y%m%d-%H%M%S')}"
     with ready:
-        import ddco_pyro
         from ddco_pyro import selection
         from ddco_pyro.cli import console
+        from ddco_pyro.fitting.fit import fit as fitted_to
 
         _check_folder(folder, spec, loaded)
         demos = selection.known_demonstrations(loaded)
@@ -222,7 +222,7 @@ def select(
             progress.end()
             assert made.choice.chosen is not None  # or it would have failed
             final = selection.final_spec(made.choice.chosen.candidate)
-            fitted = ddco_pyro.fit(final, made.demos, folder / "fit", progress, jobs, keep=False)
+            fitted = fitted_to(final, made.demos, folder / "fit", progress, jobs, keep=False)
     from ddco_pyro.report import write_report
     from ddco_pyro.selection.choice import table
 

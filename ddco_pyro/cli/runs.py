@@ -8,8 +8,8 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import wraps
-from importlib import import_module
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import typer
@@ -321,13 +321,12 @@ def segment(
 
 def _writer(place: Output, asked: Asked, settings: Mapping[str, Any]) -> Writer:
     (form,) = (form for form in FORMATS if form.option == place.option.replace("--in-place", "--out"))
-    module, _, kind = form.writer.partition(":")
     try:
-        found = import_module(f"ddco_pyro.segmenting.formats.{module}")
+        kind = resolve_name(f"ddco_pyro.segmenting.formats.{form.writer}")
     except ModuleNotFoundError as error:
         raise BadInput(f"{place.option} needs {error.name}; install it with: pip install {error.name}") from None
     more = {option.name: settings[option.name] for option in form.more}
-    writer: Writer = getattr(found, kind)(place.option, place.path, asked, **more)
+    writer: Writer = kind(place.option, place.path, asked, **more)
     return writer
 
 

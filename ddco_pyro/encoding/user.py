@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable
+from pkgutil import resolve_name
 from typing import Any
 
 import numpy as np
@@ -22,13 +22,14 @@ def imported(name: str) -> Features:
 
     :raises BadInput: the class cannot be imported or made; at a call, it fails or gives no features.
     """
-    module, _, attribute = name.partition(":")
     try:
-        own: Any = getattr(importlib.import_module(module), attribute)()
+        own: Any = resolve_name(name)()
     except Exception as error:  # whatever the user's code raises
         raise BadInput(f"encoder {name!r} cannot be imported or made: {_message(error)}") from error
     if not callable(own):
-        raise BadInput(f"encoder {name!r}: what {attribute}() gives cannot be called; it needs __call__(pictures)")
+        raise BadInput(
+            f"encoder {name!r}: what {name.rpartition(':')[2]}() gives cannot be called; it needs __call__(pictures)"
+        )
 
     def features(pictures: np.ndarray) -> np.ndarray:
         try:

@@ -129,6 +129,16 @@ class Inferred:
         """Choices and terminations of the most likely path, [N, T] for each level; -1 past a demonstration's end."""
         return most_likely_path(self.tables, self.batch.lengths)
 
+    def segmented(self, row: int, lasts: Sequence[bool]) -> list[tuple[np.ndarray, np.ndarray]]:
+        """The most likely choices of one demonstration, and where segments begin, each [T], for each level.
+
+        :param lasts: as in :meth:`intervals`.
+        """
+        steps = self.lengths[row]
+        paths = ((choices[row, :steps].numpy().copy(), ends[row, :steps].numpy())
+                 for choices, ends in zip(*self.path, strict=True))  # fmt: skip
+        return [(path, started(path, ends, own)) for (path, ends), own in zip(paths, lasts, strict=True)]
+
     def draws(self, row: int, number: int, seed: Sequence[int]) -> np.ndarray:
         """Choices and terminations of draws from p(ζ | ξ) for one demonstration, [2, D, number, T]."""
         length = self.lengths[row]
@@ -140,11 +150,10 @@ class Inferred:
 
         :param lasts: of each level, whether its options can be active for more than one step; see :func:`started`.
         """
-        found, steps = [], self.lengths[row]
-        levels = zip(lasts, *self.path, *self.draws(row, DRAWS, (0, steps)), strict=True)
-        for lasting, choices, ends, options, ended in levels:
-            path, last = choices[row, :steps].numpy(), ends[row, :steps].numpy()
-            every = boundaries(path, started(path, last, lasting), options, started(options, ended, lasting))
+        found = []
+        draws = self.draws(row, DRAWS, (0, self.lengths[row]))
+        for lasting, path, options, ended in zip(lasts, self.segmented(row, lasts), *draws, strict=True):
+            every = boundaries(*path, options, started(options, ended, lasting))
             found.append(np.array([(0, 0), *((each.low, each.high) for each in every)]))
         return found
 
@@ -163,6 +172,15 @@ def started(options: np.ndarray, terminations: np.ndarray, lasts: bool) -> np.nd
     found: np.ndarray = terminations == 1 if lasts else np.diff(options, prepend=-1) != 0
     found[..., 0] = True
     return found
+
+
+def runs(options: np.ndarray, starts: np.ndarray) -> list[tuple[int, int, int]]:
+    """Each segment of a path as (option, first step, step after the last).
+
+    :param starts: whether a segment begins at a step [T].
+    """
+    edges = [*np.flatnonzero(starts).tolist(), len(options)]
+    return [(int(options[start]), start, stop) for start, stop in pairwise(edges)]
 
 
 class Segment(NamedTuple):
@@ -213,13 +231,11 @@ class Segmentation(Sequence[np.ndarray]):
     @property
     def segments(self) -> list[Segment]:
         """Every segment in order; ``pandas.DataFrame(segments)`` is a table of them."""
-        found = []
-        for demo, own, starts in zip(self.demonstrations, self.choices, self.starts, strict=True):
-            edges = [*np.flatnonzero(starts).tolist(), len(own)]
-            for start, stop in pairwise(edges):
-                option = int(own[start])
-                found.append(Segment(demo, self.level, option, self.names[option], start, stop - start))
-        return found
+        return [
+            Segment(demo, self.level, option, self.names[option], start, stop - start)
+            for demo, own, starts in zip(self.demonstrations, self.choices, self.starts, strict=True)
+            for option, start, stop in runs(own, starts)
+        ]
 
     def __repr__(self) -> str:
         rows = self.segments

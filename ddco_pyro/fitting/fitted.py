@@ -17,7 +17,7 @@ from ddco_pyro.acting.monitor import Monitor, run_lengths
 from ddco_pyro.data.checks import unknown
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.errors import BadInput, path_of
-from ddco_pyro.evaluation.inferred import Inferred, Segmentation, infer, started
+from ddco_pyro.evaluation.inferred import Inferred, Segmentation, infer
 from ddco_pyro.fitting.digest import record, recorded
 from ddco_pyro.fitting.draws import Draws, draw
 from ddco_pyro.fitting.names import Named, checked, read_names, write_names
@@ -212,15 +212,13 @@ class Fit:
         """
         levels = self.spec.hierarchy.levels if self.spec.hierarchy else ()
         names: list[str] = []
-        found: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in levels]
+        found: list[list[tuple[np.ndarray, np.ndarray]]] = []
         for piece in self.infer(demos):
             names += piece.names
-            for own, level, choices, ends in zip(found, levels, *piece.path, strict=True):
-                for steps, row, last in zip(piece.lengths, choices.numpy(), ends.numpy(), strict=True):
-                    own.append((row[:steps].copy(), started(row[:steps], last[:steps], level.lasts)))
+            found += [piece.segmented(row, [level.lasts for level in levels]) for row in range(len(piece.names))]
         return tuple(
             Segmentation(name, tuple(names), known, *zip(*own, strict=True))
-            for own, (name, known) in zip(found, self.names.items(), strict=True)
+            for own, (name, known) in zip(zip(*found, strict=True), self.names.items(), strict=True)
         )
 
     def draws(self, demos: Sequence[Demonstration], draws: int = 100, seed: int = 0) -> Draws:

@@ -19,8 +19,8 @@ from ddco_pyro.data.sources.recording import label_names
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.agreement import agreement as scores_of  # a module here has that name
-from ddco_pyro.evaluation.agreement import confusion, of_equal_lengths
-from ddco_pyro.evaluation.inferred import Inferred, started
+from ddco_pyro.evaluation.agreement import of_equal_lengths
+from ddco_pyro.evaluation.inferred import Inferred, runs
 from ddco_pyro.events import BaselineSegmented, DemonstrationsDone, OnEvent, ignore
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Scores
@@ -47,30 +47,12 @@ class LevelLabels:
     probability: np.ndarray
     intervals: np.ndarray | None = None
 
-    @classmethod
-    def of(
-        cls,
-        options: np.ndarray,
-        terminations: np.ndarray,
-        active: np.ndarray,
-        *,
-        lasts: bool,
-        intervals: np.ndarray | None = None,
-    ) -> LevelLabels:
-        """Labels from the most likely path (choices and terminations [T]) and the posterior u [T, 1 + k].
-
-        :param lasts: whether the level's options can be active for more than one step.
-        """
-        probability = np.minimum(active[np.arange(len(options)), options], 1.0)  # rounding can exceed it
-        return cls(options, started(options, terminations, lasts), probability, intervals)
-
     def runs(self, anew: bool = True) -> list[tuple[int, int, int]]:
         """Each segment as (option, first step, step after the last).
 
         :param anew: whether a segment ends where the same option is chosen anew.
         """
-        starts = np.flatnonzero(self.boundaries if anew else np.diff(self.options, prepend=-1)).tolist()
-        return [(int(self.options[a]), a, b) for a, b in zip(starts, [*starts[1:], len(self.options)], strict=True)]
+        return runs(self.options, self.boundaries if anew else np.diff(self.options, prepend=-1))
 
 
 @dataclass(frozen=True)
@@ -104,6 +86,8 @@ class Segmented:
     :param truth: for each level, the name of the labels that the run's spec compares with it.
     :param names: for each level, the name of each choice, control first.
     :param label_names: for labels in the file, the names of labels 0, 1, ...
+    :param matched: for labels that the run's spec compares with a level, the option that each label is matched with
+        in the run's own table: of the lowest level, where labels are compared with several.
     """
 
     segments: tuple[Segments, ...]
@@ -112,6 +96,7 @@ class Segmented:
     truth: Mapping[str, str] = field(default_factory=dict)
     names: Mapping[str, Sequence[str]] = field(default_factory=dict)
     label_names: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    matched: Mapping[str, Mapping[int, int]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.segments)
@@ -122,21 +107,6 @@ class Segmented:
         held_out, others = ([demo for demo in labelled if demo.held_out is held] for held in (True, False))
         parts = {f"{len(held_out)} held out": held_out, f"{len(others)} {'others' if held_out else 'in all'}": others}
         return {part: group for part, group in parts.items() if group}
-
-    @cached_property
-    def matched(self) -> dict[str, dict[int, int]]:
-        """For labels that the run's spec compares with a level: the option that each label is matched with.
-
-        They are matched in held-out demonstrations, or in all where none is held out, as in tables. Labels of several
-        levels are matched with the lowest one's options.
-        """
-        options_of: dict[str, dict[int, int]] = {}
-        for level, truth in self.truth.items():
-            group = next(iter(self.labelled(truth).values()), ())
-            table = confusion([demo.levels[level].options for demo in group], [demo.labels[truth] for demo in group])
-            pairs = zip(table.matched, table.options, strict=True)
-            options_of.setdefault(truth, {label: option for label, option in pairs if label is not None})
-        return options_of
 
     @cached_property
     def agreements(self) -> dict[str, dict[str, Scores | None]]:
@@ -209,7 +179,11 @@ def of_run(
     counts = {level.name: level.count for level in fit.spec.hierarchy.levels} if fit.spec.hierarchy else {}
     names = fit.spec.demonstrations.labels_by_level(len(counts))
     truth = dict(zip(counts, names, strict=bool(names)))
-    return Segmented(tuple(segmented), counts, frequency, truth, fit.names, known)
+    record, matched = fit.metrics.agreement, dict[str, dict[int, int]]()
+    for label, table in zip(record.labels, record.confusion, strict=True) if record else ():
+        pairs = zip(table.matched, table.options, strict=True)
+        matched.setdefault(label, {value: option for value, option in pairs if value is not None})
+    return Segmented(tuple(segmented), counts, frequency, truth, fit.names, known, matched)
 
 
 def beside_baselines(
@@ -301,12 +275,12 @@ def of_piece(
     """
     levels = fit.spec.hierarchy.levels if fit.spec.hierarchy else ()
     for row, (name, steps) in enumerate(zip(piece.names, piece.lengths, strict=True)):
-        known = piece.intervals(row, [level.lasts for level in levels]) if intervals else [None] * len(levels)
-        each = {
-            level.name: LevelLabels.of(
-                *(array[row, :steps].numpy() for array in arrays), lasts=level.lasts, intervals=within
-            )
-            for level, within, *arrays in zip(levels, known, *piece.path, piece.posterior.u, strict=True)
+        lasts, steps_of = [level.lasts for level in levels], np.arange(steps)
+        known = piece.intervals(row, lasts) if intervals else [None] * len(levels)
+        every = zip(levels, piece.segmented(row, lasts), piece.posterior.u, known, strict=True)
+        each = {  # rounding can exceed 1
+            level.name: LevelLabels(options, starts, np.minimum(u[row].numpy()[steps_of, options], 1.0), within)
+            for level, (options, starts), u, within in every
         }
         value = float(piece.log_likelihood[row])
         if not math.isfinite(value):

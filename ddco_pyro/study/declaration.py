@@ -6,13 +6,13 @@ another in the blocks of ``demonstrations`` and ``starts``. Blocks that overlap 
 
 from __future__ import annotations
 
-import importlib
 import itertools
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError, model_validator
@@ -371,9 +371,8 @@ class Study:
         folder = str(self.path.parent.resolve())
         if folder not in sys.path:
             sys.path.append(folder)
-        module, _, name = self.declared.world.partition(":")
         try:
-            world = getattr(importlib.import_module(module), name)
+            world = resolve_name(self.declared.world)
         except Exception as error:  # whatever the adapter's code raises
             raise BadInput(f"{self.path}: world: {self.declared.world} cannot be loaded: {error}") from error
         for method in self.declared.methods.values():

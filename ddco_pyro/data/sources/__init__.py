@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from importlib import import_module
 from pathlib import Path
+from pkgutil import resolve_name
 from shlex import quote
 from typing import Protocol
 
@@ -70,10 +70,8 @@ def open_source(
         several = " or ".join(about.text for about in FORMATS.values() if "actions" in about.options)
         raise DemonstrationsError(f"{path}: has the format {form}, with one control; --action is for {several}")
     given = {"external": external, "actions": actions}
-    module, _, reader = FORMATS[form].reader.partition(":")
-    opened = getattr(import_module(f"{__name__}.{module}"), reader)(
-        path, **{option: given[option] for option in FORMATS[form].options}
-    )
+    reader = resolve_name(f"{__name__}.{FORMATS[form].reader}")
+    opened = reader(path, **{option: given[option] for option in FORMATS[form].options})
     with opened if isinstance(opened, AbstractContextManager) else nullcontext(opened) as source:
         yield source
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import importlib
 import inspect
 from collections.abc import Mapping
 from inspect import Parameter
+from pkgutil import resolve_name
 from typing import Any, Self
 
 from pydantic import PydanticUserError, TypeAdapter, ValidationError
@@ -70,9 +70,8 @@ class UserNetwork(Network):
 
 
 def _imported(name: str) -> type[nn.Module]:
-    module, _, attribute = name.partition(":")
     try:
-        network_class = getattr(importlib.import_module(module), attribute)
+        network_class: Any = resolve_name(name)
     except Exception as error:  # whatever the user's code raises
         raise ShapeError(f"network {name!r} cannot be imported: {error}") from error
     if not (isinstance(network_class, type) and issubclass(network_class, nn.Module)):
