@@ -17,7 +17,7 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.pictures import Pictures
 from ddco_pyro.data.sources.video import frames
 from ddco_pyro.encoding.autoencoder import Convolutions
-from ddco_pyro.encoding.encoder import About, Encoder, Extractor, Projection
+from ddco_pyro.encoding.encoder import About, Encoder, Projection
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.report import write_report
 from ddco_pyro.simulation import collect as collecting
@@ -95,7 +95,7 @@ def test_another_encoder_has_another_file():
     def path(scale, observed):
         network = Convolutions("random_conv", (48, 65, 3), seed=0)
         about = About(encoder="random_conv", observation="camera", picture=[48, 65, 3], features=4, size=4, seed=0)
-        encoder = Encoder(about, Extractor(network.encode, network), Projection(np.zeros(4), scale * np.eye(4), 1.0))
+        encoder = Encoder(about, network, Projection(np.zeros(4), scale * np.eye(4), 1.0))
         coded = replace(watched, cameras={"colour": Encoded(watched.cameras["camera"], encoder, 4)})
         return collecting.cache_path(coded, TASK, DemonstrationsSpec(count=5), observed)
 

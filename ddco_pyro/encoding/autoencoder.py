@@ -10,14 +10,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ddco_pyro.data.tensors import read_tensors, write_tensors
 from ddco_pyro.encoding.pictures import AT_ONCE, Pictures
 from ddco_pyro.events import OnEvent, TrainingBegan, TrainingEnded, UpdatesDone
 from ddco_pyro.model.networks import Inputs, InputShape
 from ddco_pyro.model.networks.conv import SHARPNESS, Conv
 from ddco_pyro.model.seeding import seeded
 from ddco_pyro.spec import ConvolutionLayer
-from ddco_pyro.training.checkpoint import copy_of
+from ddco_pyro.training.checkpoint import Progress, Restart, copy_of
 from ddco_pyro.training.optimizers import optimizer_state, restore_optimizer
 
 _FIRST = ConvolutionLayer(filters=16, kernel=5, stride=2, padding=2)
@@ -40,10 +39,14 @@ LEARNING_RATE = 3e-3
 
 
 class PictureNetwork(nn.Module):
-    """uint8 pictures [N, H, W, C] to features [N, F], by a network that reads them under a key."""
+    """uint8 pictures [N, H, W, C] to features [N, F], by a network that reads them under a key.
+
+    ``code`` are bytes that decide the features, beside the name of the encoder, its seed and the pictures.
+    """
 
     network: nn.Module
     key = "picture"
+    code = b""
 
     def forward(self, pictures: Tensor) -> Tensor:
         """Features of each picture by itself."""
@@ -108,7 +111,12 @@ def train(
     """
     model = Autoencoder(encoder, pictures.shape, seed)
     optimizer = torch.optim.Adam(model.parameters(), lr=LEARNING_RATE)
-    done = _restore(model, optimizer, checkpoint) if checkpoint.exists() else 0
+    done = 0
+    if checkpoint.exists():
+        before = Restart.read(checkpoint)
+        model.load_state_dict(before.states["model"])
+        restore_optimizer(optimizer, before.states["optimizer"])
+        done = before.progress.epoch
     on_event(TrainingBegan("the autoencoder", updates))
     errors: list[float] = []
     for batch in islice(_batches(pictures, seed, done), updates - done):
@@ -119,7 +127,8 @@ def train(
         errors.append(loss.item())
         done += 1
         if done % KEPT_EVERY == 0 or done == updates:
-            _keep(model, optimizer, done, checkpoint)
+            states = {"model": copy_of(model), "optimizer": optimizer_state(optimizer)}
+            Restart(Progress(0, epoch=done), states).written(checkpoint)
             on_event(UpdatesDone(done, float(np.mean(errors))))
             errors.clear()
     on_event(TrainingEnded("the autoencoder"))
@@ -134,21 +143,3 @@ def _batches(pictures: Pictures, seed: int, done: int) -> Iterator[Tensor]:
         frames = islice(pictures.at_random(seed, epoch), skip * size, None)
         yield from (torch.from_numpy(np.stack(list(islice(frames, size)))) for _ in range(skip, each))
         epoch, skip = epoch + 1, 0
-
-
-def _keep(model: Autoencoder, optimizer: torch.optim.Optimizer, done: int, path: Path) -> None:
-    tensors = {f"model/{name}": value for name, value in copy_of(model).items()}
-    tensors |= {f"optimizer/{name}": value for name, value in optimizer_state(optimizer).items()}
-    write_tensors(path, tensors, {"updates": str(done)})
-
-
-def _restore(model: Autoencoder, optimizer: torch.optim.Optimizer, path: Path) -> int:
-    """The gradient steps that are done."""
-    tensors, metadata = read_tensors(path, "remove it and do the same again: the autoencoder begins anew")
-    parts: dict[str, dict[str, Tensor]] = {"model": {}, "optimizer": {}}
-    for name, value in tensors.items():
-        part, _, rest = name.partition("/")
-        parts[part][rest] = value
-    model.load_state_dict(parts["model"])
-    restore_optimizer(optimizer, parts["optimizer"])
-    return int(metadata["updates"])

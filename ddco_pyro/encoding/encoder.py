@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -17,10 +16,10 @@ from torch import Tensor
 from ddco_pyro.data.files import Damaged, whole_folder
 from ddco_pyro.data.memory import refuse_too_much
 from ddco_pyro.data.tensors import read_tensors, write_tensors
-from ddco_pyro.encoding.autoencoder import BUILT_IN, Convolutions
+from ddco_pyro.encoding.autoencoder import BUILT_IN, Convolutions, PictureNetwork
 from ddco_pyro.encoding.fitted import FittedReader, Reader, from_folder
 from ddco_pyro.encoding.pictures import Pictures
-from ddco_pyro.encoding.user import imported, try_out
+from ddco_pyro.encoding.user import UserEncoder
 from ddco_pyro.errors import BadInput, nearest
 from ddco_pyro.spec.base import Count, Items, Model, Seed
 
@@ -49,28 +48,6 @@ class About(Model):
     """Share of the features' variance in the training demonstrations that is kept."""
 
 
-@dataclass(frozen=True)
-class Extractor:
-    """What gives the features of pictures, before they are reduced: uint8 [N, H, W, C] to [N, F].
-
-    :param network: the network whose weights are kept; None for a user's class, which is named alone.
-    :param code: bytes that decide the features, beside the name, the seed and the pictures.
-    """
-
-    encode: Callable[[np.ndarray], np.ndarray]
-    network: Convolutions | FittedReader | None = None
-    code: bytes = b""
-
-    @property
-    def reader(self) -> Reader | None:
-        """The network of a fit."""
-        return self.network.about if isinstance(self.network, FittedReader) else None
-
-    def weights(self) -> Mapping[str, Tensor]:
-        """The tensors that are kept."""
-        return {} if self.network is None else self.network.state_dict()
-
-
 def is_users(name: str, allow_code: bool) -> bool:
     """Whether an encoder is a user's class, and neither built in nor the folder of a fit.
 
@@ -88,40 +65,18 @@ def is_users(name: str, allow_code: bool) -> bool:
     return True
 
 
-def extractor(name: str, pictures: Pictures, seed: int, allow_code: bool) -> Extractor:
-    """The extractor of this name for these pictures; a user's is tried on the first of them.
+def extractor(name: str, pictures: Pictures, seed: int, allow_code: bool) -> PictureNetwork:
+    """What gives the features of these pictures before they are reduced; a user's is tried on the first of them.
 
     :raises BadInput: it cannot be had, or not for these pictures.
     """
     if is_users(name, allow_code):
-        users = _users(name)
-        try_out(name, users.encode, next(pictures.of(pictures.training[0])))
+        users = UserEncoder(name)
+        users.try_out(next(pictures.of(pictures.training[0])))
         return users
     if name in BUILT_IN:
-        return _of_network(Convolutions(name, pictures.shape, seed))
-    network = from_folder(name, pictures.key, pictures.shape, allow_code)
-    return _of_network(network, (Path(name) / "model.safetensors").read_bytes())  # the folder may change later
-
-
-def _again(about: About, allow_code: bool) -> Extractor:
-    """The extractor of an encoder that was written, before its weights are read."""
-    if about.reader is not None:
-        return _of_network(FittedReader(about.reader, about.picture))
-    if about.encoder in BUILT_IN:
-        return _of_network(Convolutions(about.encoder, about.picture, about.seed))
-    is_users(about.encoder, allow_code)
-    return _users(about.encoder)
-
-
-def _of_network(network: Convolutions | FittedReader, code: bytes = b"") -> Extractor:
-    return Extractor(network.encode, network, code)
-
-
-def _users(name: str) -> Extractor:
-    encode = imported(name)
-    module = sys.modules.get(name.partition(":")[0])
-    source = Path(module.__file__).read_bytes() if module is not None and module.__file__ else b""
-    return Extractor(encode, code=source)
+        return Convolutions(name, pictures.shape, seed)
+    return from_folder(name, pictures.key, pictures.shape, allow_code)
 
 
 @dataclass(frozen=True)
@@ -181,7 +136,7 @@ class Encoder:
     """A picture to a vector: call it with uint8 [H, W, C], and it gives float32 [size]."""
 
     about: About
-    extractor: Extractor
+    extractor: PictureNetwork
     projection: Projection | None
 
     def __call__(self, picture: np.ndarray) -> np.ndarray:
@@ -216,7 +171,7 @@ class Encoder:
         return sha256.hexdigest()
 
     def _tensors(self) -> dict[str, Tensor]:
-        tensors = {f"network/{key}": value for key, value in self.extractor.weights().items()}
+        tensors = {f"network/{key}": value for key, value in self.extractor.state_dict().items()}
         if self.projection is not None:
             tensors["mean"] = torch.from_numpy(self.projection.mean)
             tensors["components"] = torch.from_numpy(self.projection.components)
@@ -244,15 +199,19 @@ def load(folder: str | Path, allow_code: bool = False) -> Encoder:
     """
     folder = Path(folder)
     about = about_of(folder)
-    found = _again(about, allow_code)
+    if about.reader is not None:
+        found: PictureNetwork = FittedReader(about.reader, about.picture)
+    elif is_users(about.encoder, allow_code):
+        found = UserEncoder(about.encoder)
+    else:
+        found = Convolutions(about.encoder, about.picture, about.seed)
     tensors, _ = read_tensors(folder / TENSORS, AGAIN)
     projection = None
     if "components" in tensors:
         projection = Projection(tensors["mean"].numpy(), tensors["components"].numpy(), about.explained)
     weights = {key.removeprefix("network/"): value for key, value in tensors.items() if key.startswith("network/")}
     try:
-        if found.network is not None:
-            found.network.load_state_dict(weights)
+        found.load_state_dict(weights)
     except RuntimeError as error:
         raise Damaged(folder / TENSORS, " ".join(str(error).split()), AGAIN) from error
     return Encoder(about, found, projection)

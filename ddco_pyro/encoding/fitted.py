@@ -71,9 +71,11 @@ def from_folder(folder: str, key: str, picture: Sequence[int], allow_code: bool 
     :raises BadInput: there is no finished fit, or as :func:`from_fit`.
     """
     try:
-        return from_fit(load(Path(folder), allow_code), key, picture)
+        reader = from_fit(load(Path(folder), allow_code), key, picture)
     except ReaderError as error:
         raise BadInput(f"{folder}: {error}") from error
+    reader.code = (Path(folder) / "model.safetensors").read_bytes()  # the folder may change later
+    return reader
 
 
 def from_fit(fit: Fit, key: str, picture: Sequence[int]) -> FittedReader:

@@ -30,18 +30,18 @@ from ddco_pyro.data.sources.robomimic import (
     robomimic_file,
     write_recording,
 )
-from ddco_pyro.encoding.autoencoder import UPDATES, Convolutions, train
+from ddco_pyro.encoding.autoencoder import UPDATES, Convolutions, PictureNetwork, train
 from ddco_pyro.encoding.encoder import (
     NOISE,
     About,
     Encoder,
-    Extractor,
     Projection,
     about_of,
     extractor,
     is_users,
     principal_components,
 )
+from ddco_pyro.encoding.fitted import FittedReader
 from ddco_pyro.encoding.pictures import Pictures, batches
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
@@ -59,7 +59,7 @@ ROWS = 1024
 FEATURES, VERSIONS = "features", "versions"
 """Of the pictures, and of shifted pictures."""
 
-_CHECKPOINT = "autoencoder.safetensors"
+_CHECKPOINT = "checkpoint.safetensors"
 
 Blocks = Callable[[], Iterator[np.ndarray]]
 
@@ -180,10 +180,10 @@ class _Job:
         """Encode what is not encoded yet, and write the encoder and the file."""
         if self.beside.exists() and not parts.done:
             raise BadInput(f"{self.beside}: is there already; remove it, or choose another --out")
-        network, encoding, about = self.extractor.network, self.encoding, self.about
-        if encoding.encoder == "autoencoder" and isinstance(network, Convolutions):
+        encoding, about = self.encoding, self.about
+        if encoding.encoder == "autoencoder" and isinstance(self.extractor, Convolutions):
             checkpoint = parts.folder / _CHECKPOINT
-            train(network, self.pictures, encoding.seed, encoding.updates, checkpoint, self.on_event)
+            train(self.extractor, self.pictures, encoding.seed, encoding.updates, checkpoint, self.on_event)
         for name in self.source.names[len(parts.done) :]:
             blocks = {FEATURES: partial(self._features_of, name), VERSIONS: partial(self._versions_of, name)}
             parts.add(self._recording(name, {kind: (kind, blocks[kind]) for kind in encoding.keys}, about.features))
@@ -249,20 +249,21 @@ class _Job:
             return principal_components(rows, self.about.size, NOISE if self.encoding.size is None else 0.0)
 
 
-def _about(encoding: Encoding, pictures: Pictures, source: Extractor) -> About:
+def _about(encoding: Encoding, pictures: Pictures, source: PictureNetwork) -> About:
     """The facts of the encoder.
 
     :raises BadInput: there are fewer features, or training pictures, than the size that is asked for.
     """
     number = source.encode(next(pictures.of(pictures.training[0]))).shape[1]
-    size = encoding.size or (number if source.reader else min(number, SIZE, pictures.number))
+    reader = source.about if isinstance(source, FittedReader) else None
+    size = encoding.size or (number if reader else min(number, SIZE, pictures.number))
     if size > number:
         raise BadInput(f"--size {size}: encoder {encoding.encoder!r} gives {number} features; take at most as many")
     if size > pictures.number:
         raise BadInput(f"--size {size}: there are {pictures.number} training pictures; take at most as many")
     return About(
         encoder=encoding.encoder,
-        reader=source.reader,
+        reader=reader,
         observation=encoding.observation,
         picture=pictures.shape,
         features=number,
@@ -271,7 +272,7 @@ def _about(encoding: Encoding, pictures: Pictures, source: Extractor) -> About:
     )
 
 
-def _identity(path: Path, encoding: Encoding, source: Extractor) -> str:
+def _identity(path: Path, encoding: Encoding, source: PictureNetwork) -> str:
     """Everything that decides the contents of the file."""
     stat, code = path.stat(), hashlib.sha256(source.code).hexdigest()
     return json.dumps({"file": [str(path.resolve()), stat.st_size, stat.st_mtime_ns], "code": code} | asdict(encoding))
