@@ -19,7 +19,7 @@ def mean_interval(values: Sequence[float] | np.ndarray) -> tuple[float, float]:
     return mean - half, mean + half
 
 
-def t_quantile(freedom: int) -> float:
+def t_quantile(freedom: float) -> float:
     """Half the width of a :data:`CONFIDENCE` interval in standard errors, for so many degrees of freedom."""
     from scipy.special import stdtrit  # most commands draw no interval
 

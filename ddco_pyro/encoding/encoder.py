@@ -201,10 +201,11 @@ def load(folder: str | Path, allow_code: bool = False) -> Encoder:
     about = about_of(folder)
     if about.reader is not None:
         found: PictureNetwork = FittedReader(about.reader, about.picture)
-    elif is_users(about.encoder, allow_code):
-        found = UserEncoder(about.encoder)
-    else:
+    elif about.encoder in BUILT_IN:
         found = Convolutions(about.encoder, about.picture, about.seed)
+    else:
+        is_users(about.encoder, allow_code)
+        found = UserEncoder(about.encoder)
     tensors, _ = read_tensors(folder / TENSORS, AGAIN)
     projection = None
     if "components" in tensors:

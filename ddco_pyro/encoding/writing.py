@@ -61,7 +61,8 @@ FEATURES, VERSIONS = "features", "versions"
 
 _CHECKPOINT = "checkpoint.safetensors"
 
-Blocks = Callable[[], Iterator[np.ndarray]]
+Blocks = Callable[[str, str], Iterator[np.ndarray]]
+"""The blocks of a demonstration's :data:`FEATURES` or :data:`VERSIONS`."""
 
 
 @dataclass(frozen=True)
@@ -185,8 +186,7 @@ class _Job:
             checkpoint = parts.folder / _CHECKPOINT
             train(self.extractor, self.pictures, encoding.seed, encoding.updates, checkpoint, self.on_event)
         for name in self.source.names[len(parts.done) :]:
-            blocks = {FEATURES: partial(self._features_of, name), VERSIONS: partial(self._versions_of, name)}
-            parts.add(self._recording(name, {kind: (kind, blocks[kind]) for kind in encoding.keys}, about.features))
+            parts.add(self._recording(name, about.features, self._features, {kind: kind for kind in encoding.keys}))
             self.on_event(DemonstrationsDone(len(parts.done), len(self.source.names)))
         projection = self._projection(parts)
         if projection is not None:
@@ -197,45 +197,42 @@ class _Job:
         attributes = {**self.source.attributes, MADE: self.digest}
         with one_thread(), robomimic_file(self.out, attributes, self.source.masks) as data:
             for name in self.source.names:
-                reduced = {
-                    key: (kind, partial(map, encoder.reduced, self._unreduced(parts, name, kind)))
-                    for kind, key in encoding.keys.items()
-                }
-                encoded = self._recording(name, reduced, about.size)
+                encoded = self._recording(name, about.size, partial(self._reduced, encoder, parts), encoding.keys)
                 whole = self.source.recording(name)
                 others = {key: column for key, column in whole.observations.items() if key != self.pictures.key}
                 write_recording(data, replace(whole, observations=others | dict(encoded.observations)))
 
-    def _recording(self, name: str, blocks: Mapping[str, tuple[str, Blocks]], features: int) -> Recording:
-        """A demonstration with features [T, F], or [T, moved, F] of shifted pictures, by key."""
+    def _recording(self, name: str, features: int, of: Blocks, keys: Mapping[str, str]) -> Recording:
+        """A demonstration with features [T, F], or [T, moved, F] of shifted pictures, by key.
+
+        :param of: their blocks.
+        :param keys: by what they hold.
+        """
         actions = self.source.recording(name).actions
         moved = {FEATURES: (), VERSIONS: (self.encoding.moved,)}
         columns = {
-            key: Column((actions.shape[0], *moved[kind], features), np.dtype(np.float32), of)
-            for key, (kind, of) in blocks.items()
+            key: Column((actions.shape[0], *moved[kind], features), np.dtype(np.float32), partial(of, name, kind))
+            for kind, key in keys.items()
         }
         return Recording(name, columns, actions)
 
-    def _features_of(self, name: str) -> Iterator[np.ndarray]:
-        """Features of a demonstration's pictures, in blocks [M, F]."""
-        return map(partial(self._features, name), self.pictures.of(name))
-
-    def _versions_of(self, name: str) -> Iterator[np.ndarray]:
-        """Features of a demonstration's pictures shifted at random, in blocks [M, moved, F]."""
+    def _features(self, name: str, kind: str) -> Iterator[np.ndarray]:
+        """Features of a demonstration's pictures, blocks [M, F], or of pictures shifted at random, [M, moved, F]."""
         most = self.encoding.shift
         random = np.random.default_rng((self.encoding.seed, self.source.names.index(name)))
         moves = random.integers(-most, most + 1, (self.encoding.moved, 2)).tolist()
         for block in self.pictures.of(name):
-            yield np.stack([self._features(name, shifted(block, *by)) for by in moves], axis=1)
+            each = [block] if kind == FEATURES else [shifted(block, *by) for by in moves]
+            values = [self.extractor.encode(one).astype(np.float32) for one in each]
+            if numbers := {own.shape[1] for own in values} - {self.about.features}:
+                raise BadInput(
+                    f"encoder {self.about.encoder!r} gives {numbers.pop()} features in {name}, and "
+                    f"{self.about.features} in {self.pictures.training[0]}; it has to give as many of every picture"
+                )
+            yield values[0] if kind == FEATURES else np.stack(values, axis=1)
 
-    def _features(self, name: str, block: np.ndarray) -> np.ndarray:
-        values = self.extractor.encode(block)
-        if values.shape[1] != self.about.features:
-            raise BadInput(
-                f"encoder {self.about.encoder!r} gives {values.shape[1]} features in {name}, and "
-                f"{self.about.features} in {self.pictures.training[0]}; it has to give as many of every picture"
-            )
-        return values.astype(np.float32)
+    def _reduced(self, encoder: Encoder, parts: Parts, name: str, kind: str) -> Iterator[np.ndarray]:
+        return map(encoder.reduced, self._unreduced(parts, name, kind))
 
     def _unreduced(self, parts: Parts, name: str, kind: str = FEATURES) -> Iterator[np.ndarray]:
         with parts.column(name, f"obs/{kind}") as column:

@@ -15,14 +15,14 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ValidationError
 
 from ddco_pyro.errors import BadInput, nearest
 from ddco_pyro.evaluation.agreement import MATCHED, UNMATCHED
 from ddco_pyro.selection.grid import point_name
 from ddco_pyro.simulation.task import find_task
 from ddco_pyro.spec import Spec, SpecError, load_spec, parse_spec, user_code
-from ddco_pyro.spec.base import Count, Importable, Items, Model, Seed, TaskName, Text, invalid, lines
+from ddco_pyro.spec.base import Count, Importable, Items, Model, Problems, Seed, TaskName, Text, lines
 from ddco_pyro.spec.model import Baseline
 from ddco_pyro.spec.yaml import read_mapping
 
@@ -176,12 +176,9 @@ class Declaration(Model):
     kept: Items[KeptSpec] = ()
     """Tables of earlier results, the first of which decides where several have a value."""
 
-    @model_validator(mode="after")
-    def _consistent(self) -> Declaration:
-        checks = (self._blocks, self._data, self._measured, self._named, self._chosen)
-        if problems := [problem for check in checks for problem in check()]:
-            raise invalid(*problems)
-        return self
+    def problems(self) -> Problems:
+        """Blocks that overlap, what is missing, names that nothing has, and unequal tuning."""
+        return itertools.chain(self._blocks(), self._data(), self._measured(), self._named(), self._chosen())
 
     def ranges(self, key: str) -> dict[str, range]:
         """All numbers of the blocks of ``seeds``, ``demonstrations`` or ``starts``, by key path."""

@@ -13,7 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-LEVEL = 0.025
+from ddco_pyro.statistics import CONFIDENCE, mean_interval, rate, t_quantile
+
+LEVEL = (1 - CONFIDENCE) / 2
 """One-sided level of the tests, which corresponds to two-sided 95 % intervals."""
 
 
@@ -42,7 +44,7 @@ class Estimate:
         from scipy.stats import quantile_test
 
         middle = float(np.median(self.units))
-        ends = quantile_test(self.units, q=middle, p=0.5).confidence_interval(1 - 2 * LEVEL)
+        ends = quantile_test(self.units, q=middle, p=0.5).confidence_interval(CONFIDENCE)
         return middle, (float(ends.low), float(ends.high))
 
     def p_value(self, bound: float) -> float:
@@ -67,21 +69,18 @@ def estimate(values: pd.Series, trials: int = 0, lowest: float = -1.0) -> Estima
         all trials, a difference that of as many trials with different outcomes.
     :param lowest: the least possible value of a rate: 0, or -1 of a difference.
     """
-    from scipy.stats import binomtest, norm, ttest_1samp
-
     means = np.array([of_task.to_numpy().mean() for _, of_task in values.groupby(level=0, sort=False)])
     units = means if len(means) > 1 else values.to_numpy()
     value, error, interval = float(means.mean()), math.nan, (math.nan, math.nan)
     if len(units) > 1 and not np.allclose(units, units[0], rtol=1e-9, atol=1e-12):
-        low, high = ttest_1samp(units, 0.0).confidence_interval(1 - 2 * LEVEL)
-        error, interval = float(units.std(ddof=1) / math.sqrt(len(units))), (float(low), float(high))
+        error, interval = float(units.std(ddof=1) / math.sqrt(len(units))), mean_interval(units)
     elif len(units) > 1 and trials:
         number = trials * len(values)
         count = round(abs(value) * number)
-        ends = binomtest(count, number).proportion_ci(1 - 2 * LEVEL, "wilson")
-        low, high = sorted(math.copysign(end, value) for end in (ends.low, ends.high))
-        interval = (low, high) if count else (max(lowest, -ends.high), ends.high)
-        error = (interval[1] - interval[0]) / 2 / float(norm.isf(LEVEL))
+        low, high = rate(count, number)["interval"]
+        least, most = sorted((math.copysign(low, value), math.copysign(high, value)))
+        interval = (least, most) if count else (max(lowest, -high), high)
+        error = (interval[1] - interval[0]) / 2 / t_quantile(math.inf)
     return Estimate(value, error, interval, tuple(map(float, units)))
 
 
