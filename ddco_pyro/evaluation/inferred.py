@@ -152,8 +152,8 @@ class Inferred:
         """
         found = []
         draws = self.draws(row, DRAWS, (0, self.lengths[row]))
-        for lasting, path, options, ended in zip(lasts, self.segmented(row, lasts), *draws, strict=True):
-            every = boundaries(*path, options, started(options, ended, lasting))
+        for lasting, (path, starts), options, ended in zip(lasts, self.segmented(row, lasts), *draws, strict=True):
+            every = boundaries(path, starts, options, started(options, ended, lasting))
             found.append(np.array([(0, 0), *((each.low, each.high) for each in every)]))
         return found
 

@@ -489,20 +489,16 @@ def _torch(folder: Path, about: Mapping[str, Any]) -> Networks:
 
     program = torch.export.load(folder / "controller.pt2").module()
 
-    def evaluate(
-        features: np.ndarray, step: int, images: Mapping[str, np.ndarray], state: State
-    ) -> tuple[Outputs, State]:
-        inputs = (features, np.array([step], np.int64), *images.values(), *state)
+    def run(inputs: Mapping[str, np.ndarray]) -> State:
         threads = torch.get_num_threads()
         torch.set_num_threads(1)  # networks are small: more threads only wait for one another
         try:
             with torch.no_grad():
-                values = program(*map(torch.tensor, inputs))
+                return [tensor.numpy() for tensor in program(*map(torch.tensor, inputs.values()))]
         finally:
             torch.set_num_threads(threads)
-        return _divided(about["outputs"], [tensor.numpy() for tensor in values])
 
-    return evaluate
+    return _program(run, about)
 
 
 def _onnx(folder: Path, about: Mapping[str, Any]) -> Networks:
@@ -512,7 +508,12 @@ def _onnx(folder: Path, about: Mapping[str, Any]) -> Networks:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     session = onnxruntime.InferenceSession(str(folder / "controller.onnx"), options)
-    names = {argument.name for argument in session.get_inputs()}
+    names = [argument.name for argument in session.get_inputs()]  # without those that nothing reads
+    return _program(lambda inputs: session.run(None, {name: inputs[name] for name in names}), about)
+
+
+def _program(run: Callable[[Mapping[str, np.ndarray]], State], about: Mapping[str, Any]) -> Networks:
+    """Networks that give first their outputs, then the next state."""
 
     def evaluate(
         features: np.ndarray, step: int, images: Mapping[str, np.ndarray], state: State
@@ -520,15 +521,10 @@ def _onnx(folder: Path, about: Mapping[str, Any]) -> Networks:
         inputs = {"features": features, "step": np.array([step], np.int64)}
         inputs |= {f"image_{number}": image for number, image in enumerate(images.values())}
         inputs |= {f"state_{number}": array for number, array in enumerate(state)}
-        values = session.run(None, {name: array for name, array in inputs.items() if name in names})
-        return _divided(about["outputs"], values)
+        values, names = run(inputs), about["outputs"]
+        return dict(zip(names, values, strict=False)), list(values[len(names) :])
 
     return evaluate
-
-
-def _divided(names: list[str], values: list[np.ndarray]) -> tuple[Outputs, State]:
-    """A program's values: first its outputs, then the next state."""
-    return dict(zip(names, values, strict=False)), list(values[len(names) :])
 
 
 FORMS: dict[str, Callable[[Path, Mapping[str, Any]], Networks]] = {"numpy": _numpy, "torch": _torch, "onnx": _onnx}
