@@ -165,7 +165,7 @@ class PictureCell(Cell):
     def _reader(self, settings: Settings) -> FittedReader:
         """The convolutions of the flat policy of the same demonstrations, which is fitted as its own cell has it."""
         flat, plain = PictureCell("ff_flat", 0, self.count, self.seed), replace(settings, overrides=())
-        spec, trained = flat.fitted(plain, flat.demonstrations(plain), work_of(flat.path(plain)))
+        spec, trained = flat.fitted(plain, flat.demonstrations(plain), work_of(flat.path(plain)) / "fit")
         return from_fit(Fit(spec, trained.hierarchy), "camera", (*SIZE, 3))
 
 

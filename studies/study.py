@@ -75,7 +75,9 @@ class Cell(ABC):
     def do(self, settings: Settings) -> str:
         """Do it, unless it is done; returns why it failed."""
         return cells.do(
-            self.path(settings), self.depends(settings), lambda folder: {"values": self.results(settings, folder)}
+            self.path(settings),
+            self.depends(settings),
+            lambda folder: {"values": self.results(settings, folder / "fit")},
         )
 
     def kept(self, settings: Settings) -> dict[str, Any] | None:
