@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
-from functools import cache
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,6 +28,7 @@ from ddco_pyro.study.table import earlier, read_tidy, values
 FILES = ("table.csv", "page.md", "page.html", "contrasts.png", "methods.png")
 """The files of a study's report."""
 
+BLANK = "\n\n"
 NOT_TESTED = "not tested"
 DECIDED = ("holds", "does not hold")
 
@@ -260,7 +260,7 @@ _SHOWN: dict[str, Callable[[Estimate, str], str]] = {
 }
 """How a quotation shows an estimate."""
 
-_QUOTED = re.compile(r"<!-- (study|table) ([\w-]+): (.*?) -->.*?<!-- / -->", re.DOTALL)
+_QUOTED = re.compile(r"<!-- ((?:study|table) [\w-]+): (.*?) -->.*?<!-- / -->", re.DOTALL)
 _SETTING = re.compile(r"(study|task|without|seed|form|show|times|by)=(.*)", re.DOTALL)
 
 
@@ -271,83 +271,98 @@ def render(text: str, studies: Path, tables: Path = Path()) -> str:
     :param tables: the folder of ``NAME.csv``, which has the numbers of ``table NAME``.
     :raises BadInput: a quotation is wrong, or there is no such value.
     """
-    families: dict[Any, dict[Any, Estimate]] = defaultdict(dict)
-    judged: dict[Any, str] = {}
+    page = _Quoting({"study": studies, "table": tables})
+    _QUOTED.sub(page.quoted, text)  # finds the families
+    for family in page.families.values():
+        judged = verdicts([(known, 0.0) for known in family.values()])
+        page.verdicts |= {number: verdict for number, (verdict, _) in zip(family, judged, strict=True)}
+    return _QUOTED.sub(page.quoted, text)
 
-    @cache
-    def source(kind: str, name: str) -> tuple[Study | None, pd.DataFrame]:
-        if kind == "table":
-            return None, read_tidy(tables / f"{name}.csv")
-        study = Study.load(studies / f"{name}.yaml", allow_code=True)  # nothing of a study is imported for its numbers
-        for one in tested(study, found := earlier(study)):
-            key = " - ".join(one.spec.pair), one.spec.measure, (str(one.demonstrations),), None
-            judged[kind, name, (), key] = one.verdict
-        return study, found
 
-    @cache
-    def known(kind: str, name: str, rows: tuple[tuple[str, str], ...], key: Any, times: float) -> Estimate | None:
-        study, table = source(kind, name)
-        for column, value in rows:
-            first, _, last = value.partition("-")
-            several = first.isdecimal() and last.isdecimal() and column == "seed"
-            taken = [*map(str, range(int(first), int(last) + 1))] if several else [value]
-            table = table[table.task != value] if column == "without" else table[table[column].isin(taken)]
-        what, measure, count, task = key
-        return _estimate(study, table, what, measure, count, task, times)
+@dataclass
+class _Quoting:
+    """The tables that a page quotes, the families of their differences, and the verdicts on numbers.
 
-    def quoted(match: re.Match[str]) -> str:
-        kind, name, asked = match.groups()
-        study, table = source(kind, name)
+    The verdicts of ``study NAME`` are those on its primary contrasts, and it has no families.
+
+    :param folders: by kind of quotation.
+    """
+
+    folders: dict[str, Path]
+    tables: dict[str, tuple[Study | None, pd.DataFrame]] = field(default_factory=dict)
+    families: dict[Any, dict[Any, Estimate]] = field(default_factory=lambda: defaultdict(dict))
+    verdicts: dict[Any, str] = field(default_factory=dict)
+
+    def _table(self, source: str) -> tuple[Study | None, pd.DataFrame]:
+        """The study of ``study NAME``, and its rows by the names of the declaration; the rows of ``table NAME``."""
+        if source not in self.tables:
+            kind, name = source.split()
+            if kind == "table":
+                self.tables[source] = None, read_tidy(self.folders[kind] / f"{name}.csv")
+            else:  # nothing of a study is imported for its numbers
+                study = Study.load(self.folders[kind] / f"{name}.yaml", allow_code=True)
+                self.tables[source] = study, earlier(study)
+                for one in tested(study, self.tables[source][1]):
+                    key = " - ".join(one.spec.pair), one.spec.measure, (str(one.demonstrations),), None
+                    self.verdicts[source, (), key] = one.verdict
+        return self.tables[source]
+
+    def quoted(self, match: re.Match[str]) -> str:
+        """A quotation with its numbers.
+
+        :raises BadInput: it is wrong, or there is no such number.
+        """
+        source, asked = match.groups()
         fields = [part.strip() for part in asked.split(";")]
         settings = {found[1]: found[2] for part in fields if (found := _SETTING.fullmatch(part))}
         plain = [part.split(" | ") for part in fields if not _SETTING.fullmatch(part)]
-        methods, measures, numbers = (*plain, [""])[:3] if len(plain) in (2, 3) else ([], [], [])
-        counts = [tuple(one.split(" - ")) for one in numbers]
-        try:
-            times, _ = float(settings.get("times", 1)), format(0.0, settings.get("form", ""))
-        except ValueError:
-            methods = []
+        counts = [tuple(one.split(" - ")) for one in plain[2]] if len(plain) == 3 else [("",)]
         decimal = len(plain) == 2 or all(number.isdecimal() for count in counts for number in count)
-        if not methods or not decimal or settings.get("show", "mean") not in (*_SHOWN, "verdict"):
+        try:
+            _ = float(settings.get("times", 1)), format(0.0, settings.get("form", ""))
+        except ValueError:
+            decimal = False
+        if len(plain) not in (2, 3) or not decimal or settings.get("show", "mean") not in (*_SHOWN, "verdict"):
             raise BadInput(
-                f"{kind} {name}: {asked!r}: write a method or contrast, a measure and a number of demonstrations, "
-                f"such as: options - flat; success; 50. After show= stands one of: {', '.join((*_SHOWN, 'verdict'))}; "
-                "form= is Python's"
+                f"{source}: {asked!r}: write a method or contrast, a measure and a number of demonstrations, such as: "
+                f"options - flat; success; 50. After show= stands one of: {', '.join((*_SHOWN, 'verdict'))}; form= is "
+                "Python's"
             )
-        rows = tuple((column, settings[column]) for column in ("study", "without", "seed") if column in settings)
-        single, by_task = len(methods) * len(measures) * len(counts) == 1, settings.get("by") == "task"
-
-        def cell(key: Any) -> str:
-            what, measure, _, _ = key
-            difference, number = " - " in what, (kind, name, rows, key)
-            if (found := known(*number, times)) is None:
-                return ""
-            show = settings.get("show") or ("interval" if single or difference else "mean")
-            if difference and show in ("interval", "±", "verdict") and study is None:
-                families[kind, name, rows, measure.partition(",")[0]][number] = found
-            verdict = judged.get(number, NOT_TESTED)
-            if show == "verdict":
-                return verdict
-            form = settings.get("form") or (".0%" if measure.startswith("success") else ".2f")
-            form = f"+{form}" if difference and not (single and "form" in settings) else form
-            text = _SHOWN[show](found, form).replace("-", "−")
-            return f"**{text}**" if show in ("interval", "±") and verdict in DECIDED else text
-
-        tasks: Iterable[str | None] = sorted({*table.task}) if by_task else [settings.get("task")]
-        lines = []
-        for task, count, measure in product(tasks, counts, measures):
-            if any(cells := [cell((what, measure, count, task)) for what in methods]):
+        alone, by_task, rows = max(map(len, (*plain, counts))) == 1, settings.get("by") == "task", []
+        tasks: list[Any] = sorted({*self._table(source)[1].task}) if by_task else [settings.get("task")]
+        for task, count, measure in product(tasks, counts, plain[1]):
+            cells = [self._number(source, (what, measure, count, task), settings, alone) for what in plain[0]]
+            if any(cells):
                 facts = [str(task), " − ".join(count), name_of(measure)]
-                lines.append([*facts[not by_task :], *(text or "–" for text in cells)])
-        if not lines:
-            raise BadInput(f"{kind} {name}: its tables have no {asked!r}; check its names")
-        head = ["task", "demonstrations", "measure", *(what.replace(" - ", " − ") for what in methods)]
-        written = Table(head[not by_task :], lines, {0, 2} if by_task else {1}).markdown()
-        shown = lines[0][-1] if single else f"\n\n{written}\n\n"
-        return f"<!-- {kind} {name}: {asked} -->{shown}<!-- / -->"
+                rows.append([*facts[not by_task :], *(text or "–" for text in cells)])
+        if not rows:
+            raise BadInput(f"{source}: its tables have no {asked!r}; check its names")
+        head = ["task", "demonstrations", "measure", *(what.replace(" - ", " − ") for what in plain[0])]
+        whole = Table(head[not by_task :], rows, {0, 2} if by_task else {1}).markdown()
+        return f"<!-- {source}: {asked} -->{rows[0][-1] if alone else f'{BLANK}{whole}{BLANK}'}<!-- / -->"
 
-    _QUOTED.sub(quoted, text)  # finds the families
-    for family in families.values():
-        verdict_of = verdicts([(one, 0.0) for one in family.values()])
-        judged |= {number: verdict for number, (verdict, _) in zip(family, verdict_of, strict=True)}
-    return _QUOTED.sub(quoted, text)
+    def _number(self, source: str, key: Any, settings: Mapping[str, str], alone: bool) -> str:
+        """A number as it is shown; empty where there is none.
+
+        :param key: method or contrast, measure, numbers of demonstrations, and task.
+        """
+        (study, table), (what, measure, _, _) = self._table(source), key
+        taken = tuple((column, settings[column]) for column in ("study", "without", "seed") if column in settings)
+        for column, value in taken:
+            first, _, last = value.partition("-")
+            several = column == "seed" and first.isdecimal() and last.isdecimal()
+            values_taken = [*map(str, range(int(first), int(last) + 1))] if several else [value]
+            table = table[table.task != value] if column == "without" else table[table[column].isin(values_taken)]
+        known = _estimate(study, table, *key, times=float(settings.get("times", 1)))
+        if known is None:
+            return ""
+        difference, verdict = " - " in what, self.verdicts.get((source, taken, key), NOT_TESTED)
+        show = settings.get("show") or ("interval" if alone or difference else "mean")
+        if show in ("interval", "±", "verdict") and difference and study is None:
+            self.families[source, taken, measure.partition(",")[0]][source, taken, key] = known
+        if show == "verdict":
+            return verdict
+        form = settings.get("form") or (".0%" if measure.startswith("success") else ".2f")
+        form = f"+{form}" if difference and not (alone and "form" in settings) else form
+        text = _SHOWN[show](known, form).replace("-", "−")
+        return f"**{text}**" if show in ("interval", "±") and verdict in DECIDED else text
