@@ -8,22 +8,32 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import subprocess
+import sys
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import arena_venv
 import h5py
 import numpy as np
 
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.data.files import only_one
+from ddco_pyro.data.files import only_one, write_text
+from ddco_pyro.errors import BadInput, Failed
 from ddco_pyro.exporting import write_numpy
 from ddco_pyro.fitting.fitted import Fit
 
 HERE = Path(__file__).parent
+INSTALLED = ".made"
+"""In the environment: the pins that it was made from, once all of them are installed."""
+
+BAD_INPUT = 2
+"""The exit status of a script that cannot use what it was given."""
+
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 HELD_OUT = 20
 """The first demonstrations of a file are held out, whatever the others are used for."""
 
@@ -46,7 +56,7 @@ class Apart:
 
         :raises Failed: it cannot be made.
         """
-        return arena_venv.made(self.runs / "venv", HERE / self.pins)
+        return environment(self.runs / "venv", HERE / self.pins)
 
     def collected(self, task: str, **options: float) -> Path:
         """The task's demonstrations, recorded where they are not there, or were by other code or options.
@@ -64,7 +74,7 @@ class Apart:
 
     def collect(self, task: str, path: Path, **options: float) -> None:
         """Record demonstrations of a task into a file, with options as :meth:`collected`."""
-        arena_venv.run(self.made(), HERE / self.script, "collect", task, path, *_words(options))
+        run(self.made(), HERE / self.script, "collect", task, path, *_words(options))
 
     def played(self, task: str, methods: dict[str, Fit], chunk: int = 1, **options: Any) -> dict[str, Any]:
         """What the script's command ``play`` writes about exported methods.
@@ -77,7 +87,7 @@ class Apart:
                 write_numpy(one, Path(folder) / name)
                 (Path(folder) / name / "chunk.json").write_text(json.dumps(chunk))
             out, named = Path(folder) / "played.json", [f"{name}={folder}/{name}" for name in methods]
-            arena_venv.run(self.made(), HERE / self.script, "play", task, out, *named, *_words(options))
+            run(self.made(), HERE / self.script, "play", task, out, *named, *_words(options))
             return dict(json.loads(out.read_text()))
 
     def play(self, task: str, methods: dict[str, Fit], source: Path, episodes: int) -> dict[str, Any]:
@@ -112,3 +122,44 @@ def acted(one: Fit, observations: dict[str, np.ndarray]) -> np.ndarray:
     controller.reset(0)
     rows = (dict(zip(observations, row, strict=True)) for row in zip(*observations.values(), strict=True))
     return np.stack([controller.act(row) for row in rows])
+
+
+def environment(folder: Path, pins: Path, python: str = sys.executable) -> Path:
+    """The Python of the environment in ``folder``, which is made where it is not there, or of other pins.
+
+    :raises Failed: it cannot be made; one line.
+    """
+    marker, wanted = folder / INSTALLED, pins.read_text(encoding="utf-8")
+    with only_one(folder, wait=True):
+        if not marker.exists() or marker.read_text(encoding="utf-8") != wanted:
+            pip = [str(_python(folder)), "-m", "pip", "install", "-q", "--no-compile", "--no-deps", "-r", str(pins)]
+            for command in ([python, "-m", "venv", "--clear", str(folder)], pip):
+                _run(command, f"{folder}: an environment with {pins.name} cannot be made")
+            write_text(marker, wanted)
+    return _python(folder)
+
+
+def run(python: Path, script: Path, *arguments: str | Path) -> None:
+    """Run a script on one thread.
+
+    :raises BadInput: it says that what it was given cannot be used; its last line.
+    :raises Failed: it ended with another error; its last line.
+    """
+    command = [str(python), "-W", "ignore", str(script), *map(str, arguments)]
+    _run(command, f"{script.name} {arguments[0]} {arguments[1]}", ONE_THREAD)
+
+
+def _python(folder: Path) -> Path:
+    return folder / "bin" / "python"
+
+
+def _run(command: list[str], what: str, environment: dict[str, str] | None = None) -> None:
+    try:
+        ended = subprocess.run(
+            command, capture_output=True, text=True, check=False, env=os.environ | (environment or {})
+        )
+    except OSError as error:
+        raise Failed(f"{what}: {command[0]}: {error.strerror}") from error
+    if ended.returncode:
+        said = (ended.stderr.strip() or ended.stdout.strip() or f"exit status {ended.returncode}").splitlines()
+        raise (BadInput if ended.returncode == BAD_INPUT else Failed)(f"{what}: {said[-1].strip()}")

@@ -23,7 +23,6 @@ import h5py
 import numpy as np
 import study
 from apart import HELD_OUT, Apart, expert
-from arena_segments import scored
 from study import Cell, Settings, described
 from table import Row
 
@@ -32,9 +31,13 @@ from ddco_pyro.data.files import write_text
 from ddco_pyro.data.inspection import inspect
 from ddco_pyro.data.starting import starting_spec
 from ddco_pyro.errors import BadInput
+from ddco_pyro.evaluation.agreement import agreement
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.fitted import Fit
+from ddco_pyro.metrics import Scores
+from ddco_pyro.segmenting.baselines import BASELINES, segment
 from ddco_pyro.spec import load_spec
+from ddco_pyro.training.data import parts
 
 TASKS = tuple(
     f"{name}-v3"
@@ -45,6 +48,8 @@ TASKS = tuple(
 )  # fmt: skip
 OURS = "ddco"
 LABELS = "phase"
+MEASURES = ("nmi", "ari", "accuracy", "iou", "f1_10", "f1_25", "f1_50", "edit", "boundary_f1_1", "boundary_f1_3",
+            "boundary_f1_5")  # fmt: skip
 
 DEFAULTS = Settings({"demonstrations": 70, "noise": 0.1, "episodes": 50}, Path("runs/arena"))
 """Recorded for each task, with those that are held out; the standard deviation of what is added to the expert's
@@ -172,6 +177,24 @@ def main() -> None:
     parser.add_argument("--counts", type=int, nargs="+", default=[5, 10, 20, 50])
     parser.add_argument("--seeds", type=int, default=5)
     study.main("arena", parser, DEFAULTS, cells, lambda settings: sawyer(settings).made())
+
+
+def scored(fitted: Fit, labels: str) -> dict[str, dict[str, float]]:
+    """Measures on held-out demonstrations of the lowest level's options and of every baseline with as many kinds."""
+    train, valid = parts(fitted.spec, fitted.demonstrations).values()
+    hierarchy, truth = fitted.spec.hierarchy, [demo.labels[labels] for demo in valid]
+    assert hierarchy is not None  # it is what init writes
+    count, observations = hierarchy.levels[0].count, fitted.spec.observations
+    segments = {OURS: fitted.segment(valid)[0]}
+    segments |= {name: segment(name, train, valid, count, fitted.spec.seed, observations) for name in BASELINES}
+    return {name: flat(agreement(own, truth)) for name, own in segments.items()}
+
+
+def flat(measures: Scores | None) -> dict[str, float]:
+    """Each measure as a number, options matched globally where they are."""
+    assert measures is not None  # every step of the arena has a phase
+    both = dict(measures) | dict(measures.matched_globally)
+    return {name: float(both[name]) for name in MEASURES}
 
 
 if __name__ == "__main__":

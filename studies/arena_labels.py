@@ -19,8 +19,7 @@ from typing import Any
 import h5py
 import numpy as np
 import study
-from arena import LABELS, TASKS, ArenaCell, fitted_cell, recorded, sawyer
-from arena_segments import flat
+from arena import LABELS, TASKS, ArenaCell, fitted_cell, flat, recorded, sawyer
 from study import Cell, Settings, described
 from table import Row
 

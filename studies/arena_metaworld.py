@@ -1,4 +1,4 @@
-"""What is done with Meta-World itself, by the Python of an environment of its own (``arena_venv.py``).
+"""What is done with Meta-World itself, by the Python of an environment of its own (``apart.py``).
 
     python arena_metaworld.py collect TASK OUT.hdf5 [--number 70] [--held-out 20] [--noise 0.1]
     python arena_metaworld.py play TASK OUT.json NAME=EXPORTED... [--episodes 50] [--recorded DEMONSTRATIONS.hdf5]

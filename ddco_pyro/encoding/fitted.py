@@ -24,10 +24,6 @@ Part = tuple[NetworkSpec, Network, Sequence[str]]
 """A network of a fit: its spec, the network, and the names of the observations that it reads."""
 
 
-class ReaderError(BadInput):
-    """A fit has no network that could encode these pictures."""
-
-
 class Reader(Model):
     """A network that reads one observation's pictures, beside its weights."""
 
@@ -70,10 +66,7 @@ def from_folder(folder: str, key: str, picture: Sequence[int], allow_code: bool 
 
     :raises BadInput: there is no finished fit, or as :func:`from_fit`.
     """
-    try:
-        reader = from_fit(load(Path(folder), allow_code), key, picture)
-    except ReaderError as error:
-        raise BadInput(f"{folder}: {error}") from error
+    reader = from_fit(load(Path(folder), allow_code), key, picture)
     reader.code = (Path(folder) / "model.safetensors").read_bytes()  # the folder may change later
     return reader
 
@@ -85,16 +78,16 @@ def from_fit(fit: Fit, key: str, picture: Sequence[int]) -> FittedReader:
     options have to share them.
 
     :param picture: [H, W, C] of the pictures that are to be encoded.
-    :raises ReaderError: the fit observed other pictures, or stacks of several, or has no such network.
+    :raises BadInput: the fit observed other pictures, or stacks of several, or has no such network.
     """
     transform = _transform(fit, key, picture)
     found = next(_readers(_lowest(fit), key), None)
     if found is None:
-        raise ReaderError(f"its lowest policy has no convolutions that read {key} alone; make them a branch")
+        raise BadInput(f"{fit.place}: its lowest policy has no convolutions that read {key} alone; make them a branch")
     spec, network, _ = found
     if network.copies != 1:
-        raise ReaderError(
-            f"each option has a network of its own for {key}; take a flat policy, or one with shared: true"
+        raise BadInput(
+            f"{fit.place}: each option has a network of its own for {key}; take a flat policy, or one with shared: true"
         )
     about = Reader(
         network=spec.model_copy(update={"inputs": (key,), "shared": False}),
@@ -112,12 +105,12 @@ def _transform(fit: Fit, key: str, picture: Sequence[int]) -> Transform:
     encoder = fit.hierarchy.encoder
     if key not in encoder.transforms:
         there = ", ".join(encoder.transforms) or "none"
-        raise ReaderError(f"this fit observes no pictures {key!r}; the pictures it observes: {there}")
+        raise BadInput(f"{fit.place}: this fit observes no pictures {key!r}; the pictures it observes: {there}")
     if encoder.shapes[key] != tuple(picture):
-        raise ReaderError(f"this fit observed {key} of {encoder.shapes[key]}, and these are {tuple(picture)}")
+        raise BadInput(f"{fit.place}: this fit observed {key} of {encoder.shapes[key]}, and these are {tuple(picture)}")
     transform = encoder.transforms[key]
     if transform.frames > 1:
-        raise ReaderError(f"this fit sees {transform.frames} pictures at once; take one with frames: 1")
+        raise BadInput(f"{fit.place}: this fit sees {transform.frames} pictures at once; take one with frames: 1")
     return transform
 
 

@@ -346,14 +346,14 @@ class _Quoting:
 
         :param key: method or contrast, measure, numbers of demonstrations, and task.
         """
-        (study, table), (what, measure, _, _) = self._table(source), key
+        (study, table), (what, measure, count, task) = self._table(source), key
         taken = tuple((column, settings[column]) for column in ("study", "without", "seed") if column in settings)
         for column, value in taken:
             first, _, last = value.partition("-")
             several = column == "seed" and first.isdecimal() and last.isdecimal()
             values_taken = [*map(str, range(int(first), int(last) + 1))] if several else [value]
             table = table[table.task != value] if column == "without" else table[table[column].isin(values_taken)]
-        known = _estimate(study, table, *key, times=float(settings.get("times", 1)))
+        known = _estimate(study, table, what, measure, count, task, float(settings.get("times", 1)))
         if known is None:
             return ""
         difference, verdict = " - " in what, self.verdicts.get((source, taken, key), NOT_TESTED)
