@@ -23,8 +23,7 @@ import h5py
 import numpy as np
 import study
 from apart import HELD_OUT, Apart, expert
-from study import Cell, Settings, described
-from table import Row
+from study import Cell, Row, Settings, described
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text

@@ -20,8 +20,7 @@ import h5py
 import numpy as np
 import study
 from arena import LABELS, TASKS, ArenaCell, fitted_cell, flat, recorded, sawyer
-from study import Cell, Settings, described
-from table import Row
+from study import Cell, Row, Settings, described
 
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.agreement import agreement

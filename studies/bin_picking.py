@@ -19,8 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import study
-from study import Cell, Settings, described
-from table import Row
+from study import Cell, Row, Settings, described
 
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.fitted import Fit

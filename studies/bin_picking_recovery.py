@@ -22,8 +22,7 @@ from ddco_tasks.bin_picking import task
 from ddco_tasks.bin_picking.geometry import SHOWING
 from ddco_tasks.bin_picking.trials import Attempt
 from joblib import Parallel, delayed
-from study import described, printed
-from table import RESULTS, Row, add, shown
+from study import RESULTS, Row, add, described, printed, shown
 
 from ddco_pyro.fitting.fitted import Fit, load
 from ddco_pyro.simulation.episodes import run_episode

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pandas as pd
 from matplotlib.axes import Axes
-from table import RESULTS, ROOT
+from study import RESULTS, ROOT
 
 from ddco_pyro.drawing.figures import FAINT, blank, save, style
 from ddco_pyro.study.declaration import Study

@@ -24,8 +24,7 @@ from typing import Any
 import numpy as np
 import study
 from ddco_tasks.pushing import environment as pushing
-from study import Cell, Settings, described
-from table import Row
+from study import Cell, Row, Settings, described
 
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.demonstrations import Demonstrations

@@ -28,8 +28,7 @@ import numpy as np
 import study
 from ddco_tasks.pushing import environment as pushing
 from pushing import EVALUATION, HELD_OUT, HELD_OUT_SEED, LABELS, POOL, TRAINING, per_step, summary
-from study import Cell, Settings, described
-from table import Row
+from study import Cell, Row, Settings, described
 
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations

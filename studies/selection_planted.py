@@ -13,8 +13,7 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
-from study import described
-from table import RESULTS, Row, add
+from study import RESULTS, Row, add, described
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.fitting.run import claim

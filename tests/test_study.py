@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 import study
-from study import Cell, Settings, described
-from table import RESULTS, Row, add
+from study import RESULTS, Cell, Row, Settings, add, described
 
 from ddco_pyro.data.files import only_one
 from ddco_pyro.study.table import COLUMNS, read_tidy
