@@ -49,7 +49,7 @@ def test_the_units_of_several_tasks_are_their_means():
         stats.ttest_1samp([0.5, 2, 4], 1.0, alternative="greater"),
     )
     assert found.p_value(1.0) == pytest.approx(test.pvalue)
-    assert (found.value, len(found.units), found.range) == (pytest.approx(6.5 / 3), 3, (0.5, 4))
+    assert (found.value, found.units) == (pytest.approx(6.5 / 3), (0.5, 2, 4))
 
 
 def test_pairs_need_both_values():

@@ -289,23 +289,24 @@ class Folder:
     def depends(self, cell: Cell) -> dict[str, Any]:
         """What the results of a cell depend on: ``given`` without defaults, and ``spec`` with them."""
         declared, method = self.study.declared, self.study.declared.methods[cell.of]
-        baseline = method.baseline.model_dump(exclude_unset=True, mode="json") if method.baseline else None
-        facts: dict[str, Any] = {
-            "baseline": baseline,
+        baseline, changes, starts = method.baseline, self.study.changes(cell.of, dict(cell.point)), self._starts(cell)
+        given, whole = changes, dict[str, Any]()
+        if self.study.base is not None:
+            spec = with_overrides(self.study.base, {**changes, **self._placed(cell, "demonstrations.hdf5")})
+            baseline = baseline and named_baselines(spec).get(baseline.name, baseline)
+            shown = {"report", "selection", "compare_with"}  # what a result does not depend on
+            given, whole = (
+                spec.model_dump(mode="json", exclude=shown, exclude_defaults=bare) for bare in (True, False)
+            )
+        facts = {
+            "baseline": baseline and baseline.model_dump(exclude_unset=True, mode="json"),
             "by": method.by,
             "world": declared.world,
             "data": self._drawn(cell),
+            "seed": cell.seed,
+            "starts": [*starts[:1], len(starts)],
         }
-        facts |= {"seed": cell.seed, "starts": [*self._starts(cell)[:1], len(self._starts(cell))]}
-        changes = self.study.changes(cell.of, dict(cell.point))
-        if self.study.base is None:
-            return _as_json({**facts, "given": changes, "spec": {}})
-        spec = with_overrides(self.study.base, {**changes, **self._placed(cell, "demonstrations.hdf5")})
-        shown = {"report", "selection", "compare_with"}  # what a result does not depend on
-        if method.baseline is not None and (own := named_baselines(spec).get(method.baseline.name)):
-            facts["baseline"] = own.model_dump(exclude_unset=True, mode="json")
-        whole = [spec.model_dump(mode="json", exclude=shown, exclude_defaults=bare) for bare in (True, False)]
-        return _as_json({**facts, "given": whole[0], "spec": whole[1]})
+        return _as_json({**facts, "given": given, "spec": whole})
 
     def _starts(self, cell: Cell) -> range:
         starts = self.study.declared.starts

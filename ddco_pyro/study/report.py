@@ -29,6 +29,7 @@ FILES = ("table.csv", "page.md", "page.html", "contrasts.png", "methods.png")
 """The files of a study's report."""
 
 BLANK = "\n\n"
+POINTS = "Grey points: single tasks, or seeds where there is one task."
 NOT_TESTED = "not tested"
 DECIDED = ("holds", "does not hold")
 
@@ -135,10 +136,7 @@ def _contrasts(contrasts: Sequence[Tested], to: Path) -> list[Block]:
         "speaks of further tasks. Rare failures and outliers make t intervals too short: they may cover 75 %. The "
         "median's interval is exact, and needs six units."
     )
-    caption = (
-        "Mean difference and 95 % t interval. Grey points: single tasks, or seeds where there is one task. Hollow: the "
-        "bound that the difference has to exceed."
-    )
+    caption = f"Mean difference and 95 % t interval. {POINTS} Hollow: the bound that the difference has to exceed."
     drawn = [one for one in contrasts if one.estimate]
     panels = {
         name_of(measure): [
@@ -161,7 +159,7 @@ def _methods(study: Study, table: pd.DataFrame, to: Path) -> list[Block]:
     cells = iter([shown(one) if one else "–" for own in zip(*known.values(), strict=True) for one in own])
     named = [[str(count), label, *(next(cells) for _ in measures)] for count, label in rows]
     panels = {name_of(measure): [*map(_drawn, own)] for measure, own in known.items()}
-    caption = "Means with 95 % t intervals, over tasks where there are several, else over training seeds."
+    caption = f"Means with 95 % t intervals, over tasks where there are several, else over training seeds. {POINTS}"
     picture = _plotted(
         [f"{label}, {count}" for count, label in rows], panels, to / "methods.png",
         f"{', '.join(measures)} of {', '.join(labels)}", caption,
@@ -254,7 +252,7 @@ _SHOWN: dict[str, Callable[[Estimate, str], str]] = {
     "sd": lambda known, form: _with(known, known.error * math.sqrt(len(known.units)), form),
     "se": lambda known, form: _with(known, known.error, form),
     "median": lambda known, form: _between(*known.median, form),
-    "range": lambda known, form: " to ".join(format(end, form) for end in known.range),
+    "range": lambda known, form: f"{min(known.units):{form}} to {max(known.units):{form}}",
     "units": lambda known, form: str(len(known.units)),
     "above": lambda known, form: f"{sum(unit > 0 for unit in known.units)} of {len(known.units)}",
 }

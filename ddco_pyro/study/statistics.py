@@ -34,11 +34,6 @@ class Estimate:
     units: tuple[float, ...]
 
     @property
-    def range(self) -> tuple[float, float]:
-        """The least and the greatest unit."""
-        return min(self.units), max(self.units)
-
-    @property
     def median(self) -> tuple[float, tuple[float, float]]:
         """The median unit and its exact interval of at least 95 %, whatever the distribution; NaN below six units."""
         from scipy.stats import quantile_test
