@@ -277,9 +277,11 @@ def merged(pair: Pair, before: Fit, after: Fit) -> None:
 
 
 def warnings(fit: Fit) -> None:
-    """Warnings of too short a training and of a degenerate solution, each with the usual remedy."""
-    from ddco_pyro.evaluation.options import degeneracies
+    """Durations beside those asked for; warnings of a short training and of a degenerate solution, with remedies."""
+    from ddco_pyro.evaluation.options import degeneracies, durations
 
+    for level, said in durations(fit.metrics, fit.spec).items():
+        say(f"{level}: {said}.")
     for what, advice in (*effort.unconverged(fit.metrics), *degeneracies(fit.metrics, fit.spec, fit.names)):
         say(f"warning: {what} {advice}")
 

@@ -340,6 +340,28 @@ def degeneracies(metrics: Metrics, spec: Spec, names: Mapping[str, Sequence[str]
     return [*signs, *(_less_than_equal_parts(metrics.agreement, [*names]) if metrics.agreement else ())]
 
 
+def durations(metrics: Metrics, spec: Spec) -> dict[str, str]:
+    """For each level, what ``training.duration`` asks for and how long segments last; empty where nothing is asked."""
+    asked, levels = spec.training.duration, spec.hierarchy.levels if spec.hierarchy else ()
+    if asked is None or not metrics.segments:
+        return {}
+    means, said = asked.mean if isinstance(asked.mean, tuple) else (asked.mean,) * len(levels), {}
+    below = sum(use.steps for use in metrics.options[0])
+    for level, mean, segments in zip(levels, means, metrics.segments, strict=True):
+        lasts, what = below / segments.number, "segments of the level below" if said else "steps"
+        text = f"{number(mean, 1)} {what} asked by training.duration, {number(lasts, 1)} on the most likely paths"
+        said[f"Mean duration, level “{level.name}”"] = f"{text}{TOO_SHORT if 2 * lasts < mean else ''}"
+        below = segments.number
+    return said
+
+
+TOO_SHORT = (
+    ". What controls say of each step outweighs the prior: raise training.duration.weight, take fewer options, or "
+    "observe what changes more slowly"
+)
+"""What is said of segments that last less than half of what is asked."""
+
+
 def _less_than_equal_parts(found: Agreement, levels: Sequence[str]) -> Iterator[tuple[str, str]]:
     """The levels that agree less with their labels than equal parts of each demonstration do, with a remedy."""
     ours, equal, part = found.train, found.equal_train, "in training"

@@ -82,8 +82,8 @@ class DurationSpec(Model):
     """Mean duration of an option in steps, 1 / E[ψ]; a list has one number for each level, lowest first. Levels above
     the lowest count terminated options of the level below instead of steps."""
     weight: float = Field(default=1.0, ge=0, le=1e30)
-    """Strength of the prior: the number of pseudo-selections of each option, beside the selections in the training
-    demonstrations; 0 for no prior."""
+    """Strength of the prior against the training demonstrations, however many they are. At 1 its pseudo-selections are
+    as many as the demonstrations would have with these durations; 0 for no prior."""
 
 
 Start = Literal["vq", "vq_controls", "equal_parts", "cuts", "mixture", "random"]

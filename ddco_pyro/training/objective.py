@@ -19,7 +19,7 @@ from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.tables import Tables, always_ends
 from ddco_pyro.spec import DurationSpec
 from ddco_pyro.training.checkpoint import Progress, State, TrainingData
-from ddco_pyro.training.initialization import Clusters, EqualParts, RandomCuts
+from ddco_pyro.training.initialization import Clusters, EqualParts, RandomCuts, TypicalParts, labels_all
 from ddco_pyro.training.processes import Ranks
 from ddco_pyro.training.stages import Stage
 from ddco_pyro.training.upper import Constants, expected, fitted
@@ -83,15 +83,17 @@ class Objective:
         assert hierarchy is not None  # only levels are clamped
         kind, count = data.spec.training.start(self.progress.restart), hierarchy.levels[level - 1].count
         seed = data.seed(self.progress.restart, self.progress.stage)
-        start: EqualParts | RandomCuts | Clusters
-        if kind == "equal_parts":
+        labels = self.known[0].get(level)
+        start: EqualParts | TypicalParts | RandomCuts | Clusters
+        if kind == "equal_parts" and labels is not None and labels_all(labels, count):
+            start = TypicalParts(data.train, labels, count)
+        elif kind == "equal_parts":
             start = EqualParts(count)
         elif kind == "cuts":
             start = RandomCuts(count, seed)
         else:
-            labels, read = self.known[0].get(level), hierarchy.read_by(level)
             best = self.progress.restart == 0  # further restarts are to differ
-            start = Clusters(data.train, count, seed, kind != "vq", labels, read, best)
+            start = Clusters(data.train, count, seed, kind != "vq", labels, hierarchy.read_by(level), best)
         for known, batch in zip(self.known, (data.train, data.tune), strict=True):
             choices = start.choices(batch)
             labelled = known.get(level, choices)
@@ -139,8 +141,7 @@ class Objective:
             values = likelihood(tables)
         if spec.training.duration is None:
             return values
-        prior = log_duration_prior(tables.termination, lengths, spec.training.duration)
-        return values + prior / self.data.train.steps
+        return values + log_duration_prior(tables.termination, lengths, spec.training.duration)
 
     def tune(self, model: Hierarchy) -> float:
         """The objective per step of the tuning demonstrations: the mean, or the median over demonstrations."""
@@ -172,23 +173,27 @@ class Objective:
 
 
 def log_duration_prior(termination: Sequence[Tensor], lengths: Tensor, prior: DurationSpec) -> Tensor:
-    """Σ_d Σ_h Σ_t w (log ψ_h(s_t) + (m_d - 1) log(1 - ψ_h(s_t))) of each trajectory, nats, [N] in float64.
+    """Σ_d Σ_h Σ_t w / (k_d M_d) (log ψ_h(s_t) + (m_d - 1) log(1 - ψ_h(s_t))) of each trajectory, nats, [N] in float64.
 
-    ψ is that of option h of level d, w the prior's weight, m_d its mean. The sum over trajectories, divided by the
-    number of steps, is a mean over states. Its terms are log-densities of Beta distributions of ψ with mean 1/m_d and w
-    terminations. Each is a density of the logit of ψ, up to a constant. A level whose options end after every step has
-    no such distribution and adds nothing.
+    ψ is that of option h of the k_d options of level d, w the prior's weight, m_d its mean, and M_d the product of the
+    means of this level and those below: the steps that an option lasts. The mean over all states is of log-densities of
+    Beta distributions of ψ with mean 1/m_d and as many terminations as all steps have under these means, times w. Each
+    is a density of the logit of ψ, up to a constant. A level whose options end after every step has no such
+    distribution and adds nothing.
 
     :param termination: (log(1 - ψ), log ψ) of each level, lowest first, [N, T, k, 2].
     :param lengths: steps of each trajectory, [N].
     """
     means = prior.mean if isinstance(prior.mean, tuple) else (prior.mean,) * len(termination)
     total = lengths.new_zeros(len(lengths), dtype=torch.float64)
+    lasts = 1.0
     for table, mean in zip(termination, means, strict=False):  # lower levels alone, where those are discovered
         if always_ends(table):
             continue
+        lasts *= mean
         alive = torch.arange(table.shape[1], device=lengths.device) < lengths[:, None]
-        counts = prior.weight * torch.tensor([mean - 1.0, 1.0], dtype=torch.float64)
+        share = prior.weight / (lasts * table.shape[2])
+        counts = share * torch.tensor([mean - 1.0, 1.0], dtype=torch.float64)
         total = total + torch.where(alive[..., None, None], table.double() * counts, 0.0).sum((1, 2, 3))
     return total
 
