@@ -315,6 +315,18 @@ class Segments(Record):
     number: AtLeastOne
     demonstrations: AtLeastOne
 
+    def brief(self, frequency: float | None) -> bool:
+        """Whether options switch often, and most segments are too short for a skill."""
+        shortest = BRIEF_SECONDS * frequency if frequency else BRIEF_STEPS
+        return self.median < shortest and self.number >= OFTEN * self.demonstrations
+
+
+BRIEF_SECONDS = 0.5
+BRIEF_STEPS = 5
+"""Options are brief where their median segment is shorter: by the first where the rate is known, else by the second."""
+OFTEN = 6
+"""Segments in a demonstration from which on options switch often; a few brief ones may be meant."""
+
 
 class Alike(Record):
     """The divergence of two options in nats per step."""

@@ -16,7 +16,7 @@ from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.networks.conv import POOLED
 from ddco_pyro.training.checkpoint import Progress
-from ddco_pyro.training.initialization import Clusters, EqualParts, RandomCuts, TypicalParts, labels_all
+from ddco_pyro.training.initialization import Clusters, EqualParts, RandomCuts
 from ddco_pyro.training.objective import Objective
 from ddco_pyro.training.stages import plan
 
@@ -67,19 +67,6 @@ def test_planted_places_are_found_and_padding_belongs_to_none(controls):
     assert set(alive(choices)) == {1, 2, 3}
     assert (choices[torch.arange(7) >= torch.tensor(LENGTHS)[:, None]] == 0).all()
     assert controls or adjusted_rand_score(place, alive(choices)) == 1
-
-
-def test_parts_are_those_of_labelled_demonstrations():
-    """At each share of the length the option that most of them have there; the nearest share where none has a label."""
-    batch = make_batch(random_rows(0, 3), random_rows(1, 2), lengths=(10, 7))
-    labels = torch.full((2, 10), -1)
-    labels[0] = torch.tensor([2, 2, -1, -1, -1, -1, 1, 1, 1, 3])
-    labels[1, 6] = 1  # outvoted nowhere: this step is at 6/7
-    found = TypicalParts(batch, labels, 3).choices(batch)
-    assert found[0].tolist() == [2, 2, 2, 2, 1, 1, 1, 1, 1, 3]
-    assert found[1].tolist() == [2, 2, 2, 1, 1, 1, 1, 0, 0, 0]
-    every = [torch.tensor([2, 1, 3]), torch.tensor([2, 2, -1]), None]
-    assert [labels_all(given, 3) for given in every] == [True, False, False]
 
 
 def test_equal_parts_cut_each_demonstration_for_itself():

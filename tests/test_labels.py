@@ -249,6 +249,16 @@ training: {{epochs: 3, labels: {{level: skill, from: phase, count: 2}}, duration
     return tmp_path
 
 
+@pytest.mark.parametrize("start", ["equal_parts", "cuts", "vq"])
+def test_a_start_that_does_not_follow_labels_is_warned_of(files, start):
+    given = [files / "mine.yaml", "--set", f"training.initialize={start}", "--set", "compare_with=[]"]
+    page = files / "run" / "report.html"
+    outputs = [call("check", *given).out, call("fit", *given, "--out", files / "run").out, page.read_text()]
+    for said in (" ".join(output.split()) for output in outputs):
+        assert (f"training.initialize: {start} numbers options in the order of time" in said) == (start != "vq")
+    assert "training.labels say" not in call("check", *given, "--set", "training.labels=null").out
+
+
 def test_a_run_says_for_which_labels_its_options_stand(files):
     output = call("check", files / "mine.yaml").out
     assert "labels/phase, level 'skill': phase 0 is option 1, phase 2 is option 2; used of 2 demonstrations" in output

@@ -217,7 +217,7 @@ def device(spec: Spec) -> None:
 
 
 def labels(spec: Spec, used: Labels | None, known: Mapping[str, Sequence[str]]) -> None:
-    """The label of each option, where training uses labels.
+    """The label of each option, where training uses labels, and a warning where its start does not.
 
     :param known: the names of labels 0, 1, ... by name of labels.
     """
@@ -226,6 +226,10 @@ def labels(spec: Spec, used: Labels | None, known: Mapping[str, Sequence[str]]) 
         names = (label_name(own.source, value, known.get(own.source, ()), own.level) for value in used.values)
         each = ", ".join(f"{name} is {option_name(option)}" for option, name in enumerate(names, start=1))
         say(f"labels/{own.source}, level {own.level!r}: {each}; used of {len(used.demonstrations)} demonstrations")
+        from ddco_pyro.evaluation.options import unlabelled_start
+
+        for what, advice in unlabelled_start(spec.training):
+            say(f"warning: {what} {advice}")
 
 
 # --- fit, select, merge, rollout --------------------------------------------------------------------------------------

@@ -231,6 +231,9 @@ def check_fitted(recording: Recording, shapes: Mapping[str, tuple[int, ...]], co
 LEAST = 3
 """Fewest demonstrations for a fit: to train, to stop early, and to validate."""
 
+FEW = 8
+"""Of fewer demonstrations none is held out from the fit: a part to tune by and a part to validate leave too few."""
+
 
 def divided(names: Sequence[str], masks: Mapping[str, Sequence[str]]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Training and validation demonstrations by the masks ``train`` and ``valid``.

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jinja2
 import numpy as np
 
-from ddco_pyro.data.checks import LEAST, check_division, with_values
+from ddco_pyro.data.checks import FEW, LEAST, check_division, with_values
 from ddco_pyro.data.controls import all_constant
 from ddco_pyro.data.hdf5 import DemonstrationsError, natural, printable
 from ddco_pyro.data.inspection import Field, Inspection, inspect
@@ -22,9 +22,6 @@ from ddco_pyro.spec.yaml import read_yaml
 
 MANY = 100
 """From so many demonstrations on a tenth is held out, of fewer a fifth."""
-
-FEW = 8
-"""Of fewer demonstrations none is held out from the fit: a part to tune by and a part to validate leave too few."""
 
 OPTIONS = 4
 """Options where no labels say how many."""

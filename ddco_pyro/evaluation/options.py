@@ -150,11 +150,6 @@ WHOLE = 0.9
 MOSTLY = 2 / 3
 """The same share where no more than half of the demonstrations have the option."""
 
-BRIEF_SECONDS = 0.5
-BRIEF_STEPS = 5
-"""Options are brief where their median segment is shorter: by the first where the rate is known, else by the second."""
-OFTEN = 6
-"""Segments in a demonstration from which on options switch often; a few brief ones may be meant."""
 
 Kind = Literal["unused", "redundant", "dominating", "whole", "never_persisting", "brief", "high_fitting"]
 
@@ -230,12 +225,6 @@ class Finding:
         return f"{SIGNS[self.kind][0]} {self.amount(frequency)}"
 
 
-def is_brief(segments: Segments, frequency: float | None) -> bool:
-    """Whether options switch often, and most segments are too short for a skill."""
-    shortest = BRIEF_SECONDS * frequency if frequency else BRIEF_STEPS
-    return segments.median < shortest and segments.number >= OFTEN * segments.demonstrations
-
-
 def diagnose(
     options: Sequence[Sequence[Use]],
     divergences: Sequence[Sequence[Alike]] = (),
@@ -264,7 +253,7 @@ def diagnose(
             least = MOSTLY if 2 * option.having <= everything else WHOLE
             findings += _of_option(level, option, least, alone=len(use) == 2)
         findings += _of_pairs(level, use, divergences[level - 1] if divergences else ())
-        if segments and is_brief(segments[level - 1], frequency):
+        if segments and segments[level - 1].brief(frequency):
             findings.append(Finding("brief", level, 0, segments[level - 1].median))
         above = options[level][0].share if level < len(options) else 0.0
         findings += _of_caller(level, use[0].share, above)
@@ -321,8 +310,19 @@ SIGNS: Mapping[Kind, tuple[str, str]] = {
 """What one option, or one pair, does, and several."""
 
 
+def unlabelled_start(training: TrainingSpec) -> list[tuple[str, str]]:
+    """Starts that do not follow the labels to train from, with a remedy."""
+    blind = [start for start in training.starts if start in ("equal_parts", "cuts")]
+    if training.labels is None or not blind:
+        return []
+    text = f"training.initialize: {listed(blind)} numbers options in the order of time, whatever training.labels say."
+    return [(text, "Start from what labelled steps say of the others (training.initialize: vq_controls).")]
+
+
 def degeneracies(metrics: Metrics, spec: Spec, names: Mapping[str, Sequence[str]]) -> list[tuple[str, str]]:
     """The findings of :func:`diagnose` in words, those of a kind and level as one sign, with the usual remedy.
+
+    Signs that labels show follow.
 
     :param names: of the choices of each level, such as ``fit.names``.
     """
@@ -337,7 +337,8 @@ def degeneracies(metrics: Metrics, spec: Spec, names: Mapping[str, Sequence[str]
         level = levels[number_of_level - 1].name
         text = _sign(findings, level, names[level], rate)
         signs.append((text, findings[0].advice(spec.training)))
-    return [*signs, *(_less_than_equal_parts(metrics.agreement, [*names]) if metrics.agreement else ())]
+    less = _less_than_equal_parts(metrics.agreement, [*names]) if metrics.agreement else ()
+    return [*signs, *less, *unlabelled_start(spec.training)]
 
 
 def durations(metrics: Metrics, spec: Spec) -> dict[str, str]:
@@ -345,7 +346,8 @@ def durations(metrics: Metrics, spec: Spec) -> dict[str, str]:
     asked, levels = spec.training.duration, spec.hierarchy.levels if spec.hierarchy else ()
     if asked is None or not metrics.segments:
         return {}
-    means, said = asked.mean if isinstance(asked.mean, tuple) else (asked.mean,) * len(levels), {}
+    means = asked.mean if isinstance(asked.mean, tuple) else (asked.mean,) * len(levels)
+    said: dict[str, str] = {}
     below = sum(use.steps for use in metrics.options[0])
     for level, mean, segments in zip(levels, means, metrics.segments, strict=True):
         lasts, what = below / segments.number, "segments of the level below" if said else "steps"

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ddco_pyro.data.starting import FEW
+from ddco_pyro.data.checks import FEW
 from ddco_pyro.drawing.words import (
     capital,
     duration,
@@ -24,7 +24,6 @@ from ddco_pyro.drawing.words import (
     with_error,
 )
 from ddco_pyro.evaluation.effort import rising
-from ddco_pyro.evaluation.options import is_brief
 from ddco_pyro.metrics import Counts, Difference, Metrics, PerStep, Rollouts, Seeds, SuccessWorth, Worth
 from ddco_pyro.names import FLAT, MIXTURE, method
 from ddco_pyro.statistics import mean_interval, t_quantile, wider_interval
@@ -172,7 +171,7 @@ def explains(name: str, differences: Mapping[str, Difference], held_out: int) ->
 def brief(metrics: Metrics) -> str:
     """The median segment in words where the options of every level are too short for skills; else empty."""
     rate = metrics.control_frequency
-    short = bool(metrics.segments) and all(is_brief(one, rate) for one in metrics.segments)
+    short = bool(metrics.segments) and all(one.brief(rate) for one in metrics.segments)
     return duration(rate, metrics.segments[0].median) if short else ""
 
 

@@ -5,7 +5,7 @@ these segments. This clones the policies and starts the terminations from the cl
 
 Labels name clusters. Where every option has labelled steps, multinomial logistic regression assigns the other steps.
 Where some options have labelled steps, their clusters start from the means of these steps (seeded k-means, Basu et al.
-2002). Equal parts are those of the labelled steps where every option has some.
+2002).
 """
 
 from __future__ import annotations
@@ -25,9 +25,6 @@ from ddco_pyro.model.networks.conv import POOLED
 if TYPE_CHECKING:
     from sklearn.cluster import KMeans
     from sklearn.linear_model import LogisticRegression
-
-SHARES = 100
-"""Shares of a trajectory's length of which each has a typical option."""
 
 ITERATIONS = 300
 """The most iterations of k-means or logistic regression."""
@@ -143,30 +140,6 @@ class EqualParts:
         return torch.where(_alive(batch), part, 0)
 
 
-class TypicalParts:
-    """Every trajectory has, at each share of its length, the option that labelled trajectories have there most often.
-
-    :param labels: the options of labelled steps, 1 to m, and -1 for the others, [N, T].
-    """
-
-    def __init__(self, batch: Batch, labels: Tensor, options: int) -> None:
-        known = _alive(batch) & (labels > 0)
-        counts = torch.zeros(SHARES, options + 1)
-        ones = torch.ones(int(known.sum()))
-        counts.index_put_((self._shares(batch)[known], labels[known]), ones, accumulate=True)
-        there = counts.sum(1).nonzero().squeeze(1)
-        nearest = there[(torch.arange(SHARES)[:, None] - there).abs().argmin(1)]
-        self._most = counts[nearest].argmax(1)
-
-    def choices(self, batch: Batch) -> Tensor:
-        """The option of each step, [N, T], 1 to k; 0 where there is padding."""
-        return torch.where(_alive(batch), self._most[self._shares(batch).clamp(max=SHARES - 1)], 0)
-
-    @staticmethod
-    def _shares(batch: Batch) -> Tensor:
-        return batch.inputs.time * SHARES // batch.lengths[:, None]
-
-
 class RandomCuts:
     """Every trajectory cut at random into ``options`` parts, named as the options 1 to k in order.
 
@@ -201,11 +174,6 @@ class _Start:
             far = euclidean_distances(rows, np.stack(list(means.values())), squared=True).min(1)
             means[option] = rows[random_state.choice(len(rows), p=far / far.sum())]
         return np.stack([means[option] for option in range(1, clusters + 1)])
-
-
-def labels_all(labels: Tensor | None, options: int) -> bool:
-    """Whether every option has labelled steps."""
-    return labels is not None and len(_labelled(labels.numpy(), options)) == options
 
 
 def _labelled(labels: np.ndarray, options: int) -> list[int]:

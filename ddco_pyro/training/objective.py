@@ -19,7 +19,7 @@ from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.tables import Tables, always_ends
 from ddco_pyro.spec import DurationSpec
 from ddco_pyro.training.checkpoint import Progress, State, TrainingData
-from ddco_pyro.training.initialization import Clusters, EqualParts, RandomCuts, TypicalParts, labels_all
+from ddco_pyro.training.initialization import Clusters, EqualParts, RandomCuts
 from ddco_pyro.training.processes import Ranks
 from ddco_pyro.training.stages import Stage
 from ddco_pyro.training.upper import Constants, expected, fitted
@@ -83,17 +83,15 @@ class Objective:
         assert hierarchy is not None  # only levels are clamped
         kind, count = data.spec.training.start(self.progress.restart), hierarchy.levels[level - 1].count
         seed = data.seed(self.progress.restart, self.progress.stage)
-        labels = self.known[0].get(level)
-        start: EqualParts | TypicalParts | RandomCuts | Clusters
-        if kind == "equal_parts" and labels is not None and labels_all(labels, count):
-            start = TypicalParts(data.train, labels, count)
-        elif kind == "equal_parts":
+        start: EqualParts | RandomCuts | Clusters
+        if kind == "equal_parts":
             start = EqualParts(count)
         elif kind == "cuts":
             start = RandomCuts(count, seed)
         else:
+            labels, read = self.known[0].get(level), hierarchy.read_by(level)
             best = self.progress.restart == 0  # further restarts are to differ
-            start = Clusters(data.train, count, seed, kind != "vq", labels, hierarchy.read_by(level), best)
+            start = Clusters(data.train, count, seed, kind != "vq", labels, read, best)
         for known, batch in zip(self.known, (data.train, data.tune), strict=True):
             choices = start.choices(batch)
             labelled = known.get(level, choices)
