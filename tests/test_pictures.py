@@ -204,7 +204,8 @@ def test_pictures_that_a_device_holds_are_those_that_are_read(kept: Path, stored
     [
         ({"key": "camera", "crop": [3, 3, 10, 4]}, r"'camera' crop: \[3, 3, 10, 4\] is not within 12 × 10 pixels"),
         ({"key": "pose", "grey": True}, r"'pose' has shape \[3\] at each step: crop, resize, grey and frames are for"),
-        ({"key": "camera", "bins": 4}, r"'camera' has pictures: bins are for vectors"),
+        ({"key": "camera", "bins": 4}, r"'camera' has pictures: bins and relative are for vectors"),
+        ({"key": "camera", "relative": True}, r"'camera' has pictures: bins and relative are for vectors"),
     ],
 )
 def test_what_cannot_be_cut_is_refused(kept: Path, observation: dict[str, Any], message: str) -> None:

@@ -23,7 +23,7 @@ NARROWEST = 1e-6
 
 class ObservationEncoder(nn.Module):
     """Observations by name to one feature vector: angles and quaternions turned into numbers that do not jump,
-    differences appended, standardised where the spec says so.
+    the first step taken off and differences appended, standardised where the spec says so.
 
     Mean and standard deviation are those of the demonstrations given to :meth:`fit`, and are kept with the model. A
     dimension that varies by rounding alone (:func:`~ddco_pyro.data.checks.rounding`) is only centred, and so are
@@ -159,10 +159,16 @@ class ObservationEncoder(nn.Module):
             first += size
         return np.concatenate(moves)
 
-    def features(self, observations: Mapping[str, Observed], times: np.ndarray | None = None) -> np.ndarray:
+    def features(
+        self,
+        observations: Mapping[str, Observed],
+        times: np.ndarray | None = None,
+        first: Mapping[str, np.ndarray] | None = None,
+    ) -> np.ndarray:
         """Observations [T, ...] by name to features [T, F], not yet standardised.
 
         :param times: the number of each step [T]; by default 0 to T - 1.
+        :param first: the observation of the trajectory's first step by name; by default that of these.
         """
         steps = len(next(iter(observations.values())))
         times = np.arange(steps) if times is None else times
@@ -170,6 +176,9 @@ class ObservationEncoder(nn.Module):
         for spec in self.specs:
             values = times / float(self.longest) if spec.key == STEP else observations[spec.key]
             column = _turned(np.asarray(values, dtype=np.float64).reshape(steps, -1), spec)
+            if spec.relative:
+                start = values[:1] if first is None else first[spec.key]
+                column = column - _turned(np.asarray(start, dtype=np.float64).reshape(1, -1), spec)
             columns.append(column)
             if spec.differences:
                 columns.append(np.diff(column, axis=0, prepend=column[:1]))
@@ -181,15 +190,23 @@ class ObservationEncoder(nn.Module):
         # A split into nothing cannot be read again from an exported program.
         return dict(zip(self.keys, vector.split(self.sizes, -1), strict=True)) if self.sizes else {}
 
-    def inputs(self, observations: Iterable[Mapping[str, Observed]], times: np.ndarray | None = None) -> Inputs:
+    def inputs(
+        self,
+        observations: Iterable[Mapping[str, Observed]],
+        times: np.ndarray | None = None,
+        first: Iterable[Mapping[str, np.ndarray]] | None = None,
+    ) -> Inputs:
         """Sequences of observations, each [T_n, ...] by name, to padded network inputs.
 
         Pictures are read when a network asks for them.
 
         :param times: as in :meth:`features`.
+        :param first: as in :meth:`features`, for each sequence.
         """
         sequences = list(observations)
-        vectors = [self.scaled(self.features(sequence, times)) for sequence in sequences]
+        starts = [None] * len(sequences) if first is None else list(first)
+        pairs = zip(sequences, starts, strict=True)
+        vectors = [self.scaled(self.features(sequence, times, start)) for sequence, start in pairs]
         vector = padded(vectors).float()
         by_key, steps = dict(zip(self.keys, vector.split(self.sizes, -1), strict=True)), vector.shape[1]
         pictures = {key: tuple(_as_pictures(sequence[key]) for sequence in sequences) for key in self.images}
@@ -242,8 +259,8 @@ def _seen_shape(spec: ObservationSpec, shapes: Shapes) -> tuple[int, ...]:
     :raises ShapeError: it cannot be cropped, scaled, binned or augmented as the spec says.
     """
     stored = shapes[spec.key]
-    if spec.bins and len(stored) == PICTURE_DIMENSIONS:
-        raise ShapeError(f"observations: {spec.key!r} has pictures: bins are for vectors")
+    if (spec.bins or spec.relative) and len(stored) == PICTURE_DIMENSIONS:
+        raise ShapeError(f"observations: {spec.key!r} has pictures: bins and relative are for vectors")
     size, last = int(np.prod(stored)), max([*spec.angles, *(first + 3 for first in spec.quaternions)], default=-1)
     if last >= 0 and (len(stored) == PICTURE_DIMENSIONS or last >= size):
         raise ShapeError(

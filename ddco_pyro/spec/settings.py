@@ -107,6 +107,8 @@ class ObservationSpec(Model):
 
     key: Text
     """Name of the observation in the demonstrations; ``step`` is built in."""
+    relative: bool = False
+    """For vectors: read x_t − x_0, relative to the first step of the demonstration or episode, in place of x_t."""
     differences: bool = False
     """Append x_t − x_{t−1}."""
     angles: Items[Annotated[int, Field(ge=0)]] = ()
@@ -139,6 +141,8 @@ class ObservationSpec(Model):
             yield "crop", "is top, left, height, width; height and width must be at least 1"
         if self.key == STEP and self.differences:
             yield "differences", f"{STEP} grows by the same at each step; leave it out"
+        if self.key == STEP and self.relative:
+            yield "relative", f"{STEP} is 0 at the first step; leave it out"
         turned = [*self.angles, *(first + place for first in self.quaternions for place in range(4))]
         for key in ("angles", "quaternions"):
             if getattr(self, key) and self.key == STEP:

@@ -62,6 +62,7 @@ class Runner:
         self.choices: tuple[int, ...] = ()
         self.terminations: tuple[float, ...] = ()
         self.outputs: Outputs = {}
+        self._first: dict[str, np.ndarray] = {}
         self._last: dict[str, np.ndarray] | None = None
         self._pictures: dict[str, list[np.ndarray]] = {}
         self._marginal: np.ndarray | None = None
@@ -84,6 +85,7 @@ class Runner:
         specs = self.about["observations"]
         now = {spec["key"]: _checked(observation, spec) for spec in specs}
         images = {spec["key"]: self._recent(now[spec["key"]], spec) for spec in specs if spec["image"]}
+        self._first = self._first or now
         features = self._features(now, self._last or now)
         self.outputs, self._state = self._networks(features, self.time, images, self._state)
         generator = np.random.default_rng([self.seed, self.time])
@@ -110,7 +112,7 @@ class Runner:
         for spec in self.about["observations"]:
             if not spec["image"]:
                 value = _turned(now[spec["key"]], spec)
-                parts.append(value)
+                parts.append(value - _turned(self._first[spec["key"]], spec) if spec["relative"] else value)
                 if spec["differences"]:
                     parts.append(value - _turned(before[spec["key"]], spec))
         return np.concatenate(parts)

@@ -29,6 +29,7 @@ def make(
     vectors=True,
     bins=0,
     turns=False,
+    relative=False,
     std=MappingProxyType({"learn": True}),
     **rollout,
 ):
@@ -43,7 +44,8 @@ def make(
     ]
     turned = [{"angles": [1]}, {"quaternions": [0]}] if turns else [{}, {}]
     state, goal = ({"key": key} | own for key, own in zip(("state", "goal"), turned, strict=True))
-    seen = [state | {"differences": True, "bins": bins}, goal, *built_in] if vectors else []
+    own = {"differences": True, "bins": bins, "relative": relative}
+    seen = [state | own, goal | {"relative": relative}, *built_in] if vectors else []
     pictures = [{"key": "camera", **(camera if isinstance(camera, dict) else {})}] if camera else []
     endings = endings or {"network": network if network in ("conv", "per_timestep") else "linear"}
     model = {
@@ -110,6 +112,8 @@ FITS = {
     "per_timestep": make("per_timestep", steps=30),
     "bins": make("mlp", bins=4),
     "angles and quaternions": make("mlp", turns=True),
+    "relative": make("mlp", turns=True, relative=True),
+    "relative, with memory": make(RECURRENT, relative=True, endings={"network": "linear"}),
     "conv": make("conv", camera={"crop": [1, 2, 7, 9], "resize": [6, 8], "frames": 3}, options="sample"),
     "hybrid": make("mlp", (2, 3), BOTH, control="sample"),
     "σ of the state": make("mlp", (2, 3), BOTH, std={"learn": True, "per_state": True}, control="sample"),
