@@ -27,7 +27,11 @@ from ddco_pyro.metrics import Scores
 from ddco_pyro.segmenting import baselines
 from ddco_pyro.training.data import parts
 
-__all__ = ["LevelLabels", "Segmented", "Segments", "beside_baselines", "recorded", "segments"]
+__all__ = ["LevelLabels", "Segmented", "Segments", "beside_baselines", "beside_others", "recorded", "segments"]
+
+
+OTHERS = {name: f"options, {name}" for name in ("coarse", "medium", "fine")}
+"""Other fits whose options stand beside a run's, in words."""
 
 
 @dataclass(frozen=True)
@@ -125,8 +129,8 @@ class Segmented:
                 equal = f"{baselines.BASELINES[baselines.EQUAL]}, {part}"
                 scores[equal] = of_equal_lengths(labels, self.counts[level])
             for part, group in [*groups.items()][:1]:
-                for name, words in baselines.BASELINES.items():
-                    if group[0].baselines and name != baselines.EQUAL:
+                for name, words in (baselines.BASELINES | OTHERS).items():
+                    if f"{level}_{name}" in group[0].baselines and name != baselines.EQUAL:
                         kinds = [demo.baselines[f"{level}_{name}"] for demo in group]
                         agreements[level][f"{words}, {part}"] = scores_of(kinds, [demo.labels[truth] for demo in group])
         return agreements
@@ -203,7 +207,18 @@ def beside_baselines(
             found[f"{level}_{name}"] = baselines.segment(name, train, demos, count, seed, observations, gripper)
             on_event(BaselineSegmented(name, total))
     each = (
-        replace(demo, baselines={name: kinds[row] + 1 for name, kinds in found.items()})
+        replace(demo, baselines={**demo.baselines, **{name: kinds[row] + 1 for name, kinds in found.items()}})
+        for row, demo in enumerate(segmented.segments)
+    )
+    return replace(segmented, segments=tuple(each))
+
+
+def beside_others(segmented: Segmented, others: Mapping[str, Fit], fit: Fit, source: Source) -> Segmented:
+    """The same segments with the options of other fits of the same levels, as baselines of these names."""
+    demos = tuple(recorded(segmented, fit, source))
+    found = {f"{level.level}_{name}": level.choices for name, other in others.items() for level in other.segment(demos)}
+    each = (
+        replace(demo, baselines={**demo.baselines, **{name: options[row] for name, options in found.items()}})
         for row, demo in enumerate(segmented.segments)
     )
     return replace(segmented, segments=tuple(each))

@@ -17,7 +17,8 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import LengthTried, OnEvent, ignore
 from ddco_pyro.fitting.fit import fit
-from ddco_pyro.fitting.fitted import Fit
+from ddco_pyro.fitting.fitted import Fit, load
+from ddco_pyro.fitting.run import is_finished
 from ddco_pyro.spec import Spec, with_overrides
 from ddco_pyro.training.data import parts
 
@@ -30,6 +31,8 @@ NEAR, FAR = 1.15, 1.5
 second."""
 LADDER = ((0.5, False), (0.1, False), (0.1, True), (0.03, True))
 """Powers, and whether gates are constant, that are tried in this order where no length is asked for."""
+GRANULARITIES = {"coarse": 2.0, "medium": 1.0, "fine": 0.5}
+"""Median segments in units of a run's own."""
 STEPS = 3000
 """Steps of the demonstrations that are used, about."""
 EPOCHS = 30
@@ -105,6 +108,30 @@ def lasting(
         if found.median >= least:
             break
     return found
+
+
+def cut(trained: Fit, granularity: str, on_event: OnEvent = ignore) -> Fit:
+    """A run's model, fitted again so that segments are about twice or half as long.
+
+    A run keeps such fits in ``granularity/``.
+
+    :param granularity: one of :data:`GRANULARITIES`; ``medium`` is the run itself.
+    :raises BadInput: the run has no options that last, or trains on labels.
+    """
+    if GRANULARITIES[granularity] == 1:
+        return trained
+    if trained.spec.training.labels is not None:
+        raise BadInput("--granularity: the labels that the run trains on decide how long segments are; leave it out")
+    folder = None if trained.folder is None else trained.folder / "granularity" / granularity
+    if folder is not None and is_finished(folder):
+        return load(folder, allow_code=True)
+    spec, demos = trained.spec, trained.demonstrations
+    train = parts(spec, demos)["train"]
+    half = float(np.mean([len(demo) for demo in train])) / 2  # a whole demonstration is no skill
+    steps = min(GRANULARITIES[granularity] * median_segment(trained, train), half)
+    alone = {"compare_with": [], "demonstrations.leave_one_out": False}
+    changes = lasting(spec, demos, steps, on_event=on_event).overrides(spec) | alone
+    return fit(with_overrides(spec, changes), demos, folder, on_event, keep=False)
 
 
 def in_steps(place: str, length: str, frequency: float | None) -> float:
