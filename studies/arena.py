@@ -138,7 +138,7 @@ def fitted_cell(cell: ArenaCell, source: Path, overrides: tuple[str, ...], folde
     names, valid, unused = chosen(source, cell)
     facts = replace(inspect(source, exclude=[*valid, *unused]), excluded=(), masks={})  # init is shown no others
     started = folder / "started.yaml"
-    write_text(started, starting_spec(facts, source.resolve()))
+    write_text(started, starting_spec(facts, source.resolve()).text)
     spec = load_spec(started, [*overrides, f"seed={cell.seed}"])
     demos = replace(
         Demonstrations.read(source, spec.observed, [LABELS]).select([*names, *valid]),
