@@ -7,7 +7,8 @@ its gradient g in every output, and the posterior in every table (the E-step). T
 
 where h is the information that the posterior expects of an output and R a ridge. For the mean of a Gaussian, clipped or
 not, this is the weighted least squares of the M-step (for a clipped one: of the censored moments, by Fisher's
-identity). For switches, categories, terminations and gates it is one Fisher scoring step. σ follows in closed form.
+identity). For switches and terminations it is one Fisher scoring step. For categories and gates h is at least Fisher's
+information, one matrix for each output in place of one for each pair. σ follows in closed form.
 
 Steps are overrelaxed (Salakhutdinov and Roweis 2003): as long as each raises the penalised log-likelihood, the next is
 longer. A step that lowers it is halved, and the next one is EM's own.
@@ -49,10 +50,10 @@ TOLERANCE = 1e-5
 """EM has converged where a step gains less, in nats per step of the demonstrations."""
 ROUGHLY = 1e-3
 """The same in a stage whose end is a start alone."""
-KEPT = 2**24
-"""The most products of two features that are kept from step to step (128 MB)."""
-BLOCK = 2**20
-"""The most of them that are made at once where they are not kept."""
+BLOCK = 2**16
+"""The most features that are weighted at once: they stay in the cache."""
+NEGLIGIBLE = 1e-6
+"""A step whose weight is at most this part of the mean, as of an option far from it or in padding, adds nothing."""
 BIAS = 1e-6
 """Ridge of biases, and the least of weights: an option that is never active keeps its own."""
 
@@ -69,36 +70,26 @@ def is_linear(model: Hierarchy) -> bool:
 
 
 class Features:
-    """The features of a piece of the demonstrations and their products, in float64.
+    """The features of a piece of the demonstrations, in float64.
 
     :param reads: the vectors that networks read; none for constants.
-    :param room: the most products that are kept.
     :ivar x: the vectors with a 1 at the end, [N, T, F].
     """
 
-    def __init__(self, inputs: Inputs, reads: Sequence[str], room: int) -> None:
+    def __init__(self, inputs: Inputs, reads: Sequence[str]) -> None:
         vectors = (inputs.vectors[name].double() for name in reads)
         self.x = torch.cat([*vectors, torch.ones(*inputs.batch, 1, dtype=torch.float64)], dim=-1)
-        self._rows = self.x.flatten(0, 1)
-        self._first, self._second = torch.tril_indices(self.x.shape[-1], self.x.shape[-1])
-        place = torch.empty(self.x.shape[-1], self.x.shape[-1], dtype=torch.long)
-        place[self._first, self._second] = place[self._second, self._first] = torch.arange(len(self._first))
-        self._place = place.flatten()
-        self._kept = self._products(self._rows) if len(self._rows) * len(self._first) <= room else None
 
     def moments(self, weights: Tensor) -> Tensor:
         """Σ_t h_t x_t x_t^T for each column of weights [N·T, W]: [W, F, F]."""
-        size, features = max(1, BLOCK // len(self._first)), self._rows.shape[1]
-        if self._kept is not None:
-            found = weights.T @ self._kept
-        else:
-            blocks = zip(weights.split(size), self._rows.split(size), strict=True)
-            found = torch.stack([own.T @ self._products(rows) for own, rows in blocks]).sum(0)
-        return found.index_select(1, self._place).unflatten(1, (features, features))
-
-    def _products(self, rows: Tensor) -> Tensor:
-        """x_f x_g of each pair of features, [M, F (F + 1) / 2]."""
-        return rows[:, self._first] * rows[:, self._second]
+        every, features = self.x.flatten(0, 1), self.x.shape[-1]
+        found = every.new_zeros(weights.shape[1], features, features)
+        counted = weights > NEGLIGIBLE * weights.mean(0)
+        for total, own, which in zip(found, weights.T, counted.T, strict=True):
+            for some in which.nonzero().squeeze(1).split(max(1, BLOCK // features)):
+                rows = every[some]
+                total.addmm_((rows * own[some].unsqueeze(1)).T, rows)
+        return found
 
 
 @dataclass
@@ -125,7 +116,7 @@ class Sums:
     def add_information(self, group: Information, moments: Tensor) -> None:
         """Add that of a piece from the moments of its weights."""
         place = group.columns.start, group.columns.stop
-        self.information[place] = self.information.get(place, 0.0) + group.matrices(moments)
+        self.information[place] = self.information.get(place, 0.0) + moments.unflatten(0, group.weight.shape[2:])
         self.counts[place] = self.counts.get(place, 0.0) + (group.weight if group.count is None else group.count).sum(
             (0, 1)
         )
@@ -360,8 +351,7 @@ class Expectation:
         said: dict[str, Tensor] = {}
         for name, network in self._networks.items():
             if network.reads not in xs:
-                room = KEPT // (len(self._pieces) * len(self._networks))
-                xs[network.reads] = Features(piece.inputs, network.reads, room)
+                xs[network.reads] = Features(piece.inputs, network.reads)
             said[name] = network.outputs(xs[network.reads].x).requires_grad_()
         stds = {name: std.value.clone().requires_grad_() for name, std in self._stds.items()}
         callers = {
@@ -396,8 +386,8 @@ class Expectation:
             of[name][..., caller.sizes[0] :] /= power  # the M-step of policies is the same whatever the power
             choices, columns = selection.get(name), slice(0, caller.sizes[0])
             if caller.sizes[0] and choices is not None:
-                probabilities = said[name].detach()[..., columns].softmax(-1)
-                groups.append(Information(columns, choices.sum(-1).double(), probabilities))
+                asked = choices.sum(-1).double()
+                groups.append(Information.of_logits(columns, asked, said[name].detach()[..., columns]))
             acting = acted[place]
             if caller.std is not None and acting is not None:
                 emission = callers[name].emission
@@ -419,7 +409,7 @@ class Expectation:
         for reads, x in xs.items():
             its = [(name, group) for name in learned if self._networks[name].reads == reads for group in learned[name]]
             if its:
-                weights = [group.weights() for _, group in its]
+                weights = [group.weight.flatten(0, 1).flatten(1) for _, group in its]
                 moments = x.moments(torch.cat(weights, dim=1)).split([each.shape[1] for each in weights])
                 for (name, group), part in zip(its, moments, strict=True):
                     sums[name].add_information(group, part)
@@ -490,15 +480,9 @@ def _penalties(weight: Tensor, ridge: float) -> Tensor:
 
 def _damped(information: Tensor, gradient: Tensor, weight: Tensor, ridge: float) -> Tensor:
     """A Fisher scoring step [K, F, n], at most :data:`LARGEST` in any weight of a copy."""
-    copies, features, outputs = weight.shape
-    each = _ridges(features, ridge)
+    each = _ridges(weight.shape[1], ridge)
     right = gradient - each.unsqueeze(-1) * weight
-    if information.dim() == 4:  # a weight for each output
-        solved = torch.linalg.solve(information + each.diag(), right.mT.unsqueeze(-1))
-        step = solved.squeeze(-1).mT
-    else:
-        joint = information + each.repeat(outputs).diag()
-        step = torch.linalg.solve(joint, right.mT.reshape(copies, -1)).reshape(copies, outputs, features).mT
+    step = torch.linalg.solve(information + each.diag(), right.mT.unsqueeze(-1)).squeeze(-1).mT
     most = step.abs().amax((1, 2), keepdim=True)
     return step * (LARGEST / most.clamp(min=LARGEST))
 

@@ -52,16 +52,13 @@ class Information:
     """The information that the posterior expects of some numbers of a network, for an M-step.
 
     :param columns: the numbers; none for a parameter that is no σ, whose information is the weight.
-    :param weight: h of each output [N, T, K, n]. Or a weight of all outputs, [N, T, K]: h is the weight times 1/σ² for
-        means, and times diag(p) - pp^T for logits of probabilities p.
-    :param probabilities: p, [N, T, K, n].
+    :param weight: h of each output [N, T, K, n]. Or a weight of all outputs, [N, T, K]: h is the weight times 1/σ².
     :param std: the places of σ of these means, or of the parameter, among the parameters of the control.
     :param count: how many controls the weight stands for, [N, T, K]; None where it is their number.
     """
 
     columns: slice
     weight: Tensor
-    probabilities: Tensor | None = None
     std: tuple[int, ...] = ()
     count: Tensor | None = None
 
@@ -70,27 +67,14 @@ class Information:
         columns = slice(self.columns.start + numbers, self.columns.stop + numbers)
         return replace(self, columns=columns, std=tuple(place + parameters for place in self.std))
 
-    def weights(self) -> Tensor:
-        """h as columns, [N·T, W]; of probabilities those of each pair of outputs, the lower triangle."""
-        if self.probabilities is None:
-            return self.weight.flatten(0, 1).flatten(1)
-        p = self.probabilities.flatten(0, 1)
-        i, j = torch.tril_indices(p.shape[-1], p.shape[-1])
-        first, second = p.index_select(-1, i), p.index_select(-1, j)
-        return (self.weight.flatten(0, 1).unsqueeze(-1) * first * ((i == j).double() - second)).flatten(1)
+    @classmethod
+    def of_logits(cls, columns: slice, weight: Tensor, logits: Tensor) -> Self:
+        """At least that of logits [N, T, K, n] of a choice that is made with this weight, [N, T, K].
 
-    def matrices(self, moments: Tensor) -> Tensor:
-        """Σ_t h_t x_t x_t^T from the moments [W, F, F] of :meth:`weights`.
-
-        [K, F, F] for a weight of all outputs, [K, n, F, F] for one of each, [K, nF, nF] of logits.
+        diag(p) - pp^T is the Laplacian of a graph, and so at most twice its own diagonal.
         """
-        if self.probabilities is None:
-            return moments.unflatten(0, self.weight.shape[2:])
-        (copies, outputs), features = self.probabilities.shape[2:], moments.shape[-1]
-        i, j = torch.tril_indices(outputs, outputs)
-        whole = moments.new_empty(copies, outputs, outputs, features, features)
-        whole[:, i, j] = whole[:, j, i] = moments.unflatten(0, (copies, -1))
-        return whole.transpose(2, 3).reshape(copies, outputs * features, outputs * features)
+        p = logits.softmax(-1)
+        return cls(columns, 2 * weight.unsqueeze(-1) * p * (1 - p))
 
 
 class Parameter(NamedTuple):

@@ -60,8 +60,8 @@ class Categorical(Emission):
         return rows
 
     def information(self, acting: Tensor, actions: Tensor) -> Iterator[Information]:
-        """diag(p) - pp^T of the logits."""
-        yield Information(slice(0, self.numbers), acting, self.logits.softmax(-1))
+        """That of the logits."""
+        yield Information.of_logits(slice(0, self.numbers), acting, self.logits)
 
     @property
     def shape(self) -> torch.Size:
