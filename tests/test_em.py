@@ -281,7 +281,10 @@ def test_moments_of_features_are_those_of_einsum(monkeypatch):
     vector, weights = torch.randn(5, 7, 2, generator=generator), torch.rand(35, 4, generator=generator).double()
     weights[:, 1], weights[3:, 2], weights[::2, 3] = 0, 1e-9, 0
     x = torch.cat([vector, torch.ones(5, 7, 1)], -1).double().flatten(0, 1)
-    torch.testing.assert_close(em.Features(Inputs({"state": vector}, {}, torch.arange(7)), ["state"]).moments(weights), torch.einsum("mw,mf,mg->wfg", weights, x, x))
+    torch.testing.assert_close(
+        em.Features(Inputs({"state": vector}, {}, torch.arange(7)), ["state"]).moments(weights),
+        torch.einsum("mw,mf,mg->wfg", weights, x, x),
+    )
 
 
 def test_the_information_of_logits_is_at_least_fishers():
