@@ -317,7 +317,7 @@ def test_there_are_as_many_options_as_labels(labels: dict[str, int], count: int,
     ended = call("init", path, "--out", tmp_path / "spec.yaml")
     assert load_spec(tmp_path / "spec.yaml").hierarchy.levels[0].count == count
     said = [] if count == 4 else [f"{count} options, as many as the values of labels/fine"]
-    assert ended.out.splitlines()[:-1] == said
+    assert ended.out.splitlines()[:-2] == said
 
 
 def of_operators(path: Path, operators: str) -> Path:

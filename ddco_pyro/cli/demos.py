@@ -120,7 +120,6 @@ def init(
     if spec.training.optimizer.name == "em":
         lengths = _lengths(spec, facts, segment, segments)
         starting = starting_spec(facts, file, hold_out_by, lengths)
-        print(lengths.why)
     elif segment or segments:
         raise BadInput(f"{file}: --segment needs vectors to observe, since small fits find the settings")
     write_text(out, starting.text.replace("THIS_FILE", quote(str(out))))
@@ -130,8 +129,8 @@ def init(
     print(f"{out}{hint(f': fit it with: {fit}')}")
 
 
-def _lengths(spec: Spec, facts: Inspection, segment: str | None, segments: int | None) -> Lengths:
-    """What makes options last as long as is asked for, by small fits."""
+def _lengths(spec: Spec, facts: Inspection, segment: str | None, segments: int | None) -> Lengths | None:
+    """What makes options last as long as is asked for, by small fits; None where these fail."""
     from ddco_pyro.cli import console
     from ddco_pyro.data.starting import Lengths
     from ddco_pyro.drawing.words import duration
@@ -151,7 +150,7 @@ def _lengths(spec: Spec, facts: Inspection, segment: str | None, segments: int |
     except (BadInput, Failed):
         if steps is not None:
             raise
-        return Lengths()  # the fit will say what is wrong
+        return None  # the fit will say what is wrong
     asked = "" if steps is None else f"; asked: {duration(rate, steps)}"
     why = f"median segment {duration(rate, found.median)} in small fits{asked}"
     return Lengths(found.power, found.constant, why)

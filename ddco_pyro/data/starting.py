@@ -132,7 +132,8 @@ def starting_spec(
         filled | {"by": hold_out_by, "apart": apart, "lasting": lengths or Lengths()},
     )
     parse_spec(read_yaml(text))  # the text is a valid spec
-    return Starting(text, [*([f"{filled['count']} options, {many}"] if many else []), *([apart] if apart else [])])
+    notes = [f"{filled['count']} options, {many}" if many else "", apart, lengths.why if lengths else ""]
+    return Starting(text, [note for note in notes if note])
 
 
 def _held_out(inspection: Inspection, attribute: str) -> str:
