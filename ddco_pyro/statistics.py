@@ -1,4 +1,4 @@
-"""Confidence intervals of means and rates, and the paired test of successes."""
+"""Confidence intervals of means and rates, the paired test of successes, and the edit score of segments."""
 
 from __future__ import annotations
 
@@ -72,3 +72,19 @@ def paired_difference(ours: Sequence[float], theirs: Sequence[float]) -> dict[st
     discordant = only_ours + only_theirs
     p_value = float(binomtest(only_ours, discordant).pvalue) if discordant else 1.0
     return {"only_ours": only_ours, "only_theirs": only_theirs, "trials": len(ours), "p_value": p_value}
+
+
+def edit_score(ours: np.ndarray, theirs: np.ndarray) -> float:
+    """1 − Levenshtein distance of two sequences of segments / the longer one's length, of options [T] at each step.
+
+    >>> edit_score(np.array([1, 1, 2, 1]), np.array([1, 2, 2, 2]))
+    0.6666666666666667
+    """
+    first, second = (steps[np.flatnonzero(np.diff(steps, prepend=steps[0] - 1))] for steps in (ours, theirs))
+    distances = np.arange(len(second) + 1)
+    for number, segment in enumerate(first, 1):
+        diagonal, distances[0] = distances[0], number
+        for place, other in enumerate(second, 1):
+            cost = min(distances[place] + 1, distances[place - 1] + 1, diagonal + (segment != other))
+            diagonal, distances[place] = distances[place], cost
+    return 1 - float(distances[-1]) / max(len(first), len(second))

@@ -17,6 +17,7 @@ import numpy as np
 
 from ddco_pyro.data.sources.recording import UNKNOWN
 from ddco_pyro.metrics import Confusion, Matched, Scores
+from ddco_pyro.statistics import edit_score
 
 TOLERANCES = (1, 3, 5)
 """Tolerances of boundary F1, in steps."""
@@ -142,7 +143,7 @@ LARGEST = 2**32
 def _matched(ours: Sequence[np.ndarray], truth: Sequence[np.ndarray], labels: int) -> Matched:
     x, y = np.concatenate(ours), np.concatenate(truth)
     steps = [((x == label) & (y == label), (x == label) | (y == label)) for label in range(labels)]
-    edits = [_edit(h[_starts(h)], label[_starts(label)]) for h, label in zip(ours, truth, strict=True)]
+    edits = [edit_score(*pair) for pair in zip(ours, truth, strict=True)]
     return Matched(
         accuracy=float((x == y).mean()),
         iou=float(np.mean([both.sum() / either.sum() for both, either in steps])),
@@ -208,14 +209,3 @@ def _overlapping(ours: tuple[np.ndarray, np.ndarray], theirs: tuple[np.ndarray, 
         best = int(ratio.argmax())
         taken[best] |= ratio[best] >= overlap
     return int(taken.sum())
-
-
-def _edit(ours: np.ndarray, theirs: np.ndarray) -> float:
-    """1 − Levenshtein distance / the longer length."""
-    distances = np.arange(len(theirs) + 1)
-    for number, segment in enumerate(ours, 1):
-        diagonal, distances[0] = distances[0], number
-        for place, other in enumerate(theirs, 1):
-            cost = min(distances[place] + 1, distances[place - 1] + 1, diagonal + (segment != other))
-            diagonal, distances[place] = distances[place], cost
-    return 1 - float(distances[-1]) / max(len(ours), len(theirs))

@@ -109,14 +109,16 @@ class Inferred:
 
     @cached_property
     def tables(self) -> Tables:
-        """The log-probabilities that exact inference works on."""
+        """The log-probabilities that exact inference works on, with the evidence of a recogniser."""
         with torch.no_grad():
-            return self.outputs.tables(self.batch.actions)
+            return self.hierarchy.recognised(self.outputs.tables(self.batch.actions), self.batch)
 
     @cached_property
     def log_likelihood(self) -> np.ndarray:
         """Σ_t log p(a_t | s_0..t, a_0..t-1) of each demonstration, nats in the control's own units, [N]."""
-        values: np.ndarray = log_predictive(self.tables, self.batch.lengths).numpy()
+        with torch.no_grad():
+            alone = self.outputs.tables(self.batch.actions)  # a recogniser has seen the controls that follow
+        values: np.ndarray = log_predictive(alone, self.batch.lengths).numpy()
         return values
 
     @cached_property

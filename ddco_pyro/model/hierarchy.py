@@ -23,6 +23,7 @@ from ddco_pyro.model.encoder import ObservationEncoder, Shapes
 from ddco_pyro.model.networks import Inputs, InputShape, Network, State, States, build, build_trunk, named
 from ddco_pyro.model.networks.probe import training_bytes
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
+from ddco_pyro.model.recogniser import Recogniser
 from ddco_pyro.model.seeding import HOST
 from ddco_pyro.model.tables import Tables
 from ddco_pyro.spec import ControlSpec, LevelSpec, NetworkSpec, Spec
@@ -167,6 +168,11 @@ class Hierarchy(nn.Module):
         network, emits = _meta_policy(spec)
         with named("hierarchy.meta_policy" if levels else "baseline.policy"):
             self.meta_policy = Caller(network, emits, below, shape, spec.control, scaling, copies=1)
+        self.recogniser: Recogniser | None = None
+        if spec.hierarchy is not None and (labels := spec.training.labels) is not None and labels.recogniser:
+            level = [each.name for each in spec.hierarchy.levels].index(labels.level)
+            count, size = spec.hierarchy.levels[level].count, len(scaling.varying)
+            self.recogniser = Recogniser(1 + level, count, self.input_shape, size)
 
     def place(self, device: torch.device) -> Hierarchy:
         """Move the networks, and nothing else, to a device. Their callers give and get tensors on the host."""
@@ -233,6 +239,12 @@ class Hierarchy(nn.Module):
         """
         outputs: Outputs = self(batch.inputs, discovering)
         return outputs.tables(batch.actions)
+
+    def recognised(self, tables: Tables, batch: Batch) -> Tables:
+        """The tables of a batch with the evidence of the recogniser, where there is one."""
+        if self.recogniser is None:
+            return tables
+        return tables.with_evidence(self.recogniser.level, self.recogniser.evidence(batch))
 
     def forward(self, inputs: Inputs, discovering: int | None = None) -> Outputs:
         """The outputs for these observations, which begin with the first step of their trajectories.

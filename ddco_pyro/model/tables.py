@@ -84,14 +84,18 @@ class Tables:
 
         :param level: 1 is the lowest.
         """
-        evidence = list(self.evidence or (None,) * self.depth)
         each, choices = torch.arange(self.sizes[level - 1]), choices.unsqueeze(-1)
-        evidence[level - 1] = torch.where((choices == each) | (choices < 0), 0.0, NEVER)
-        return self.with_evidence(tuple(evidence))
+        return self.with_evidence(level, torch.where((choices == each) | (choices < 0), 0.0, NEVER))
 
-    def with_evidence(self, evidence: tuple[Tensor | None, ...]) -> Tables:
-        """The same tables with this evidence."""
-        return replace(self, evidence=evidence)
+    def with_evidence(self, level: int, own: Tensor) -> Tables:
+        """These tables with further evidence of a level's choices, [N, T, 1 + k_d].
+
+        :param level: 1 is the lowest.
+        """
+        evidence = list(self.evidence or (None,) * self.depth)
+        before = evidence[level - 1]
+        evidence[level - 1] = own if before is None else before + own
+        return replace(self, evidence=tuple(evidence))
 
     def memoryless(self) -> Tables:
         """These tables with ψ = 1 at every level: every option ends after every step."""

@@ -18,8 +18,9 @@ from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.errors import BadInput, nearest
 from ddco_pyro.evaluation.agreement import equal_lengths
 from ddco_pyro.model.encoder import ObservationEncoder
+from ddco_pyro.model.recogniser import block_means
 from ddco_pyro.spec import ObservationSpec
-from ddco_pyro.training.initialization import block_means, distinct, joined
+from ddco_pyro.training.initialization import distinct, joined
 
 EQUAL = "equal"
 """The baseline of parts of equal length."""

@@ -52,6 +52,24 @@ class OptimizerSpec(Model):
             yield "momentum", f"is for name: momentum, and {self.name} does not use it; leave it out"
 
 
+Window = Annotated[int, Field(ge=1)] | Annotated[str, Field(pattern=r"^(\d+\.?\d*|\.\d+)s$")]
+
+
+class RecogniserSpec(Model):
+    """A recogniser of the options of labelled steps, whose evidence places the options of steps without labels."""
+
+    weight: float = Field(default=0.3, ge=0)
+    """γ: how many times log r(h | window) − log p(h) counts, beside the control's log-density (``control.power``)."""
+    ridge: Positive = 50.0
+    """Precision of a normal prior on the weights of standardised features."""
+    windows: Annotated[Items[Window], Field(min_length=2, max_length=2)] | None = None
+    """Half widths of both windows around a step, in steps, or in seconds, such as ``[1s, 3s]``. Null: a quarter and
+    three quarters of the median labelled segment."""
+    cross_validated: bool = False
+    """Whether ``weight``, ``ridge`` and ``control.power`` are chosen by leaving out labelled demonstrations in turn, or
+    parts of a single one: the best mean of accuracy and edit score."""
+
+
 class LabelsSpec(Model):
     """Labels that fix the active option of one level; steps labelled −1 are free."""
 
@@ -66,6 +84,12 @@ class LabelsSpec(Model):
     Null: all. Labels of held-out demonstrations are never used."""
     hold: bool = True
     """Whether labels fix the active option throughout training; false: in initialisation alone."""
+    recogniser: RecogniserSpec | None = None
+    """A recogniser that the labelled steps train, for steps without labels and for other demonstrations; null: none."""
+
+    def problems(self) -> Problems:
+        if self.recogniser is not None and not self.hold:
+            yield "recogniser", "is for labels that hold throughout training; say hold: true, or leave it out"
 
 
 Duration = Annotated[float, Field(ge=1)]

@@ -32,6 +32,7 @@ class TrainingData:
     :param encoder: the state of the fitted observation encoder.
     :param scaling: the state of the fitted scaling of the control.
     :param labels: the labels that say which options are active; None where there are none.
+    :param recogniser: the state of the recogniser that the labels train.
     """
 
     spec: Spec
@@ -42,6 +43,7 @@ class TrainingData:
     encoder: State
     scaling: State
     labels: Labels | None = None
+    recogniser: State | None = None
 
     def hierarchy(self, restart: int, state: State | None = None) -> Hierarchy:
         """A restart's hierarchy in evaluation mode, with its networks on the spec's device.
@@ -51,6 +53,8 @@ class TrainingData:
         hierarchy = build_hierarchy(self.spec, self.dimensions, self.seed(restart))
         hierarchy.encoder.load_state_dict(self.encoder)
         hierarchy.scaling.load_state_dict(self.scaling)
+        if hierarchy.recogniser is not None and self.recogniser is not None:
+            hierarchy.recogniser.load_state_dict(self.recogniser)
         if state is not None:
             hierarchy.load_state_dict(state)
         return hierarchy.place(device_of(self.spec.training)).eval()

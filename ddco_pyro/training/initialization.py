@@ -20,7 +20,7 @@ from torch import Tensor
 from ddco_pyro.data.memory import share
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import BYTES_AT_ONCE
-from ddco_pyro.model.networks.conv import POOLED
+from ddco_pyro.model.recogniser import FRAMES_AT_ONCE, block_means
 
 if TYPE_CHECKING:
     from sklearn.cluster import KMeans
@@ -183,19 +183,6 @@ def _labelled(labels: np.ndarray, options: int) -> list[int]:
 
 def _alive(batch: Batch) -> Tensor:
     return batch.inputs.time < batch.lengths[:, None]
-
-
-FRAMES_AT_ONCE = 64
-"""Pictures that are converted to floating-point numbers together."""
-
-
-def block_means(frames: Tensor) -> Tensor:
-    """Pictures uint8 [T, H, W, C] averaged over POOLED × POOLED blocks, in [0, 1], [T, C · POOLED²]."""
-    pooled = [
-        torch.nn.functional.adaptive_avg_pool2d(block.permute(0, 3, 1, 2).float() / 255, POOLED).flatten(1)
-        for block in frames.split(FRAMES_AT_ONCE)
-    ]
-    return torch.cat(pooled)
 
 
 def distinct(rows: np.ndarray, most: int) -> int:

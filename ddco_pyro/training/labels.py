@@ -27,6 +27,8 @@ class Labels:
     :param demonstrations: the names of the demonstrations whose labels are used.
     :param train: the option of each step of the demonstrations to train with, [N, T]; -1 where it is free.
     :param tune: the same of the demonstrations to tune with.
+    :param evidence: what a recogniser says of each choice at steps without labels, [N, T, 1 + k], of both.
+    :param starts: the options that the recogniser finds likeliest, [N, T], of both.
     """
 
     level: int
@@ -35,6 +37,8 @@ class Labels:
     demonstrations: tuple[str, ...]
     train: Tensor
     tune: Tensor
+    evidence: tuple[Tensor, Tensor] | None = None
+    starts: tuple[Tensor, Tensor] | None = None
 
     @classmethod
     def of(cls, spec: Spec, train: Demonstrations, tune: Demonstrations) -> Labels | None:

@@ -34,7 +34,7 @@ class Diverged(TrainingError):
 
 
 Known = dict[int, Tensor]
-"""Known choices of levels, by level (1 is the lowest): the choice of each step [N, T]; -1 where it is free."""
+"""By level (1 is the lowest): the known choice of each step [N, T], -1 where it is free; or the evidence of choices."""
 
 
 class Objective:
@@ -46,6 +46,7 @@ class Objective:
 
     :param states: the checkpoint from which the stage goes on; None at the beginning of the stage.
     :ivar known: the known choices of the training and of the tuning demonstrations.
+    :ivar evidence: of the choices of other steps, in nats, [N, T, 1 + k] by level.
     :ivar likelihoods: the number of log-likelihoods whose mean is reported.
     """
 
@@ -60,9 +61,12 @@ class Objective:
         self.likelihoods = 2 if stage.selecting else 1
         self.constants = Constants.of((states or {}).get("constants", {}))
         self.known: tuple[Known, Known] = {}, {}
+        self.evidence: tuple[Known, Known] = {}, {}
         labels = data.labels
         if labels is not None and labels.matter_in(stage):
             self.known = {labels.level: labels.train}, {labels.level: labels.tune}
+            if labels.evidence is not None:
+                self.evidence = {labels.level: labels.evidence[0]}, {labels.level: labels.evidence[1]}
         if stage.clamped is not None:
             if states is None:
                 self._clamp_to_start(stage.clamped)
@@ -84,14 +88,18 @@ class Objective:
         kind, count = data.spec.training.start(self.progress.restart), hierarchy.levels[level - 1].count
         seed = data.seed(self.progress.restart, self.progress.stage)
         start: EqualParts | RandomCuts | Clusters
+        if (labels := data.labels) is not None and labels.level == level and labels.starts is not None:
+            for known, found in zip(self.known, labels.starts, strict=True):
+                known[level] = torch.where(known[level] < 0, found, known[level])
+            return
         if kind == "equal_parts":
             start = EqualParts(count)
         elif kind == "cuts":
             start = RandomCuts(count, seed)
         else:
-            labels, read = self.known[0].get(level), hierarchy.read_by(level)
+            given, read = self.known[0].get(level), hierarchy.read_by(level)
             best = self.progress.restart == 0  # further restarts are to differ
-            start = Clusters(data.train, count, seed, kind != "vq", labels, read, best)
+            start = Clusters(data.train, count, seed, kind != "vq", given, read, best)
         for known, batch in zip(self.known, (data.train, data.tune), strict=True):
             choices = start.choices(batch)
             labelled = known.get(level, choices)
@@ -116,11 +124,13 @@ class Objective:
         return self.clamped(tables, rows, tuning)
 
     def clamped(self, tables: Tables, rows: Tensor, tuning: bool = False) -> Tables:
-        """The tables with the choices that are known clamped, and ψ = 1 in a stage that is memoryless."""
+        """The tables with known choices clamped, evidence of the others, and ψ = 1 in a stage that is memoryless."""
         if self.stage.memoryless:
             tables = tables.memoryless()
         for level, choices in self.known[tuning].items():
             tables = tables.clamp(level, choices[rows, : tables.steps])
+        for level, evidence in self.evidence[tuning].items():
+            tables = tables.with_evidence(level, evidence[rows, : tables.steps])
         return tables
 
     def values(self, tables: Tables, lengths: Tensor) -> Tensor:

@@ -47,6 +47,7 @@ from ddco_pyro.training.networks import Dimensions, build_hierarchy, model_name
 from ddco_pyro.training.objective import TrainingError
 from ddco_pyro.training.optimizers import optimizer_of
 from ddco_pyro.training.processes import Ranks
+from ddco_pyro.training.recognition import Recognition, recognise
 from ddco_pyro.training.ridge import cross_validated
 from ddco_pyro.training.stages import StageEnd, plan
 
@@ -136,6 +137,10 @@ class Trainer:
             self.ridge = cross_validated(self.hierarchy, varied, ridge, self.data.seed(0))
             raised = with_overrides(spec, {"training.optimizer.ridge.policy": self.ridge})
             self.data = replace(self.data, spec=raised)
+        self.recognition: Recognition | None = None
+        if self.hierarchy.recogniser is not None:
+            every = train if tune is train else replace(train, demonstrations=(*train, *tune), masks={})
+            self.data, self.recognition = recognise(self.hierarchy, self.data, every)
         self.restarts: list[Restart] = []
         self.stopped: dict[int, int] = {}
         self.agreement: dict[int, float] = {}
@@ -254,7 +259,7 @@ class Trainer:
         model = self.data.hierarchy(number, self.restarts[number].states["best"])
         with torch.no_grad():
             pieces = (piece for _, piece in self.data.train.pieces(model.steps_at_once))
-            found = [segment(model.tabulate(piece), piece.lengths)[0] for piece in pieces]
+            found = [segment(model.recognised(model.tabulate(piece), piece), piece.lengths)[0] for piece in pieces]
         return torch.cat([choices[choices >= 0] for choices in found]).numpy()
 
     def _last(self, number: int) -> int:

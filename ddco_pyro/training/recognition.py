@@ -1,0 +1,230 @@
+"""Learning a recogniser from labelled steps, and how much it counts (``training.labels.recogniser``)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.inference.paths import most_likely_path
+from ddco_pyro.model.batch import Batch, encode
+from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.recogniser import SCALES, Windows
+from ddco_pyro.spec import SpecError, with_overrides
+from ddco_pyro.statistics import edit_score
+from ddco_pyro.training.checkpoint import Progress, Restart, State, TrainingData
+from ddco_pyro.training.labels import Labels, choices
+from ddco_pyro.training.loop import train
+from ddco_pyro.training.optimizers import optimizer_of
+
+ALONE = 1e-6
+"""The power β of the controls' density under which a recogniser alone decides, with the transitions."""
+
+CANDIDATES = ((ALONE, 0.3), (0.03, 0.1), (0.1, 0.3), (0.3, 1.0), (1.0, 1.0), (1.0, 0.0))
+"""The pairs (β, γ) that are tried: from the recogniser alone to labels alone."""
+
+RIDGES = (15.0, 50.0, 150.0)
+"""The ridges of the recogniser that are tried."""
+
+FOLDS = 5
+"""The most parts of the labelled demonstrations that are left out in turn, and the parts of a single one."""
+
+EM_STEPS = 4
+"""EM steps of a stage of a model that decodes left-out demonstrations: labels leave little to infer."""
+
+ITERATIONS = 500
+"""The most iterations of logistic regression."""
+
+SHARES = (0.25, 0.75)
+"""The half widths of windows, as parts of a labelled segment."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """What is tried, and the mean accuracy and edit score of labelled demonstrations that are left out."""
+
+    power: float
+    weight: float
+    ridge: float
+    accuracy: float
+    edit: float
+
+    @property
+    def score(self) -> float:
+        """The mean of both scores."""
+        return (self.accuracy + self.edit) / 2
+
+
+@dataclass(frozen=True)
+class Recognition:
+    """A learned recogniser, and how much it counts.
+
+    :param state: of ``Hierarchy.recogniser``.
+    :param power: β, of the log-density of controls.
+    :param weight: γ, of the evidence.
+    :param ridge: of the regressions.
+    :param widths: half widths of the windows, in steps.
+    :param tried: every candidate, where cross-validation has chosen.
+    """
+
+    state: State
+    power: float
+    weight: float
+    ridge: float
+    widths: tuple[int, ...]
+    tried: tuple[Candidate, ...]
+
+
+def recognise(model: Hierarchy, data: TrainingData, demos: Demonstrations) -> tuple[TrainingData, Recognition]:
+    """Teach a hierarchy's recogniser the labelled steps, and say what it makes of the others.
+
+    :param model: the hierarchy, with fitted encoder and scaling.
+    :param demos: those to train and to tune with.
+    :returns: the data with the power β of the control, and with starts and evidence of steps without labels.
+    :raises SpecError: windows are in seconds, and the frequency of the control is not known.
+    """
+    labels, own, recogniser = data.labels, data.spec.training.labels, model.recogniser
+    assert labels is not None and own is not None and own.recogniser is not None and recogniser is not None
+    asked = own.recogniser
+    labelled = [demo for demo in demos.select(labels.demonstrations) if (demo.labels[own.source] >= 0).any()]
+    demos = replace(demos, demonstrations=tuple(labelled), masks={})
+    batch = encode(demos, model.encoder, model.scaling)
+    options = choices(demos, own.source, labels.values, labels.demonstrations)
+    widths = _widths(asked.windows, [demo.labels[own.source] for demo in demos], demos.frequency)
+    features = {}
+    for windows in (recogniser.around, recogniser.past):
+        windows.widths.copy_(torch.tensor(widths))
+        features[windows] = windows.features(batch.inputs, batch.actions, batch.lengths)
+    power, weight, ridge, tried = data.spec.control.power, asked.weight, asked.ridge, ()
+    if asked.cross_validated:
+        tried = tuple(_tried(data, recogniser.around, features[recogniser.around], batch, options, demos.names))
+        best = max(tried, key=lambda candidate: candidate.score)
+        power, weight, ridge = best.power, best.weight, best.ridge
+    for windows, rows in features.items():
+        learn(windows, rows[options > 0], options[options > 0], ridge)
+    recogniser.gamma.fill_(weight)
+    model.power.fill_(power)
+    evidence = [
+        torch.where((known >= 0).unsqueeze(-1), 0.0, recogniser.evidence(part))
+        for known, part in ((labels.train, data.train), (labels.tune, data.tune))
+    ]
+    taught = replace(
+        labels,
+        evidence=tuple(evidence),
+        starts=(recogniser.options(data.train), recogniser.options(data.tune)),
+    )
+    state = {name: value.clone() for name, value in recogniser.state_dict().items()}
+    spec = with_overrides(data.spec, {"control.power": power})
+    found = Recognition(state, power, weight, ridge, widths, tried)
+    return replace(data, spec=spec, labels=taught, recogniser=state), found
+
+
+def learn(windows: Windows, features: Tensor, options: Tensor, ridge: float) -> None:
+    """Fit a regression to labelled steps.
+
+    :param features: [M, 3 F].
+    :param options: 1 to k, [M].
+    :param ridge: precision of a normal prior on the weights of standardised features.
+    """
+    from sklearn.linear_model import LogisticRegression
+
+    rows, known = features.numpy(), options.numpy() - 1
+    middle, spread = rows.mean(0), rows.std(0)
+    spread = np.where(spread > NARROWEST * np.abs(rows).max(0, initial=NARROWEST), spread, 1.0)
+    classes, counts = np.unique(known, return_counts=True)
+    for buffer in (windows.weight, windows.bias, windows.share):
+        buffer.zero_()
+    windows.share[classes] = torch.as_tensor(counts / len(known))
+    if len(classes) > 1:
+        fitted = LogisticRegression(C=1 / ridge, max_iter=ITERATIONS).fit((rows - middle) / spread, known)
+        classes = classes[-len(fitted.coef_) :]  # of two classes the first has no weights
+        weight = fitted.coef_.T / spread[:, None]
+        windows.weight[:, classes] = torch.as_tensor(weight)
+        windows.bias[classes] = torch.as_tensor(fitted.intercept_ - middle @ weight)
+
+
+NARROWEST = 1e-9
+"""A feature varies where its standard deviation is a larger part of its largest value."""
+
+
+def _widths(
+    windows: tuple[int | str, ...] | None, labels: list[np.ndarray], frequency: float | None
+) -> tuple[int, ...]:
+    """Half widths of windows in steps; by default a quarter and three quarters of the median labelled segment."""
+    if windows is None:
+        edges = [np.flatnonzero(np.diff(own, prepend=-2, append=-2)) for own in labels]
+        lengths = [np.diff(at)[own[at[:-1]] >= 0] for own, at in zip(labels, edges, strict=True)]
+        typical = float(np.median(np.concatenate(lengths)))
+        return tuple(max(1, round(share * typical)) for share in SHARES)
+    if frequency is None and any(isinstance(width, str) for width in windows):
+        raise SpecError(
+            "training.labels.recogniser.windows: are in seconds, and the file does not say its control frequency; give "
+            "numbers of steps"
+        )
+    steps = (width if isinstance(width, int) else float(width.removesuffix("s")) * (frequency or 1) for width in windows)
+    return tuple(max(1, round(width)) for width in steps)
+
+
+def _tried(
+    data: TrainingData, windows: Windows, features: Tensor, batch: Batch, options: Tensor, names: tuple[str, ...]
+) -> list[Candidate]:
+    """The candidates, each with its scores of the labelled steps that are left out.
+
+    A model is trained on the other labels alone, and decodes the left-out demonstrations with each candidate.
+    """
+    assert data.labels is not None
+    level, scores = data.labels.level, dict[tuple[float, float, float], list[tuple[float, float]]]()
+    for hidden in _left_out(options, batch.lengths):
+        known = torch.where(hidden, -1, options)
+        (rows,) = torch.where((hidden & (options > 0)).any(1))
+        model, part, truth = _taught(data, batch, known, names), batch.select(rows), torch.where(hidden, options, -1)
+        with torch.no_grad():
+            tables = model.tabulate(part)
+        for ridge in RIDGES:
+            learn(windows, features[known > 0], known[known > 0], ridge)
+            ratio = windows.log_ratio(features[rows, : tables.steps])
+            for power, weight in CANDIDATES:
+                evident = replace(tables, power=power).with_evidence(level, weight * ratio)
+                path = most_likely_path(evident, part.lengths).choices[level - 1]
+                own = scores.setdefault((power, weight, ridge), [])
+                for found, true in zip(path.numpy(), truth[rows, : tables.steps].numpy(), strict=True):
+                    ours, theirs = found[true > 0], true[true > 0]
+                    own.append((float((ours == theirs).mean()), edit_score(ours, theirs)))
+    return [Candidate(*key, *np.mean(own, axis=0).tolist()) for key, own in scores.items()]
+
+
+def _left_out(options: Tensor, lengths: Tensor) -> Iterator[Tensor]:
+    """The steps that are left out together, bool [N, T]: of whole demonstrations, or parts of a single one."""
+    count = len(options)
+    if count == 1:
+        fold = (torch.arange(options.shape[1]) * FOLDS // lengths[0]).expand(1, -1)
+    else:
+        fold = (torch.arange(count) % min(FOLDS, count)).unsqueeze(1).expand(-1, options.shape[1])
+    for number in range(int(fold.max()) + 1):
+        hidden = fold == number
+        if bool((hidden & (options > 0)).any()) and bool((~hidden & (options > 0)).any()):
+            yield hidden
+
+
+def _taught(data: TrainingData, batch: Batch, known: Tensor, names: tuple[str, ...]) -> Hierarchy:
+    """A model that is trained on labelled demonstrations alone."""
+    assert data.labels is not None
+    (rows,) = torch.where((known > 0).any(1))
+    part = batch.select(rows)
+    known = known[rows, : int(part.lengths.max())]
+    spec = data.spec
+    changes = {"training.restarts": 1, "training.initialize": spec.training.start(0)}
+    model = data.hierarchy(0)
+    if optimizer_of(spec.training.optimizer, model) == "em":
+        changes["training.epochs"] = EM_STEPS * (2 + model.depth)
+    labels = replace(data.labels, train=known, tune=known)
+    own = replace(
+        data, spec=with_overrides(spec, changes), train=part, tune=part, labels=labels,
+        names=[names[row] for row in rows.tolist()],
+    )  # fmt: skip
+    restart = train(own, Restart(Progress(0)))
+    return own.hierarchy(0, restart.states["best"])
