@@ -14,27 +14,31 @@ from ddco_pyro.inference.paths import most_likely_path
 from ddco_pyro.model.batch import Batch, encode
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.recogniser import SCALES, Windows
+from ddco_pyro.model.tables import Tables
 from ddco_pyro.spec import SpecError, with_overrides
 from ddco_pyro.statistics import edit_score
 from ddco_pyro.training.checkpoint import Progress, Restart, State, TrainingData
+from ddco_pyro.training.em import Expectation
 from ddco_pyro.training.labels import Labels, choices
 from ddco_pyro.training.loop import train
+from ddco_pyro.training.objective import Objective
 from ddco_pyro.training.optimizers import optimizer_of
+from ddco_pyro.training.stages import plan
 
 ALONE = 1e-6
 """The power β of the controls' density under which a recogniser alone decides, with the transitions."""
 
-CANDIDATES = ((ALONE, 0.3), (0.03, 0.1), (0.1, 0.3), (0.3, 1.0), (1.0, 1.0), (1.0, 0.0))
+CANDIDATES = ((ALONE, 0.3), (0.03, 0.1), (0.1, 0.3), (1.0, 1.0), (1.0, 0.0))
 """The pairs (β, γ) that are tried: from the recogniser alone to labels alone."""
 
 RIDGES = (15.0, 50.0, 150.0)
 """The ridges of the recogniser that are tried."""
 
-FOLDS = 5
+FOLDS = 4
 """The most parts of the labelled demonstrations that are left out in turn, and the parts of a single one."""
 
 EM_STEPS = 4
-"""EM steps of a stage of a model that decodes left-out demonstrations: labels leave little to infer."""
+"""EM steps of a model that decodes left-out demonstrations, with clamped starts and then with a candidate."""
 
 ITERATIONS = 500
 """The most iterations of logistic regression."""
@@ -90,11 +94,9 @@ def recognise(model: Hierarchy, data: TrainingData, demos: Demonstrations) -> tu
     labels, own, recogniser = data.labels, data.spec.training.labels, model.recogniser
     assert labels is not None and own is not None and own.recogniser is not None and recogniser is not None
     asked = own.recogniser
-    labelled = [demo for demo in demos.select(labels.demonstrations) if (demo.labels[own.source] >= 0).any()]
-    demos = replace(demos, demonstrations=tuple(labelled), masks={})
     batch = encode(demos, model.encoder, model.scaling)
     options = choices(demos, own.source, labels.values, labels.demonstrations)
-    widths = _widths(asked.windows, [demo.labels[own.source] for demo in demos], demos.frequency)
+    widths = _widths(asked.windows, options, demos.frequency)
     features = {}
     for windows in (recogniser.around, recogniser.past):
         windows.widths.copy_(torch.tensor(widths))
@@ -151,13 +153,11 @@ NARROWEST = 1e-9
 """A feature varies where its standard deviation is a larger part of its largest value."""
 
 
-def _widths(
-    windows: tuple[int | str, ...] | None, labels: list[np.ndarray], frequency: float | None
-) -> tuple[int, ...]:
+def _widths(windows: tuple[int | str, ...] | None, options: Tensor, frequency: float | None) -> tuple[int, ...]:
     """Half widths of windows in steps; by default a quarter and three quarters of the median labelled segment."""
     if windows is None:
-        edges = [np.flatnonzero(np.diff(own, prepend=-2, append=-2)) for own in labels]
-        lengths = [np.diff(at)[own[at[:-1]] >= 0] for own, at in zip(labels, edges, strict=True)]
+        edges = [np.flatnonzero(np.diff(own, prepend=-2, append=-2)) for own in options.numpy()]
+        lengths = [np.diff(at)[own[at[:-1]] > 0] for own, at in zip(options.numpy(), edges, strict=True)]
         typical = float(np.median(np.concatenate(lengths)))
         return tuple(max(1, round(share * typical)) for share in SHARES)
     if frequency is None and any(isinstance(width, str) for width in windows):
@@ -165,7 +165,9 @@ def _widths(
             "training.labels.recogniser.windows: are in seconds, and the file does not say its control frequency; give "
             "numbers of steps"
         )
-    steps = (width if isinstance(width, int) else float(width.removesuffix("s")) * (frequency or 1) for width in windows)
+    steps = (
+        width if isinstance(width, int) else float(width.removesuffix("s")) * (frequency or 1) for width in windows
+    )
     return tuple(max(1, round(width)) for width in steps)
 
 
@@ -174,24 +176,31 @@ def _tried(
 ) -> list[Candidate]:
     """The candidates, each with its scores of the labelled steps that are left out.
 
-    A model is trained on the other labels alone, and decodes the left-out demonstrations with each candidate.
+    A model of the other labels decodes the left-out steps with each candidate. EM trains it on all demonstrations, the
+    left-out ones without their labels; a model that takes gradient steps is trained on labelled ones alone.
     """
     assert data.labels is not None
     level, scores = data.labels.level, dict[tuple[float, float, float], list[tuple[float, float]]]()
     for hidden in _left_out(options, batch.lengths):
         known = torch.where(hidden, -1, options)
-        (rows,) = torch.where((hidden & (options > 0)).any(1))
-        model, part, truth = _taught(data, batch, known, names), batch.select(rows), torch.where(hidden, options, -1)
-        with torch.no_grad():
-            tables = model.tabulate(part)
+        ratios = {}
         for ridge in RIDGES:
             learn(windows, features[known > 0], known[known > 0], ridge)
-            ratio = windows.log_ratio(features[rows, : tables.steps])
-            for power, weight in CANDIDATES:
-                evident = replace(tables, power=power).with_evidence(level, weight * ratio)
+            ratios[ridge] = windows.log_ratio(features)
+        begun = _begun(
+            data, batch, torch.where(known < 0, ratios[RIDGES[1]][..., 1:].argmax(-1) + 1, known), known, names
+        )
+        (rows,) = torch.where((hidden & (options > 0)).any(1))
+        part, truth = batch.select(rows), torch.where(hidden, options, -1)[rows]
+        for power, weight in CANDIDATES:
+            model = _continued(data, begun, batch, known, power, weight * ratios[RIDGES[1]])
+            with torch.no_grad():
+                tables = model.tabulate(part)
+            for ridge, ratio in ratios.items():
+                evident = tables.with_evidence(level, weight * ratio[rows, : tables.steps])
                 path = most_likely_path(evident, part.lengths).choices[level - 1]
                 own = scores.setdefault((power, weight, ridge), [])
-                for found, true in zip(path.numpy(), truth[rows, : tables.steps].numpy(), strict=True):
+                for found, true in zip(path.numpy(), truth[:, : tables.steps].numpy(), strict=True):
                     ours, theirs = found[true > 0], true[true > 0]
                     own.append((float((ours == theirs).mean()), edit_score(ours, theirs)))
     return [Candidate(*key, *np.mean(own, axis=0).tolist()) for key, own in scores.items()]
@@ -199,32 +208,55 @@ def _tried(
 
 def _left_out(options: Tensor, lengths: Tensor) -> Iterator[Tensor]:
     """The steps that are left out together, bool [N, T]: of whole demonstrations, or parts of a single one."""
-    count = len(options)
-    if count == 1:
-        fold = (torch.arange(options.shape[1]) * FOLDS // lengths[0]).expand(1, -1)
+    (labelled,) = torch.where((options > 0).any(1))
+    fold = torch.full_like(options, -1)
+    if len(labelled) == 1:
+        fold[labelled] = torch.arange(options.shape[1]) * FOLDS // lengths[labelled]
     else:
-        fold = (torch.arange(count) % min(FOLDS, count)).unsqueeze(1).expand(-1, options.shape[1])
-    for number in range(int(fold.max()) + 1):
+        fold[labelled] = (torch.arange(len(labelled)) % FOLDS).unsqueeze(1)
+    for number in range(FOLDS):
         hidden = fold == number
         if bool((hidden & (options > 0)).any()) and bool((~hidden & (options > 0)).any()):
             yield hidden
 
 
-def _taught(data: TrainingData, batch: Batch, known: Tensor, names: tuple[str, ...]) -> Hierarchy:
-    """A model that is trained on labelled demonstrations alone."""
+def _begun(data: TrainingData, batch: Batch, starts: Tensor, known: Tensor, names: tuple[str, ...]) -> Hierarchy:
+    """A model whose options begin as the labels say, and as the recogniser says of other steps."""
     assert data.labels is not None
-    (rows,) = torch.where((known > 0).any(1))
-    part = batch.select(rows)
-    known = known[rows, : int(part.lengths.max())]
-    spec = data.spec
-    changes = {"training.restarts": 1, "training.initialize": spec.training.start(0)}
     model = data.hierarchy(0)
-    if optimizer_of(spec.training.optimizer, model) == "em":
-        changes["training.epochs"] = EM_STEPS * (2 + model.depth)
+    if optimizer_of(data.spec.training.optimizer, model) == "em":
+        return _by_em(data, model, batch, replace(data.labels, train=starts, tune=starts))
+    (rows,) = torch.where((known > 0).any(1))
+    part, known = batch.select(rows), known[rows, : int(batch.lengths[rows].max())]
     labels = replace(data.labels, train=known, tune=known)
-    own = replace(
-        data, spec=with_overrides(spec, changes), train=part, tune=part, labels=labels,
-        names=[names[row] for row in rows.tolist()],
-    )  # fmt: skip
-    restart = train(own, Restart(Progress(0)))
-    return own.hierarchy(0, restart.states["best"])
+    changes = {"training.restarts": 1, "training.initialize": data.spec.training.start(0)}
+    spec, names = with_overrides(data.spec, changes), tuple(names[row] for row in rows.tolist())
+    alone = replace(data, spec=spec, train=part, tune=part, labels=labels, names=names)
+    return alone.hierarchy(0, train(alone, Restart(Progress(0))).states["best"])
+
+
+def _continued(
+    data: TrainingData, begun: Hierarchy, batch: Batch, known: Tensor, power: float, evidence: Tensor
+) -> Hierarchy:
+    """The model after some EM steps with a power and evidence of the steps without labels."""
+    assert data.labels is not None
+    model = data.hierarchy(0, begun.state_dict())
+    model.power.fill_(power)
+    if optimizer_of(data.spec.training.optimizer, model) != "em":
+        return model
+    evidence = torch.where((known > 0).unsqueeze(-1), 0.0, evidence)
+    labels = replace(data.labels, train=known, tune=known, evidence=(evidence, evidence))
+    return _by_em(data, model, batch, labels)
+
+
+def _by_em(data: TrainingData, model: Hierarchy, batch: Batch, labels: Labels) -> Hierarchy:
+    stage = plan(data.spec, model.depth)[-1]
+    objective = Objective(replace(data, train=batch, tune=batch, labels=labels), Progress(0), stage)
+
+    def score(tables: Tables, piece: Batch, rows: Tensor) -> Tensor:
+        return objective.values(objective.clamped(tables, rows), piece.lengths).sum()
+
+    steps = Expectation(model, stage.trained, score, data.spec.training.optimizer.ridge)
+    for _ in range(EM_STEPS):
+        steps.step(batch)
+    return model
