@@ -164,6 +164,26 @@ class Restarts(Record):
     each: Annotated[list[Restart], Field(min_length=1)]
 
 
+class Candidate(Record):
+    """Weights that were tried, and the mean accuracy and edit score of labelled demonstrations that were left out."""
+
+    power: Finite
+    weight: Finite
+    ridge: Finite
+    accuracy: Finite
+    edit: Finite
+
+
+class Recogniser(Record):
+    """How much the controls' density (``power``) and the recogniser's evidence (``weight``) count; widths in steps."""
+
+    power: Finite
+    weight: Finite
+    ridge: Finite
+    widths: list[AtLeastOne]
+    tried: LeftOut[list[Candidate]] = []
+
+
 class Training(Record):
     """The effort of training out of its budget, and whether training converged."""
 
@@ -179,6 +199,7 @@ class Training(Record):
     """Whether they are steps of L-BFGS over all training demonstrations."""
     raised_ridge: LeftOut[float | None] = None
     """The ridge of policies, where it is larger than the spec's."""
+    recogniser: LeftOut[Recogniser | None] = None
 
 
 class Compared(Record):
@@ -473,7 +494,7 @@ class Agreement(Record):
     """Agreement of each level's segments with the labels so named; None where no label is known.
 
     ``equal_train`` and ``equal_valid`` are of demonstrations that are cut into equal parts, as many as there are
-    options.
+    options. ``recogniser`` has, by part, the options that a recogniser alone finds at each step of its level.
     """
 
     labels: list[str]
@@ -481,6 +502,7 @@ class Agreement(Record):
     valid: LeftOut[list[Scores | None] | None] = None
     equal_train: LeftOut[list[Scores | None]] = []
     equal_valid: LeftOut[list[Scores | None] | None] = None
+    recogniser: LeftOut[dict[str, Scores | None]] = {}
     confusion: list[Confusion]
 
 

@@ -15,8 +15,9 @@ from ddco_pyro.acting.window import ObservationError, Window, numbers, refuse_la
 from ddco_pyro.errors import BadInput, nearest
 from ddco_pyro.inference.filtering import Belief, Filter
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.model.networks import States
+from ddco_pyro.model.networks import Inputs, States
 from ddco_pyro.model.outputs import Outputs
+from ddco_pyro.model.recogniser import Recogniser, observed
 from ddco_pyro.model.tables import complete, joint_density
 from ddco_pyro.names import choice_names
 
@@ -93,14 +94,16 @@ class Monitor:
     def reset(self) -> None:
         """Begin an episode."""
         self._window, self._filter = Window(self.hierarchy.encoder), Filter(float(self.hierarchy.power))
+        self._alone = self._filter if self.hierarchy.recogniser is None else Filter(float(self.hierarchy.power))
+        self._seen: list[Tensor] = []
         self._outputs: Outputs | None = None
         self._states: States | None = None
         self._active: dict[str, tuple[int, int]] = {}
 
     @property
     def log_likelihood(self) -> float:
-        """log p of the controls so far, nats."""
-        return float(self._filter.log_likelihood)
+        """log p of the controls so far, nats, without the evidence of a recogniser."""
+        return float(self._alone.log_likelihood)
 
     def progress(self, order: Mapping[str, Sequence[str]] = MappingProxyType({})) -> dict[str, Progress]:
         """The active option of each level that ``names`` has, and how far its run is, after :meth:`step`.
@@ -145,9 +148,14 @@ class Monitor:
             inputs = self._window.inputs([observation])
             if self._outputs is not None:
                 assert scaled is not None
-                self._filter.update(joint_density(self._outputs.tables(scaled).control)[:, 0])
+                for each in {self._filter, self._alone}:
+                    each.update(joint_density(self._outputs.tables(scaled).control)[:, 0])
             self._outputs, self._states = self.hierarchy.advance(inputs, self._states)
-            self.belief = self._filter.predict(complete(self._outputs.tables(), ONE_STEP).steps()[0])
+            tables = self._outputs.tables()
+            self.belief = self._alone.predict(complete(tables, ONE_STEP).steps()[0])
+            if (recogniser := self.hierarchy.recogniser) is not None:
+                tables = tables.with_evidence(recogniser.level, self._evidence(recogniser, inputs, scaled))
+                self.belief = self._filter.predict(complete(tables, ONE_STEP).steps()[0])
         probabilities = {}
         for (level, names), choices in zip(self.names.items(), self.belief.choices, strict=True):
             probabilities[level] = dict(zip(names, choices[0].tolist(), strict=True))
@@ -155,6 +163,16 @@ class Monitor:
             before, steps = self._active.get(level, (option, 0))
             self._active[level] = (option, steps + 1 if option == before else 1)
         return probabilities
+
+    def _evidence(self, recogniser: Recogniser, inputs: Inputs, before: Tensor | None) -> Tensor:
+        """What the past says of each choice, [1, 1, 1 + k].
+
+        :param before: the scaled control before this step, [1, 1, A'].
+        """
+        before = inputs.vector.new_zeros(1, 1, len(self.hierarchy.scaling.varying)) if before is None else before
+        now = torch.cat([observed(inputs), before.double()], dim=-1)[0, 0]
+        self._seen = [*self._seen, now][-1 - int(recogniser.past.widths.max()) :]
+        return (recogniser.gamma * recogniser.past.log_ratio(recogniser.past.latest(self._seen))).reshape(1, 1, -1)
 
     def _scaled(self, control: np.ndarray | None) -> Tensor:
         scaling = self.hierarchy.scaling

@@ -297,6 +297,8 @@ def names(fit: Fit) -> None:
         level: [(name, found.get((level, option))) for option, name in enumerate(own[1:], start=1)]
         for level, own in fit.names.items()
     }
+    if told := effort.recogniser(fit.metrics.training):
+        say(f"labels: {told}")
     written = [
         f"{name} {words.number(one.agreement)}" if one and one.name == name else name
         for level in fit.named

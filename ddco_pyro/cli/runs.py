@@ -292,7 +292,7 @@ def segment(
     from ddco_pyro.cli import console
     from ddco_pyro.data.sources import open_source
     from ddco_pyro.fitting.fitted import load
-    from ddco_pyro.segmenting import beside_baselines, beside_others, segments
+    from ddco_pyro.segmenting import baseline_labels, beside_baselines, beside_others, segments
     from ddco_pyro.segmenting.agreement import agreement_table, tolerances
     from ddco_pyro.segmenting.baselines import BASELINES, check_installed
     from ddco_pyro.segmenting.formats import Asked
@@ -310,8 +310,8 @@ def segment(
             others = {name: cut(fit, name, progress) for name in GRANULARITIES}
         fit = others.pop(granularity)
     with open_source(demos, external=allow_external) as source, console.Progress("segmenting") as progress:
-        rows = (*others, *(BASELINES if baselines else ()))
-        beside = tuple(f"{level}_{name}" for level in fit.names for name in rows)
+        beside = baseline_labels(fit) if baselines else ()
+        beside += tuple(f"{level}_{name}" for level in fit.names for name in others)
         asked = Asked(fit, run, demos, source, level or next(iter(fit.names), ""), beside)
         writers = [_writer(place, asked, settings) for place in places]
         if fit.names:  # without options, segments() refuses the run

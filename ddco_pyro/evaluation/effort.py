@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from ddco_pyro.drawing.words import capital, listed, number, verb
-from ddco_pyro.metrics import Metrics, Stage, Training
+from ddco_pyro.metrics import Candidate, Metrics, Stage, Training
 from ddco_pyro.names import method
 
 
@@ -19,6 +19,27 @@ def _over_all(training: Training) -> str:
     """The name of an optimiser whose steps are over all demonstrations, and its ridge where that was raised."""
     ridge = "" if training.raised_ridge is None else f", ridge {training.raised_ridge:g}"
     return f"EM{ridge}" if training.by_em else "L-BFGS" if training.by_lbfgs else ""
+
+
+def recogniser(training: Training) -> str:
+    """How much a recogniser's evidence counts, and what left-out demonstrations said of it; empty without one."""
+    own = training.recogniser
+    if own is None:
+        return ""
+    said = f"the controls count {own.power:g} times, the recogniser {own.weight:g} times (ridge {own.ridge:g})"
+    if not own.tried:
+        return said
+    each = {
+        "chosen": max(own.tried, key=_score),
+        "recogniser alone": max((one for one in own.tried if one.power == own.tried[0].power), key=_score),
+        "labels alone": max((one for one in own.tried if not one.weight), key=_score),
+    }
+    scores = (f"{name} {number(one.accuracy)} and {number(one.edit)}" for name, one in each.items())
+    return f"{said}; accuracy and edit score of left-out labelled demonstrations: {', '.join(scores)}"
+
+
+def _score(candidate: Candidate) -> float:
+    return candidate.accuracy + candidate.edit
 
 
 def spent(training: Training) -> str:

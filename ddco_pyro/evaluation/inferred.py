@@ -10,6 +10,7 @@ from typing import NamedTuple, overload
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from ddco_pyro.data.checks import check_fitted
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, not_demonstrations
@@ -130,6 +131,12 @@ class Inferred:
     def path(self) -> Path:
         """Choices and terminations of the most likely path, [N, T] for each level; -1 past a demonstration's end."""
         return most_likely_path(self.tables, self.batch.lengths)
+
+    @cached_property
+    def recognised(self) -> Tensor | None:
+        """The likeliest option of every step by the recogniser alone, [N, T]; None without one."""
+        recogniser = self.hierarchy.recogniser
+        return None if recogniser is None else recogniser.options(self.batch)
 
     def segmented(self, row: int, lasts: Sequence[bool]) -> list[tuple[np.ndarray, np.ndarray]]:
         """The most likely choices of one demonstration, and where segments begin, each [T], for each level.

@@ -54,22 +54,27 @@ class _Part:
     :param values: log p(ξ) of each demonstration, nats, [N].
     :param each: the decomposition of the same.
     :param segments: the most likely options [T] of each demonstration, for each level.
+    :param recognised: the options that a recogniser alone finds, [T] of each demonstration; empty without one.
     """
 
     values: np.ndarray
     each: Decomposition
     segments: list[list[np.ndarray]]
+    recognised: list[np.ndarray]
 
     @classmethod
     def of(cls, fit: Fit, demos: Demonstrations, held_out: bool = False) -> _Part:
-        values, parts, paths = [], [], []
+        values, parts, paths, recognised = [], [], [], list[np.ndarray]()
         named = _Names(fit, demos) if held_out and fit.without else None
         for piece in fit.infer(demos, held_out):
             values.append(_finite(fit, piece))
             parts.append(piece.decomposition)
             paths.append(named.alike(piece) if named else piece.path.choices)
+            if piece.recognised is not None:
+                rows = zip(piece.recognised.numpy(), piece.lengths, strict=True)
+                recognised += [row[:steps] for row, steps in rows]
         segments = [[row[row >= 0].numpy() for h in level for row in h] for level in zip(*paths, strict=True)]
-        return cls(np.concatenate(values), Decomposition.joined(parts), segments)
+        return cls(np.concatenate(values), Decomposition.joined(parts), segments, recognised)
 
 
 class _Names:
@@ -176,7 +181,7 @@ def evaluate(
         options=options,
         segments=segments,
         divergences=alike,
-        agreement=_agreement(labels, counts, ours, parts) if labels else None,
+        agreement=_agreement(labels, counts, ours, parts, fitted.hierarchy) if labels else None,
         control_frequency=demos.frequency,
         trained_labels=_trained_labels(fitted, demos),
         **about,
@@ -245,7 +250,11 @@ def _by_dimension(fit: Fit, each: Decomposition, demos: Demonstrations) -> Dimen
 
 
 def _agreement(
-    names: Sequence[str], counts: Sequence[int], ours: dict[str, _Part], parts: dict[str, Demonstrations]
+    names: Sequence[str],
+    counts: Sequence[int],
+    ours: dict[str, _Part],
+    parts: dict[str, Demonstrations],
+    model: Hierarchy,
 ) -> Agreement:
     """All measures of each level's segments against its labels, and the confusion matrix of the held-out part.
 
@@ -262,6 +271,10 @@ def _agreement(
     }
     scores = {name: [agreement(*pair) for pair in each] for name, each in pairs.items()}
     tables = [confusion(*pair) for pair in pairs.get("valid", pairs["train"])]
+    alone = {}
+    if model.recogniser is not None:
+        level = model.recogniser.level - 1
+        alone = {name: agreement(ours[name].recognised, pairs[name][level][1]) for name in parts}
     equal = {
         name: [of_equal_lengths(labels, count) for (_, labels), count in zip(each, counts, strict=True)]
         for name, each in pairs.items()
@@ -272,6 +285,7 @@ def _agreement(
         valid=scores.get("valid"),
         equal_train=equal["train"],
         equal_valid=equal.get("valid"),
+        recogniser=alone,
         confusion=tables,
     )
 

@@ -26,6 +26,8 @@ class Belief(NamedTuple):
 class Filter:
     """An exact filter: call :meth:`predict` with each step's tables, then :meth:`update` with its control.
 
+    Evidence in a step's tables conditions the belief at this step and later ones; it has to be of the past alone.
+
     :param power: β, how many times the log-density of a control counts in later beliefs.
     """
 
@@ -44,6 +46,8 @@ class Filter:
         if self._before is not None and self._before.shape != (expected := _joint(now)):
             raise BadTables(f"step: expected joint choices {list(self._before.shape)}; got {list(expected)}")
         arrival = arrive(self._before, now)
+        if now.evidence is not None:
+            arrival = _given(arrival, now, now.evidence)
         self._now = arrival.message
         return Belief(tuple(_marginals(arrival, level) for level in range(len(now.selection))))
 
@@ -62,6 +66,22 @@ class Filter:
         self.log_likelihood = self.log_likelihood + total
         message = self._now + self.power * density
         self._before, self._now = message - _log_mass(message).reshape(-1, *(1,) * (message.dim() - 1)), None
+
+
+def _given(arrival: Arrival, now: Step, evidence: Tensor) -> Arrival:
+    """The arrival given evidence of the joint choice, [N, C_D, ..., C_1].
+
+    What is kept or selected at level d leaves all lower levels to be selected: the evidence there is summed over them.
+    """
+    message = arrival.message + evidence
+    mass, kept, selected = _log_mass(message), list[Tensor](), list[Tensor]()
+    for level, table in enumerate(now.selection):
+        own = evidence - mass.reshape(-1, *(1,) * (evidence.dim() - 1))
+        kept += [arrival.kept[level] + own] if arrival.kept else []
+        selected.append(arrival.selected[level] + own)
+        above = table.reshape(table.shape[:1] + (1,) * (evidence.dim() - 3) + table.shape[1:])
+        evidence = log_sum(evidence + (above if evidence.dim() > 2 else table.squeeze(1)))
+    return Arrival(message - mass.reshape(-1, *(1,) * (message.dim() - 1)), kept, selected)
 
 
 def _log_mass(message: Tensor) -> Tensor:

@@ -170,9 +170,8 @@ class Hierarchy(nn.Module):
             self.meta_policy = Caller(network, emits, below, shape, spec.control, scaling, copies=1)
         self.recogniser: Recogniser | None = None
         if spec.hierarchy is not None and (labels := spec.training.labels) is not None and labels.recogniser:
-            level = [each.name for each in spec.hierarchy.levels].index(labels.level)
-            count, size = spec.hierarchy.levels[level].count, len(scaling.varying)
-            self.recogniser = Recogniser(1 + level, count, self.input_shape, size)
+            place = 1 + [each.name for each in spec.hierarchy.levels].index(labels.level)
+            self.recogniser = Recogniser(place, levels[place - 1].count, self.input_shape, len(scaling.varying))
 
     def place(self, device: torch.device) -> Hierarchy:
         """Move the networks, and nothing else, to a device. Their callers give and get tensors on the host."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -66,6 +66,10 @@ class Windows(nn.Module):
             low, high = (sums.gather(1, end.unsqueeze(-1).expand(*end.shape, x.shape[-1])) for end in (first, last))
             columns.append((high - low) / (last - first).unsqueeze(-1))
         return torch.cat(columns, dim=-1)
+
+    def latest(self, rows: Sequence[Tensor]) -> Tensor:
+        """The features [3 F] of the last of consecutive steps, from x of each [F]; for a regression on the past."""
+        return torch.cat([rows[-1], *(torch.stack([*rows[-1 - width :]]).mean(0) for width in self.widths.tolist())])
 
     def log_probability(self, features: Tensor) -> Tensor:
         """log r(h | window), [..., k]; -inf for an option without labelled steps."""

@@ -7,13 +7,14 @@ from collections.abc import Sequence
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.sources.recording import label_names
 from ddco_pyro.drawing.page import Block, Section, Table, Text, footnote, note
-from ddco_pyro.drawing.words import number, percent
+from ddco_pyro.drawing.words import capital, number, percent
+from ddco_pyro.evaluation.effort import recogniser
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Confusion, Scores
 from ddco_pyro.names import label_name, option_name
 from ddco_pyro.report.options import quoted
 from ddco_pyro.segmenting.agreement import EXPLAINED, agreement_table, tolerances
-from ddco_pyro.segmenting.baselines import BASELINES, EQUAL
+from ddco_pyro.segmenting.baselines import BASELINES, EQUAL, RECOGNISED
 
 
 def section(fit: Fit, demos: Demonstrations) -> Section | None:
@@ -22,18 +23,25 @@ def section(fit: Fit, demos: Demonstrations) -> Section | None:
     names, truth = list(fit.names), fit.spec.demonstrations.labels_by_level(len(fit.names))
     if not record or not truth:
         return None
-    scores = dict[str, Scores | None]()
-    sides = (("held out", record.valid, record.equal_valid), ("training", record.train, record.equal_train))
+    scores, given = dict[str, Scores | None](), fit.spec.training.labels
+    sides = (
+        ("held out", "valid", record.valid, record.equal_valid),
+        ("training", "train", record.train, record.equal_train),
+    )
     for place, level in enumerate(names):
         before = f"{level}: " if len(names) > 1 else ""
-        for words, found, equal in sides:
+        for words, part, found, equal in sides:
             if found is not None and equal is not None:
                 scores[f"{before}options, {words}"] = found[place]
+                if given is not None and level == given.level and part in record.recogniser:
+                    scores[f"{before}{RECOGNISED}, {words}"] = record.recogniser[part]
                 scores[f"{before}{BASELINES[EQUAL]}, {words}"] = equal[place]
     known = label_names(demos.attributes)
     compared = quoted(fit.spec.demonstrations.label_names)
     blocks: list[Block] = [Text(f"Options and the ground-truth {compared}."), agreement_table(scores)]
     blocks.append(footnote(f"{EXPLAINED} {tolerances(demos.frequency)}"))
+    if told := recogniser(fit.metrics.training):
+        blocks.append(Text(f"{capital(told)}."))
     for level, label, own in zip(names, truth, record.confusion, strict=True):
         names_of_labels = [label_name(label, value, known.get(label, ()), level) for value in own.labels]
         title = f"Where each label’s steps lie: level “{level}”, label “{label}”"

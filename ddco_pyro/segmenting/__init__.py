@@ -27,7 +27,16 @@ from ddco_pyro.metrics import Scores
 from ddco_pyro.segmenting import baselines
 from ddco_pyro.training.data import parts
 
-__all__ = ["LevelLabels", "Segmented", "Segments", "beside_baselines", "beside_others", "recorded", "segments"]
+__all__ = [
+    "LevelLabels",
+    "Segmented",
+    "Segments",
+    "baseline_labels",
+    "beside_baselines",
+    "beside_others",
+    "recorded",
+    "segments",
+]
 
 
 OTHERS = {name: f"options, {name}" for name in ("coarse", "medium", "fine")}
@@ -129,7 +138,7 @@ class Segmented:
                 equal = f"{baselines.BASELINES[baselines.EQUAL]}, {part}"
                 scores[equal] = of_equal_lengths(labels, self.counts[level])
             for part, group in [*groups.items()][:1]:
-                for name, words in (baselines.BASELINES | OTHERS).items():
+                for name, words in (baselines.BASELINES | {baselines.RECOGNISER: baselines.RECOGNISED} | OTHERS).items():
                     if f"{level}_{name}" in group[0].baselines and name != baselines.EQUAL:
                         kinds = [demo.baselines[f"{level}_{name}"] for demo in group]
                         agreements[level][f"{words}, {part}"] = scores_of(kinds, [demo.labels[truth] for demo in group])
@@ -190,10 +199,19 @@ def of_run(
     return Segmented(tuple(segmented), counts, frequency, truth, fit.names, known, matched)
 
 
+def baseline_labels(fit: Fit) -> tuple[str, ...]:
+    """The names of the labels of baselines: ``<level>_<baseline>``."""
+    names = [f"{level}_{name}" for level in fit.names for name in baselines.BASELINES]
+    own = fit.hierarchy.recogniser
+    return (*names, *([] if own is None else [f"{[*fit.names][own.level - 1]}_{baselines.RECOGNISER}"]))
+
+
 def beside_baselines(
     segmented: Segmented, fit: Fit, source: Source, gripper: int = -1, on_event: OnEvent = ignore
 ) -> Segmented:
     """The same segments with the labels of every baseline, fitted to the run's training demonstrations.
+
+    The options that a run's recogniser alone finds stand beside them.
 
     :param gripper: the control dimension whose changes divide demonstrations in the baseline ``gripper``.
     :raises BadInput: there is no such control dimension, or a package is not installed.
@@ -206,6 +224,12 @@ def beside_baselines(
             seed, observations = fit.spec.seed, fit.spec.observations
             found[f"{level}_{name}"] = baselines.segment(name, train, demos, count, seed, observations, gripper)
             on_event(BaselineSegmented(name, total))
+    if fit.hierarchy.recogniser is not None:
+        found[baseline_labels(fit)[-1]] = [
+            row[:steps].numpy() - 1
+            for piece in fit.infer(demos)
+            for row, steps in zip(() if piece.recognised is None else piece.recognised, piece.lengths, strict=True)
+        ]
     each = (
         replace(demo, baselines={**demo.baselines, **{name: kinds[row] + 1 for name, kinds in found.items()}})
         for row, demo in enumerate(segmented.segments)

@@ -22,6 +22,10 @@ from ddco_pyro.model.recogniser import block_means
 from ddco_pyro.spec import ObservationSpec
 from ddco_pyro.training.initialization import distinct, joined
 
+RECOGNISER = "recogniser"
+RECOGNISED = "recogniser alone"
+"""The options of single steps that a run's recogniser finds, beside the baselines; and their name in tables."""
+
 EQUAL = "equal"
 """The baseline of parts of equal length."""
 

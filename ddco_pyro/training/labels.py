@@ -64,8 +64,8 @@ class Labels:
                 f"hierarchy.levels.{number - 1}.count, or say -1 for labels that are no option"
             )
         names = tuple(demo.name for demo in used)
-        options = (choices(part, labels.source, values, names) for part in (train, tune))
-        return cls(number, labels.hold, values, names, *options)
+        ours, theirs = (choices(part, labels.source, values, names) for part in (train, tune))
+        return cls(number, labels.hold, values, names, ours, theirs)
 
     def matter_in(self, stage: Stage) -> bool:
         """Whether a stage of training uses the labels."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,7 +14,7 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.inference.paths import most_likely_path
 from ddco_pyro.model.batch import Batch, encode
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.model.recogniser import SCALES, Windows
+from ddco_pyro.model.recogniser import Windows
 from ddco_pyro.model.tables import Tables
 from ddco_pyro.spec import SpecError, with_overrides
 from ddco_pyro.statistics import edit_score
@@ -82,6 +83,10 @@ class Recognition:
     widths: tuple[int, ...]
     tried: tuple[Candidate, ...]
 
+    def as_data(self) -> dict[str, Any]:
+        """What ``metrics.json`` has of it."""
+        return {name: value for name, value in asdict(self).items() if name != "state"}
+
 
 def recognise(model: Hierarchy, data: TrainingData, demos: Demonstrations) -> tuple[TrainingData, Recognition]:
     """Teach a hierarchy's recogniser the labelled steps, and say what it makes of the others.
@@ -92,7 +97,10 @@ def recognise(model: Hierarchy, data: TrainingData, demos: Demonstrations) -> tu
     :raises SpecError: windows are in seconds, and the frequency of the control is not known.
     """
     labels, own, recogniser = data.labels, data.spec.training.labels, model.recogniser
-    assert labels is not None and own is not None and own.recogniser is not None and recogniser is not None
+    assert labels is not None
+    assert own is not None
+    assert own.recogniser is not None
+    assert recogniser is not None
     asked = own.recogniser
     batch = encode(demos, model.encoder, model.scaling)
     options = choices(demos, own.source, labels.values, labels.demonstrations)
@@ -101,7 +109,7 @@ def recognise(model: Hierarchy, data: TrainingData, demos: Demonstrations) -> tu
     for windows in (recogniser.around, recogniser.past):
         windows.widths.copy_(torch.tensor(widths))
         features[windows] = windows.features(batch.inputs, batch.actions, batch.lengths)
-    power, weight, ridge, tried = data.spec.control.power, asked.weight, asked.ridge, ()
+    power, weight, ridge, tried = data.spec.control.power, asked.weight, asked.ridge, tuple[Candidate, ...]()
     if asked.cross_validated:
         tried = tuple(_tried(data, recogniser.around, features[recogniser.around], batch, options, demos.names))
         best = max(tried, key=lambda candidate: candidate.score)
@@ -110,15 +118,12 @@ def recognise(model: Hierarchy, data: TrainingData, demos: Demonstrations) -> tu
         learn(windows, rows[options > 0], options[options > 0], ridge)
     recogniser.gamma.fill_(weight)
     model.power.fill_(power)
-    evidence = [
+    evidence, tuning = (
         torch.where((known >= 0).unsqueeze(-1), 0.0, recogniser.evidence(part))
         for known, part in ((labels.train, data.train), (labels.tune, data.tune))
-    ]
-    taught = replace(
-        labels,
-        evidence=tuple(evidence),
-        starts=(recogniser.options(data.train), recogniser.options(data.tune)),
     )
+    starts = recogniser.options(data.train), recogniser.options(data.tune)
+    taught = replace(labels, evidence=(evidence, tuning), starts=starts)
     state = {name: value.clone() for name, value in recogniser.state_dict().items()}
     spec = with_overrides(data.spec, {"control.power": power})
     found = Recognition(state, power, weight, ridge, widths, tried)

@@ -252,6 +252,7 @@ class Trainer:
             "by_em": optimizer == "em",
             "by_lbfgs": optimizer == "lbfgs",
             "raised_ridge": self.ridge if self.ridge != self.spec.training.optimizer.ridge.policy else None,
+            "recogniser": None if self.recognition is None else self.recognition.as_data(),
         }
 
     def _segments(self, number: int) -> np.ndarray:
