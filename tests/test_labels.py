@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from command_line import call
-from oracle import paths
+from oracle import brute_force, paths
 from planted import CONTROL, make_spec, make_trainer, make_truth, plant, small_spec, tabulated
 from random_demonstrations import numbered
 from sklearn.metrics import normalized_mutual_info_score
@@ -19,7 +19,8 @@ from sklearn.metrics import normalized_mutual_info_score
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.evaluation.agreement import agreement
-from ddco_pyro.inference import segment
+from ddco_pyro.evaluation.inferred import infer
+from ddco_pyro.inference import log_likelihood, segment
 from ddco_pyro.model.batch import encode
 from ddco_pyro.report import write_report
 from ddco_pyro.spec import SpecError
@@ -29,6 +30,7 @@ from ddco_pyro.training.labels import Labels
 from ddco_pyro.training.loop import backward
 from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.objective import Objective
+from ddco_pyro.training.recognition import _left_out, _widths
 from ddco_pyro.training.restarts import Trainer
 from ddco_pyro.training.stages import plan
 
@@ -205,6 +207,163 @@ def clustered(states, count, labels):
     model = make_truth(make_spec((2,)))
     batch = encode(numbered([({"state": states}, states)]), model.encoder, model.scaling)
     return Clusters(batch, count, seed=0, labels=torch.tensor([list(labels)])).choices(batch)[0].numpy()
+
+
+# --- a recogniser of labelled steps -----------------------------------------------------------------------------------
+
+RECOGNISER = {"weight": 0.7, "ridge": 3.0, "windows": [1, 2]}
+
+
+def window(rows, width, past=False):
+    """Means over windows that are cut at the ends, one after another."""
+    return np.stack([rows[max(t - width, 0) : t + 1 + (0 if past else width)].mean(0) for t in range(len(rows))])
+
+
+def features(demo, past=False):
+    """Those of a demonstration whose observation and control are neither standardised nor of other dimensions."""
+    actions = np.concatenate([np.zeros((1, 2)), demo.actions[:-1]]) if past else demo.actions
+    rows = np.concatenate([demo.observations["state"], actions], axis=1)
+    return np.concatenate([rows, *(window(rows, width, past) for width in RECOGNISER["windows"])], axis=1)
+
+
+@pytest.fixture(scope="module")
+def recognised():
+    """Demonstrations, of which some have labels of two of three options, and a trainer with a recogniser of them."""
+    random = np.random.default_rng(3)
+    phases = [[5, 5, -1, 9, 9], [-1] * 4, [9, 9, 5, 5, 5, -1], [-1] * 5, [5, 9, 5], [-1] * 6]
+
+    def one(phase):
+        state, actions = random.normal(size=(2, len(phase), 2))
+        return {"state": state + np.array(phase)[:, None] / 5}, actions, {"phase": np.array(phase)}
+
+    demos = numbered(map(one, phases))
+    spec = labelled(counts=(3,), training={"seed": 1, "epochs": 2}, recogniser=RECOGNISER)
+    spec = ddco_pyro.spec.with_overrides(spec, {"observations": [{"key": "state", "standardize": False}]})
+    return demos, make_trainer(spec, demos, None)
+
+
+def recogniser_of_sklearn(demos, past=False):
+    from sklearn.linear_model import LogisticRegression
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import StandardScaler
+
+    known = [demo for demo in demos if (demo.labels["phase"] >= 0).any()]
+    rows, labels = (
+        np.concatenate([part[demo.labels["phase"] >= 0] for demo, part in zip(known, each, strict=True)])
+        for each in ([features(demo, past) for demo in known], [demo.labels["phase"] for demo in known])
+    )
+    regression = LogisticRegression(C=1 / RECOGNISER["ridge"], max_iter=500)
+    return make_pipeline(StandardScaler(), regression).fit(rows, labels), np.array(
+        [(labels == 5).mean(), (labels == 9).mean()]
+    )
+
+
+@pytest.mark.parametrize("past", [False, True])
+def test_it_is_the_regression_of_scikit_learn_on_windows(recognised, past):
+    demos, trainer = recognised
+    truth, share = recogniser_of_sklearn(demos, past)
+    model = trainer.hierarchy
+    batch = encode(demos, model.encoder, model.scaling)
+    windows = model.recogniser.past if past else model.recogniser.around
+    ratio = windows.log_ratio(windows.features(batch.inputs, batch.actions, batch.lengths))
+    for demo, own in zip(demos, ratio.numpy(), strict=True):
+        expected = np.maximum(truth.predict_log_proba(features(demo, past)), -12) - np.log(share)
+        np.testing.assert_allclose(own[: len(demo), 1:3], expected, atol=1e-4)
+        np.testing.assert_array_equal(own[: len(demo), [0, 3]], 0.0)  # of control, and of the option without labels
+
+
+def test_evidence_is_a_factor_of_every_path(recognised):
+    """Against the sum over all paths, and Pyro's program with factors; the log-likelihood has no evidence."""
+    demos, trainer = recognised
+    model = trainer.hierarchy
+    (piece,) = infer(model, demos.select(["demo_1", "demo_4"]))
+    assert float(piece.tables.evidence[0].abs().max()) > 0.1
+    for n, length in enumerate(piece.lengths):
+        truth = brute_force(piece.tables, n, length)
+        np.testing.assert_allclose(piece.posterior.u[0][n, :length].numpy(), truth.u[0], atol=1e-9)
+        for engine in ("fused", "enumerate"):
+            found = log_likelihood(piece.tables, piece.batch.lengths, engine)[n]
+            assert float(found) == pytest.approx(truth.log_likelihood, abs=1e-6)
+        path = max(paths(piece.tables, n, length, [4]), key=lambda one: one[2])
+        assert piece.path.choices[0][n, :length].tolist() == [h for (h,) in path[0]]
+        alone = brute_force(model.tabulate(piece.batch), n, length).log_likelihood
+        assert piece.log_likelihood[n] == pytest.approx(alone, abs=1e-6)
+
+
+def test_in_training_evidence_is_of_steps_without_labels_and_starts_are_the_recognisers(recognised):
+    _, trainer = recognised
+    labels, first = trainer.data.labels, Objective(trainer.data, Progress(0), plan(trainer.data.spec, 1)[0])
+    given = trainer.hierarchy.recogniser.evidence(trainer.data.train)
+    free = labels.train < 0
+    torch.testing.assert_close(labels.evidence[0][free], given[free])
+    assert not labels.evidence[0][~free].any()
+    best = given[..., 1:3] + trainer.hierarchy.recogniser.gamma * trainer.hierarchy.recogniser.around.share[:2].log()
+    alive = torch.arange(free.shape[1]) < trainer.data.train.lengths[:, None]
+    torch.testing.assert_close(first.known[0][1][free & alive], best.argmax(-1)[free & alive] + 1)
+    torch.testing.assert_close(first.known[0][1][~free], labels.train[~free])
+
+
+def test_a_recogniser_places_what_labels_alone_do_not(tmp_path):
+    """Two skills that move alike at every single step, at places that differ by person: only what is around tells."""
+    random = np.random.default_rng(0)
+
+    def one(number):
+        phase = np.repeat([0, 1, 0, 1], random.integers(12, 18, 4))
+        fast = np.sin(np.arange(len(phase)) * np.where(phase, 2.4, 0.3))[:, None] + random.normal(size=(len(phase), 1))
+        drift = np.where(phase, 1.0, -1.0)[:, None] + 1.5 * random.normal(size=(len(phase), 1))
+        known = phase if number < 3 else np.full_like(phase, -1)
+        return (
+            {"state": np.hstack([drift, fast])},
+            random.normal(size=(len(phase), 2)),
+            {"phase": phase, "known": known},
+        )
+
+    demos = numbered(one(number) for number in range(14))
+    train, held_out = demos.select(demos.names[:10]), demos.select(demos.names[10:])
+    found = {}
+    for name, own in {"clamped": None, "recogniser": {"cross_validated": True}}.items():
+        labels = {"level": "level-1", "from": "known", **({"recogniser": own} if own else {})}
+        spec = small_spec((2,), training={"optimizer": {"name": "em"}, "labels": labels, "epochs": 40})
+        fit = ddco_pyro.fit(spec, train, out=tmp_path / name)
+        paths = [*fit.segment(held_out)[0]]
+        truth = [demo.labels["phase"] + 1 for demo in held_out]
+        found[name] = np.mean(np.concatenate(paths) == np.concatenate(truth))
+    print(found)
+    assert found["recogniser"] > 0.9
+    assert found["recogniser"] > found["clamped"] + 0.1
+    again = ddco_pyro.load(tmp_path / "recogniser")
+    chosen = again.metrics.training.recogniser
+    best = max(chosen.tried, key=lambda one: one.accuracy + one.edit)
+    assert (chosen.power, chosen.weight, chosen.ridge) == (best.power, best.weight, best.ridge)
+    assert float(again.hierarchy.power) == chosen.power
+    assert float(again.hierarchy.recogniser.gamma) == chosen.weight
+    for own, other in zip(fit.segment(held_out)[0], again.segment(held_out)[0], strict=True):
+        np.testing.assert_array_equal(own, other)
+    page = write_report(again, again.demonstrations).read_text()
+    assert "of left-out labelled demonstrations: chosen" in page
+
+
+@pytest.mark.parametrize(
+    ("windows", "hertz", "widths"), [([4, 9], None, (4, 9)), (["1s", 2], 10.0, (10, 2)), (None, None, (1, 2))]
+)
+def test_windows_are_in_steps_or_seconds_or_follow_from_labelled_segments(windows, hertz, widths):
+    options = torch.tensor([[1, 1, 1, -1, 2, 2, 2], [-1, 1, 1, 1, 2, -1, -1]])
+    assert _widths(windows, options, hertz) == widths
+
+
+def test_seconds_need_a_frequency():
+    with pytest.raises(SpecError, match="the file does not say its control frequency"):
+        _widths(("1s", "3s"), torch.ones(1, 4, dtype=torch.long), None)
+
+
+def test_demonstrations_are_left_out_whole_and_a_single_one_by_parts():
+    options, lengths = torch.tensor([[1, 2, 1, 2, 1], [-1] * 5, [2, 2, 1, -1, -1]]), torch.tensor([5, 4, 3])
+    each = [hidden.any(1).tolist() for hidden in _left_out(options, lengths)]
+    assert each == [[True, False, False], [False, False, True]]
+    single = torch.tensor([[1, 2, 1, 2, 1, 1, 2, 2]])
+    parts = torch.stack([*_left_out(single, torch.tensor([8]))])
+    assert parts.sum(0).eq(1).all()
+    assert len(parts) == 4
 
 
 # --- planted options --------------------------------------------------------------------------------------------------

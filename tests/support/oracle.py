@@ -104,13 +104,7 @@ def paths(tables: Tables, n: int, length: int, sizes: list[int]) -> Iterator[tup
     """Every possible (h, b) with its joint density; a step that follows another is looked up when it is seen again."""
     joint = list(itertools.product(*map(range, sizes)))
     ends = list(itertools.product((0, 1), repeat=len(sizes)))
-    known = Tables(
-        *(
-            tuple(table[n].tolist() for table in part)
-            for part in (tables.selection, tables.termination, tables.control)
-        ),
-        power=tables.power,
-    )
+    known = _lists(tables, n)
 
     @functools.cache
     def following(t: int, before: tuple[int, ...] | None) -> list[tuple[tuple[int, ...], tuple[int, ...], float]]:
@@ -129,8 +123,9 @@ def paths(tables: Tables, n: int, length: int, sizes: list[int]) -> Iterator[tup
 
 def _lists(tables: Tables, n: int) -> Tables:
     """The tables of one trajectory as lists."""
-    parts = (tables.selection, tables.termination, tables.control)
-    return Tables(*(tuple(table[n].tolist() for table in part) for part in parts), power=tables.power)
+    parts = (tables.selection, tables.termination, tables.control, tables.evidence)
+    cut = (tuple(None if table is None else table[n].tolist() for table in part) for part in parts)
+    return Tables(*cut, power=tables.power)
 
 
 def _step(tables: Tables, t: int, h: tuple[int, ...], b: tuple[int, ...], before: tuple[int, ...] | None) -> float:
@@ -150,7 +145,8 @@ def _step(tables: Tables, t: int, h: tuple[int, ...], b: tuple[int, ...], before
             probability *= float(h[d] == 0)
         else:
             probability *= math.exp(tables.selection[d][t][0 if caller is None else caller - 1][h[d]])
-    return probability * math.exp(tables.power * log_density(tables, t, h))
+    evidence = sum(table[t][choice] for table, choice in zip(tables.evidence, h, strict=False) if table is not None)
+    return probability * math.exp(tables.power * log_density(tables, t, h) + evidence)
 
 
 def log_density(tables: Tables, t: int, h: tuple[int, ...]) -> float:
