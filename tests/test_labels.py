@@ -30,7 +30,8 @@ from ddco_pyro.training.labels import Labels
 from ddco_pyro.training.loop import backward
 from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.objective import Objective
-from ddco_pyro.training.recognition import _left_out, _widths
+from ddco_pyro.training.recognition import Candidate, _left_out, _widths
+from ddco_pyro.training.recognition import chosen as best_of
 from ddco_pyro.training.restarts import Trainer
 from ddco_pyro.training.stages import plan
 
@@ -323,24 +324,37 @@ def test_a_recogniser_places_what_labels_alone_do_not(tmp_path):
     found = {}
     for name, own in {"clamped": None, "recogniser": {"cross_validated": True}}.items():
         labels = {"level": "level-1", "from": "known", **({"recogniser": own} if own else {})}
-        spec = small_spec((2,), training={"optimizer": {"name": "em"}, "labels": labels, "epochs": 40})
+        training = {"optimizer": {"name": "em"}, "labels": labels, "epochs": 40}
+        spec = small_spec((2,), training=training, demonstrations={"path": "unused.hdf5", "labels": "phase"})
         fit = ddco_pyro.fit(spec, train, out=tmp_path / name)
         paths = [*fit.segment(held_out)[0]]
         truth = [demo.labels["phase"] + 1 for demo in held_out]
         found[name] = np.mean(np.concatenate(paths) == np.concatenate(truth))
-    print(found)
     assert found["recogniser"] > 0.9
     assert found["recogniser"] > found["clamped"] + 0.1
     again = ddco_pyro.load(tmp_path / "recogniser")
     chosen = again.metrics.training.recogniser
-    best = max(chosen.tried, key=lambda one: one.accuracy + one.edit)
-    assert (chosen.power, chosen.weight, chosen.ridge) == (best.power, best.weight, best.ridge)
+    assert (chosen.power, chosen.weight, chosen.ridge) == best_of(
+        [Candidate(*(getattr(one, name) for name in Candidate.__annotations__)) for one in chosen.tried]
+    )
     assert float(again.hierarchy.power) == chosen.power
     assert float(again.hierarchy.recogniser.gamma) == chosen.weight
     for own, other in zip(fit.segment(held_out)[0], again.segment(held_out)[0], strict=True):
         np.testing.assert_array_equal(own, other)
     page = write_report(again, again.demonstrations).read_text()
     assert "of left-out labelled demonstrations: chosen" in page
+    row = again.metrics.agreement.recogniser["train"]
+    assert f"<td>recogniser alone, training</td><td>{row.nmi:.2f}</td>" in page
+
+
+def test_the_pair_is_chosen_by_its_mean_over_ridges():
+    scores = {(0.1, 0.3): (0.5, 0.9), (1.0, 0.0): (0.8, 0.7)}
+    tried = [
+        Candidate(*pair, ridge, score, score)
+        for pair, own in scores.items()
+        for ridge, score in zip((15, 50), own, strict=True)
+    ]
+    assert best_of(tried) == (1.0, 0.0, 15)
 
 
 @pytest.mark.parametrize(

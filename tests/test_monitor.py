@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from hierarchies import make_hierarchy
-from planted import make_spec
+from planted import make_spec, make_trainer
 from random_demonstrations import of_states
 
 import ddco_pyro
@@ -48,6 +50,67 @@ def test_what_it_says_at_the_end_is_what_the_demonstration_says(counts, network)
         torch.testing.assert_close(level[0].sum(-1), expected.u[d][0, -1], atol=1e-6, rtol=0)
         assert list(active[f"level-{1 + d}"].values()) == pytest.approx(level[0].sum(-1).tolist())
         torch.testing.assert_close(level[0, :, 1], expected.v[d][0, -1], atol=1e-6, rtol=0)
+
+
+@pytest.fixture(scope="module")
+def watched():
+    """A hierarchy of two levels with a recogniser of the upper one, and demonstrations."""
+    demos = of_states([9, 7, 8, 9], seed=4)
+    labels = [np.where(np.arange(len(demo)) % 5 == 4, -1, np.arange(len(demo)) // 3 % 2) for demo in demos]
+    known = (replace(demo, labels={"phase": own}) for demo, own in zip(demos, labels, strict=True))
+    demos = Demonstrations(tuple(known))
+    recogniser = {"weight": 0.8, "windows": [1, 3]}
+    own = {"level": "level-2", "from": "phase", "recogniser": recogniser}
+    return make_trainer(make_spec((2, 2), labels=own), demos, None).hierarchy.eval(), demos
+
+
+def beliefs(hierarchy, demo, until=None):
+    monitor, found = Monitor(hierarchy), []
+    for t in range(until or len(demo)):
+        monitor.step({"state": demo.observations["state"][t]}, demo.actions[t - 1] if t else None)
+        found.append([level[0].numpy() for level in monitor.belief.levels])
+    return found, monitor.log_likelihood
+
+
+def test_a_recogniser_of_the_past_is_evidence_at_every_step(watched):
+    """Against a slow recomputation of everything at every step; the log-likelihood has no evidence."""
+    hierarchy, demos = watched
+    demo, past = demos[0], hierarchy.recogniser.past
+    found, value = beliefs(hierarchy, demo)
+    for t, levels in enumerate(found):
+        batch = encode(Demonstrations([demo]), hierarchy.encoder, hierarchy.scaling).select(torch.tensor([0]), t + 1)
+        actions = torch.cat([torch.zeros(1, 1, 2), batch.actions[:, :t]], dim=1)
+        x = torch.cat([batch.inputs.vector, actions], dim=-1)[0].double()
+        rows = [torch.cat([x[s], *(x[max(s - w, 0) : s + 1].mean(0) for w in (1, 3))]) for s in range(t + 1)]
+        ratio = (torch.stack(rows) @ past.weight + past.bias).log_softmax(-1).clamp(min=-12) - past.share.log()
+        evidence = torch.cat([torch.zeros(t + 1, 1), 0.8 * ratio], dim=1)[None]
+        with torch.no_grad():
+            tables = hierarchy.tabulate(batch).with_evidence(2, evidence)
+        last = torch.arange(t + 1)[:, None] == t  # the control at t is not known yet
+        known = tuple(torch.where(last & (table > -torch.inf), 0.0, table) for table in tables.control)
+        expected = posterior(replace(tables, control=known), batch.lengths)
+        for d, level in enumerate(levels):
+            np.testing.assert_allclose(level.sum(-1), expected.u[d][0, -1], atol=1e-6)
+            np.testing.assert_allclose(level[:, 1], expected.v[d][0, -1], atol=1e-6)
+    with torch.no_grad():
+        alone = log_likelihood(hierarchy.tabulate(batch), torch.tensor([len(demo) - 1]))
+    assert value == pytest.approx(float(alone), rel=1e-5)
+
+
+def test_a_monitor_with_a_recogniser_sees_the_past_alone(watched):
+    hierarchy, demos = watched
+    demo, steps = demos[0], 6
+    later = np.arange(len(demo)) >= steps
+    other = replace(
+        demo,
+        observations={"state": np.where(later[:, None], 7.0, demo.observations["state"])},
+        actions=np.where((np.arange(len(demo)) >= steps - 1)[:, None], 9.0, demo.actions),
+    )
+    ours, theirs = (beliefs(hierarchy, one)[0] for one in (demo, other))
+    for one, same in zip(ours[:steps], theirs[:steps], strict=True):
+        for level, again in zip(one, same, strict=True):
+            np.testing.assert_array_equal(level, again)
+    assert any(np.abs(a - b).max() > 1e-3 for a, b in zip(ours[-1], theirs[-1], strict=True))
 
 
 def test_the_control_comes_with_every_observation_but_the_first():

@@ -29,8 +29,9 @@ def recogniser(training: Training) -> str:
     said = f"the controls count {own.power:g} times, the recogniser {own.weight:g} times (ridge {own.ridge:g})"
     if not own.tried:
         return said
+    taken = own.power, own.weight, own.ridge
     each = {
-        "chosen": max(own.tried, key=_score),
+        "chosen": next(one for one in own.tried if (one.power, one.weight, one.ridge) == taken),
         "recogniser alone": max((one for one in own.tried if one.power == own.tried[0].power), key=_score),
         "labels alone": max((one for one in own.tried if not one.weight), key=_score),
     }
