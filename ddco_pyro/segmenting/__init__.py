@@ -39,8 +39,11 @@ __all__ = [
 ]
 
 
-OTHERS = {name: f"options, {name}" for name in ("coarse", "medium", "fine")}
-"""Other fits whose options stand beside a run's, in words."""
+OTHERS = {
+    baselines.RECOGNISER: baselines.RECOGNISED,
+    **{name: f"options, {name}" for name in ("coarse", "medium", "fine")},
+}
+"""What can stand beside a run's options and is fitted by no baseline, in words."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +141,9 @@ class Segmented:
                 equal = f"{baselines.BASELINES[baselines.EQUAL]}, {part}"
                 scores[equal] = of_equal_lengths(labels, self.counts[level])
             for part, group in [*groups.items()][:1]:
-                for name, words in (baselines.BASELINES | {baselines.RECOGNISER: baselines.RECOGNISED} | OTHERS).items():
+                for name, words in (
+                    baselines.BASELINES | {baselines.RECOGNISER: baselines.RECOGNISED} | OTHERS
+                ).items():
                     if f"{level}_{name}" in group[0].baselines and name != baselines.EQUAL:
                         kinds = [demo.baselines[f"{level}_{name}"] for demo in group]
                         agreements[level][f"{words}, {part}"] = scores_of(kinds, [demo.labels[truth] for demo in group])
