@@ -19,7 +19,7 @@ from ddco_pyro.spec.yaml import read_yaml
 
 if TYPE_CHECKING:
     from ddco_pyro.data.inspection import Inspection
-    from ddco_pyro.data.starting import Lengths
+    from ddco_pyro.data.starting import Decided
 
 SourcePath = Annotated[
     Path, typer.Argument(metavar="FILE", help=f"Demonstrations: {', '.join(about.text for about in FORMATS.values())}.")
@@ -118,8 +118,8 @@ def init(
     starting = starting_spec(facts, file, hold_out_by)
     spec = parse_spec(read_yaml(starting.text))
     if spec.training.optimizer.name == "em":
-        lengths = _lengths(spec, facts, segment, segments)
-        starting = starting_spec(facts, file, hold_out_by, lengths)
+        decided = _decided(spec, facts, segment, segments)
+        starting = starting_spec(facts, file, hold_out_by, decided)
     elif segment or segments:
         raise BadInput(f"{file}: --segment needs vectors to observe, since small fits find the settings")
     write_text(out, starting.text.replace("THIS_FILE", quote(str(out))))
@@ -129,12 +129,12 @@ def init(
     print(f"{out}{hint(f': fit it with: {fit}')}")
 
 
-def _lengths(spec: Spec, facts: Inspection, segment: str | None, segments: int | None) -> Lengths | None:
-    """What makes options last as long as is asked for, by small fits; None where these fail."""
+def _decided(spec: Spec, facts: Inspection, segment: str | None, segments: int | None) -> Decided | None:
+    """What small fits decide: heavy tails, and what makes options last as long as asked; None where these fail."""
     from ddco_pyro.cli import console
-    from ddco_pyro.data.starting import Lengths
+    from ddco_pyro.data.starting import Decided
     from ddco_pyro.drawing.words import duration
-    from ddco_pyro.selection.lengths import in_steps, lasting
+    from ddco_pyro.selection.small import heavy_tails, in_steps, lasting, with_heavy_tails
     from ddco_pyro.training.data import demonstrations
 
     if segment and segments:
@@ -146,14 +146,16 @@ def _lengths(spec: Spec, facts: Inspection, segment: str | None, segments: int |
     least = max(5.0, 0.5 * rate) if rate else 5.0
     try:
         with console.Progress() as progress:
-            found = lasting(spec, demonstrations(spec), steps, least, progress)
+            known = demonstrations(spec)
+            heavy = heavy_tails(spec, known)
+            found = lasting(with_heavy_tails(spec, heavy), known, steps, least, progress)
     except (BadInput, Failed):
         if steps is not None:
             raise
         return None  # the fit will say what is wrong
     asked = "" if steps is None else f"; asked: {duration(rate, steps)}"
     why = f"median segment {duration(rate, found.median)} in small fits{asked}"
-    return Lengths(found.power, found.constant, why)
+    return Decided(found.power, found.constant, why, heavy)
 
 
 def import_(

@@ -296,7 +296,7 @@ def segment(
     from ddco_pyro.segmenting.agreement import agreement_table, tolerances
     from ddco_pyro.segmenting.baselines import BASELINES, check_installed
     from ddco_pyro.segmenting.formats import Asked
-    from ddco_pyro.selection.lengths import GRANULARITIES, cut
+    from ddco_pyro.selection.small import GRANULARITIES, cut
 
     if granularity not in (None, *GRANULARITIES):
         raise BadInput(f"--granularity {granularity}: give one of {', '.join(GRANULARITIES)}")

@@ -66,17 +66,22 @@ PICTURES = Recipe(batch_steps=250, gradient_steps=4000, epochs=20)
 """About six minutes on one core for each model, with pictures of 48 × 64 pixels."""
 
 
-class Lengths(NamedTuple):
-    """What decides how long options last.
+HEAVY = "one Student t predicts left-out demonstrations better than Gaussians"
+
+
+class Decided(NamedTuple):
+    """What small fits decide.
 
     :param power: β of the control's log-density.
     :param constant: whether gates and terminations are constant.
-    :param why: what came of it, in words.
+    :param why: the length of segments that came of it, in words.
+    :param heavy: control dimensions for one Student t.
     """
 
     power: float = 0.5
     constant: bool = False
     why: str = "times the control's log-density counts: less makes options last longer, as init --segment 2s does"
+    heavy: tuple[int, ...] = ()
 
 
 class Starting(NamedTuple):
@@ -87,7 +92,7 @@ class Starting(NamedTuple):
 
 
 def starting_spec(
-    inspection: Inspection, path: str | Path, hold_out_by: str | None = None, lengths: Lengths | None = None
+    inspection: Inspection, path: str | Path, hold_out_by: str | None = None, decided: Decided | None = None
 ) -> Starting:
     """A spec for the inspected demonstrations, with ``path`` as its file.
 
@@ -123,16 +128,11 @@ def starting_spec(
     many = f"as many as the values of {counted.place}" if counted else ""
     apart = _held_out(inspection, hold_out_by) if hold_out_by else ""
     filled = {"labels": labels, "count": len(counted.values) if counted else OPTIONS, "many": many}
-    text = _filled(
-        inspection,
-        str(path),
-        observed,
-        used,
-        reasons,
-        filled | {"by": hold_out_by, "apart": apart, "lasting": lengths or Lengths()},
-    )
+    filled |= {"by": hold_out_by, "apart": apart, "small": decided or Decided()}
+    text = _filled(inspection, str(path), observed, used, reasons, filled)
     parse_spec(read_yaml(text))  # the text is a valid spec
-    notes = [f"{filled['count']} options, {many}" if many else "", apart, lengths.why if lengths else ""]
+    said = [decided.why, "heavy tails: " + HEAVY if decided.heavy else ""] if decided else []
+    notes = [f"{filled['count']} options, {many}" if many else "", apart, *said]
     return Starting(text, [note for note in notes if note])
 
 

@@ -13,7 +13,7 @@ from sklearn.metrics import normalized_mutual_info_score
 
 import ddco_pyro
 from ddco_pyro.errors import BadInput
-from ddco_pyro.selection.lengths import in_steps, lasting, median_segment
+from ddco_pyro.selection.small import in_steps, lasting, median_segment
 from ddco_pyro.spec import load_spec, parse_spec, with_overrides
 
 SLOW = 30

@@ -1,4 +1,4 @@
-"""How long options last: the power of the control's log-density, and gates, that give segments of a length asked for.
+"""What small fits decide of a spec: heavy tails, and what makes options last as long as is asked for.
 
 The less the control counts, the more a change of option costs beside what it explains. What gates and terminations read
 of the observations costs nothing, so where even a small power leaves segments too short, both become constant.
@@ -35,6 +35,8 @@ GRANULARITIES = {"coarse": 2.0, "medium": 1.0, "fine": 0.5}
 """Median segments in units of a run's own."""
 STEPS = 3000
 """Steps of the demonstrations that are used, about."""
+FEWEST = 4
+"""Fewest demonstrations of which a half predicts the other."""
 EPOCHS = 30
 """Most epochs of a fit."""
 
@@ -83,17 +85,7 @@ def lasting(
     """
     if spec.hierarchy is None or not spec.hierarchy.levels[0].lasts:
         raise BadInput("lengths of segments are of a spec whose lowest level has options that last")
-    some = _some(parts(spec, demos)["train"])
-    sketch = with_overrides(
-        spec,
-        {
-            "compare_with": [],
-            "demonstrations.valid_fraction": 0,
-            "demonstrations.leave_one_out": False,
-            "demonstrations.hold_out_by": None,
-            "training.epochs": min(EPOCHS, spec.training.epochs or EPOCHS),
-        },
-    )
+    some, sketch = _some(parts(spec, demos)["train"]), _sketch(spec)
 
     def tried(power: float, constant: bool) -> Lasting:
         settings = Lasting(power, constant, 0.0).overrides(spec)
@@ -108,6 +100,44 @@ def lasting(
         if found.median >= least:
             break
     return found
+
+
+def _sketch(spec: Spec) -> Spec:
+    """The spec of a small fit of the model alone, with all demonstrations."""
+    return with_overrides(
+        spec,
+        {
+            "compare_with": [],
+            "demonstrations.valid_fraction": 0,
+            "demonstrations.leave_one_out": False,
+            "demonstrations.hold_out_by": None,
+            "training.epochs": min(EPOCHS, spec.training.epochs or EPOCHS),
+        },
+    )
+
+
+def heavy_tails(spec: Spec, demos: Demonstrations) -> tuple[int, ...]:
+    """The Gaussian control dimensions, where one Student t predicts them better than Gaussians do, else none.
+
+    Small fits to every other one of some training demonstrations predict the controls of the rest.
+    """
+    some = _some(parts(spec, demos)["train"])
+    if len(some) < FEWEST:
+        return ()
+    train, rest = (Demonstrations(tuple(some[place] for place in range(first, len(some), 2))) for first in (0, 1))
+    usual = fit(_sketch(spec), train)
+    kinds = usual.hierarchy.scaling.parts
+    heavy = tuple(sorted(dim for part in kinds if part.kind == "gaussian" for dim in part.dims))
+    if not heavy:
+        return ()
+    other = fit(_sketch(with_heavy_tails(spec, heavy)), train)
+    gain = other.log_likelihood(rest).sum() - usual.log_likelihood(rest).sum()
+    return heavy if gain > 0 else ()
+
+
+def with_heavy_tails(spec: Spec, dims: tuple[int, ...]) -> Spec:
+    """The spec with one Student t for these control dimensions, if there are any."""
+    return with_overrides(spec, {"control.parts": [{"name": "heavy", "dims": dims, "kind": "student"}]} if dims else {})
 
 
 def cut(trained: Fit, granularity: str, on_event: OnEvent = ignore) -> Fit:
