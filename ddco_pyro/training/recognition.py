@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -31,11 +30,8 @@ from ddco_pyro.training.stages import plan
 ALONE = 1e-6
 """The power β of the controls' density under which a recogniser alone decides, with the transitions."""
 
-TRAINED = ((ALONE, 0.3), (0.03, 0.1), (0.1, 0.3), (1.0, 1.0), (1.0, 0.0))
-"""The pairs (β, γ) that models are trained with: from the recogniser alone to labels alone."""
-
-WEIGHTS = (0.1, 0.3, 1.0)
-"""The weights γ of a recogniser that each of these models decodes with, unless it is without."""
+PAIRS = ((ALONE, 0.3), (0.03, 0.1), (0.1, 0.3), (1.0, 1.0), (1.0, 0.0))
+"""The pairs (β, γ) that models train and decode with: from the recogniser alone to labels alone."""
 
 RIDGES = (15.0, 50.0, 150.0, 500.0)
 """The ridges of the recogniser that are tried."""
@@ -214,14 +210,14 @@ def _tried(
         )
         (rows,) = torch.where((hidden & (options > 0)).any(1))
         part, truth = batch.select(rows), torch.where(hidden, options, -1)[rows]
-        for power, weight in TRAINED:
+        for power, weight in PAIRS:
             model = _continued(data, begun, batch, known, power, weight * ratios[RIDGES[1]])
             with torch.no_grad():
                 tables = model.tabulate(part)
-            for ridge, gamma in product(RIDGES, WEIGHTS if weight else (0.0,)):
-                evident = tables.with_evidence(level, gamma * ratios[ridge][rows, : tables.steps])
+            for ridge, ratio in ratios.items():
+                evident = tables.with_evidence(level, weight * ratio[rows, : tables.steps])
                 path = most_likely_path(evident, part.lengths).choices[level - 1]
-                own = scores.setdefault((power, gamma, ridge), [])
+                own = scores.setdefault((power, weight, ridge), [])
                 for found, true in zip(path.numpy(), truth[:, : tables.steps].numpy(), strict=True):
                     ours, theirs = found[true > 0], true[true > 0]
                     own.append((float((ours == theirs).mean()), edit_score(ours, theirs)))
