@@ -35,7 +35,8 @@ def test_the_settings_of_a_spec_reach_the_network(name):
         assert [layer.recurrent.shape for layer in network.memory] == [(4, 7, 28), (4, 9, 36)]
         return
     sizes = [layer.weight.shape[1] for layer in network.layers if hasattr(layer, "weight")]
-    assert sizes == [3 + (2 * 64 if name == "conv" else 0), *given.get("hidden", [])]
+    read = {"constant": 0, "conv": 3 + 2 * 64}.get(name, 3)
+    assert sizes == [read, *given.get("hidden", [])]
     assert {layer.p for layer in network.layers if isinstance(layer, nn.Dropout)} == (
         {0.25} if "dropout" in given else set()
     )

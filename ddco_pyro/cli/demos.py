@@ -132,9 +132,7 @@ def init(
 def _decided(spec: Spec, facts: Inspection, segment: str | None, segments: int | None) -> Decided | None:
     """What small fits decide: heavy tails, and what makes options last as long as asked; None where these fail."""
     from ddco_pyro.cli import console
-    from ddco_pyro.data.starting import Decided
-    from ddco_pyro.drawing.words import duration
-    from ddco_pyro.selection.small import heavy_tails, in_steps, lasting, with_heavy_tails
+    from ddco_pyro.selection.small import decide, in_steps
     from ddco_pyro.training.data import demonstrations
 
     if segment and segments:
@@ -143,19 +141,13 @@ def _decided(spec: Spec, facts: Inspection, segment: str | None, segments: int |
     steps = in_steps("--segment", segment, rate) if segment else None
     if segments:
         steps = sum(facts.lengths.values()) / len(facts.lengths) / segments
-    least = max(5.0, 0.5 * rate) if rate else 5.0
     try:
         with console.Progress() as progress:
-            known = demonstrations(spec)
-            heavy = heavy_tails(spec, known)
-            found = lasting(with_heavy_tails(spec, heavy), known, steps, least, progress)
+            return decide(spec, demonstrations(spec), rate, steps, progress)
     except (BadInput, Failed):
         if steps is not None:
             raise
         return None  # the fit will say what is wrong
-    asked = "" if steps is None else f"; asked: {duration(rate, steps)}"
-    why = f"median segment {duration(rate, found.median)} in small fits{asked}"
-    return Decided(found.power, found.constant, why, heavy)
 
 
 def import_(

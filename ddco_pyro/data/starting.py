@@ -74,12 +74,14 @@ class Decided(NamedTuple):
 
     :param power: β of the control's log-density.
     :param constant: whether gates and terminations are constant.
+    :param window: ``training.window``; above 0, gates have larger ridges too.
     :param why: the length of segments that came of it, in words.
     :param heavy: control dimensions for one Student t.
     """
 
     power: float = 0.5
     constant: bool = False
+    window: int = 0
     why: str = "times the control's log-density counts: less makes options last longer, as init --segment 2s does"
     heavy: tuple[int, ...] = ()
 

@@ -316,7 +316,7 @@ class Hierarchy(nn.Module):
             endings.append(None if level.termination is None else next(each).squeeze(-1))
         top = raw[-1]
         last = _uniform(top, levels[-1].count) if discovering else self.meta_policy(top, self.scaling)
-        return Outputs((*callers, last), tuple(endings), float(self.power))
+        return Outputs((*callers, last), tuple(endings), self.power)
 
 
 def _bytes_at_once(device: torch.device) -> float:

@@ -89,12 +89,12 @@ class Outputs:
     :param callers: each level's, lowest first, the meta-policy's last.
     :param termination_logits: of each level's options [N, T, k], before they are bounded; None for a level whose
         options end after every step.
-    :param power: β of :class:`~ddco_pyro.model.tables.Tables`.
+    :param power: β of :class:`~ddco_pyro.model.tables.Tables`, a number.
     """
 
     callers: tuple[CallerOutputs, ...]
     termination_logits: tuple[Tensor | None, ...]
-    power: float = 1.0
+    power: Tensor | float = 1.0
 
     @property
     def emissions(self) -> tuple[Emission | None, ...]:
@@ -111,7 +111,7 @@ class Outputs:
         """The tables for controls [N, T, A] in scaled units; without them, of selections and terminations alone."""
         selection = tuple(caller.selection for caller in self.callers if caller.options)
         control = () if actions is None else tuple(caller.log_density(actions) for caller in self.callers)
-        return Tables(selection, self.termination, control, power=self.power)
+        return Tables(selection, self.termination, control, power=float(self.power))
 
     def tensors(self) -> list[Tensor]:
         """All outputs of the networks, each [N, T, ...]."""

@@ -31,11 +31,12 @@ def section(fit: Fit, demos: Demonstrations) -> Section | None:
     for place, level in enumerate(names):
         before = f"{level}: " if len(names) > 1 else ""
         for words, part, found, equal in sides:
-            if found is not None and equal is not None:
+            if found is not None:
                 scores[f"{before}options, {words}"] = found[place]
                 if given is not None and level == given.level and part in record.recogniser:
                     scores[f"{before}{RECOGNISED}, {words}"] = record.recogniser[part]
-                scores[f"{before}{BASELINES[EQUAL]}, {words}"] = equal[place]
+                if equal:
+                    scores[f"{before}{BASELINES[EQUAL]}, {words}"] = equal[place]
     known = label_names(demos.attributes)
     compared = quoted(fit.spec.demonstrations.label_names)
     blocks: list[Block] = [Text(f"Options and the ground-truth {compared}."), agreement_table(scores)]

@@ -14,6 +14,8 @@ import numpy as np
 
 from ddco_pyro.acting.monitor import run_lengths
 from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.starting import Decided
+from ddco_pyro.drawing.words import duration
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import LengthTried, OnEvent, ignore
 from ddco_pyro.fitting.fit import fit
@@ -29,11 +31,17 @@ HALVINGS = 2
 NEAR, FAR = 1.15, 1.5
 """Factors between the median and what is asked: a search ends within the first; gates stay as they are within the
 second."""
-LADDER = ((0.5, False), (0.1, False), (0.1, True), (0.03, True))
-"""Powers, and whether gates are constant, that are tried in this order where no length is asked for."""
+LADDER = (0.5, 0.05, 0.02)
+"""Powers that are tried in this order where no length is asked for, at last with constant gates."""
+USUAL = 0.5
+"""The power from which on gates have ridges of 1, and options begin from single steps."""
+RIDGE = 100.0
+"""The ridge of gates and terminations below that: what they read of observations costs nothing else."""
 GRANULARITIES = {"coarse": 2.0, "medium": 1.0, "fine": 0.5}
 """Median segments in units of a run's own."""
-STEPS = 3000
+STEPS_A_SECOND = 10
+"""The half width of windows where the frequency is unknown; else it is one second."""
+STEPS = 6000
 """Steps of the demonstrations that are used, about."""
 FEWEST = 4
 """Fewest demonstrations of which a half predicts the other."""
@@ -46,16 +54,21 @@ class Lasting(NamedTuple):
 
     :param power: β.
     :param constant: whether gates and terminations are constant.
+    :param window: ``training.window`` of options that last long.
     :param median: length of the lowest level's segments, steps.
     """
 
     power: float
     constant: bool
+    window: int
     median: float
 
     def overrides(self, spec: Spec) -> dict[str, Any]:
         """The key paths of a spec that have these values."""
         values: dict[str, Any] = {"control.power": self.power}
+        if self.power < USUAL:
+            values |= {f"training.optimizer.ridge.{gate}": RIDGE for gate in ("gate", "termination")}
+            values["training.window"] = self.window
         if self.constant and spec.hierarchy is not None:
             levels = enumerate(spec.hierarchy.levels)
             gates = [f"levels.{n}.{part}" for n, level in levels for part in _gates(n, level.lasts)]
@@ -73,6 +86,28 @@ def median_segment(trained: Fit, demos: Demonstrations) -> float:
     return float(np.median(np.concatenate(run_lengths(level, len(level.names) - 1))))
 
 
+def decide(
+    spec: Spec,
+    demos: Demonstrations,
+    frequency: float | None,
+    steps: float | None = None,
+    on_event: OnEvent = ignore,
+) -> Decided:
+    """What small fits to training demonstrations decide of a starting spec.
+
+    :param frequency: steps per second (Hz); None where unknown.
+    :param steps: the median segment that is asked for; None for at least half a second, or five steps.
+    :raises BadInput: the spec has no options that last.
+    """
+    heavy = heavy_tails(spec, demos)
+    least = max(5.0, 0.5 * frequency) if frequency else 5.0
+    found = lasting(with_heavy_tails(spec, heavy), demos, steps, least, on_event)
+    asked = "" if steps is None else f"; asked: {duration(frequency, steps)}"
+    window = found.window if found.power < USUAL else 0
+    why = f"median segment {duration(frequency, found.median)} in small fits{asked}"
+    return Decided(found.power, found.constant, window, why, heavy)
+
+
 def lasting(
     spec: Spec, demos: Demonstrations, steps: float | None, least: float = 5.0, on_event: OnEvent = ignore
 ) -> Lasting:
@@ -87,16 +122,18 @@ def lasting(
         raise BadInput("lengths of segments are of a spec whose lowest level has options that last")
     some, sketch = _some(parts(spec, demos)["train"]), _sketch(spec)
 
+    window = max(1, round(demos.frequency or STEPS_A_SECOND))
+
     def tried(power: float, constant: bool) -> Lasting:
-        settings = Lasting(power, constant, 0.0).overrides(spec)
-        found = Lasting(power, constant, median_segment(fit(with_overrides(sketch, settings), some), some))
+        settings = Lasting(power, constant, window, 0.0).overrides(spec)
+        found = Lasting(power, constant, window, median_segment(fit(with_overrides(sketch, settings), some), some))
         on_event(LengthTried(power, constant, found.median))
         return found
 
     if steps is not None:
         return _searched(tried, steps)
-    for power, constant in LADDER:
-        found = tried(power, constant)
+    for power in LADDER:
+        found = tried(power, power == LADDER[-1])
         if found.median >= least:
             break
     return found

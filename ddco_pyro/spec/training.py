@@ -129,6 +129,9 @@ class TrainingSpec(Model):
     1/2, and all levels train together, whatever ``layerwise`` says. ``random``: random weights. A list has a kind for
     each of several restarts in turn, the first again after the last. The first restart has the best of ten runs of
     k-means, each further one a run from random steps."""
+    window: int = Field(default=0, ge=0)
+    """For ``vq``, ``vq_controls`` and ``mixture``: steps before and after a step over which observations and controls
+    are averaged before they are clustered. People's skills show over a second, not in a step."""
     layerwise: bool = True
     """Whether levels are discovered one after another, lowest first, rather than all at once."""
     upper_levels: Literal["clusters", "segments"] = "clusters"

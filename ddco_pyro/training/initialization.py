@@ -42,6 +42,7 @@ class Clusters:
     :param read: names of the observations that are clustered; all where it is empty.
     :param best: the best of ten runs of k-means, nearly the same ones whatever the seed; otherwise a single run from
         steps drawn at random.
+    :param window: steps before and after a step over which what is clustered is averaged.
     """
 
     def __init__(
@@ -53,8 +54,9 @@ class Clusters:
         labels: Tensor | None = None,
         read: Sequence[str] = (),
         best: bool = True,
+        window: int = 0,
     ) -> None:
-        self._controls, self._read = controls, read
+        self._controls, self._read, self._window = controls, read, window
         self._most = most_rows(next(self._blocks(batch)).shape[1])
         chosen = np.ones(batch.steps, dtype=bool)
         chosen[np.random.default_rng(seed).permutation(batch.steps)[self._most :]] = False
@@ -84,15 +86,27 @@ class Clusters:
     def _blocks(self, batch: Batch) -> Iterator[np.ndarray]:
         """The features of consecutive steps [B, F], trajectory after trajectory."""
         for row, length in enumerate(batch.lengths.tolist()):
-            alone, first = batch.inputs.part(torch.tensor([row]), slice(0, length)), 0
-            for inputs in alone.chunks(FRAMES_AT_ONCE if alone.images else length):
-                loaded = inputs.loaded()
-                read = loaded.select(self._read) if self._read else loaded
-                means = [block_means(image[0].cpu()) for image in read.images.values()]
-                seen = torch.cat([read.vector[0], *means], dim=-1).double().numpy()
-                last = first + len(seen)
-                yield joined(seen, batch.actions[row, first:last].double().numpy()) if self._controls else seen
-                first = last
+            blocks = self._of_trajectory(batch, row, length)
+            yield from [averaged(np.concatenate(list(blocks)), self._window)] if self._window else blocks
+
+    def _of_trajectory(self, batch: Batch, row: int, length: int) -> Iterator[np.ndarray]:
+        alone, first = batch.inputs.part(torch.tensor([row]), slice(0, length)), 0
+        for inputs in alone.chunks(FRAMES_AT_ONCE if alone.images else length):
+            loaded = inputs.loaded()
+            read = loaded.select(self._read) if self._read else loaded
+            means = [block_means(image[0].cpu()) for image in read.images.values()]
+            seen = torch.cat([read.vector[0], *means], dim=-1).double().numpy()
+            last = first + len(seen)
+            yield joined(seen, batch.actions[row, first:last].double().numpy()) if self._controls else seen
+            first = last
+
+
+def averaged(rows: np.ndarray, window: int) -> np.ndarray:
+    """The mean of each row [T, F] and of so many rows before and after it, fewer at the ends."""
+    sums, time = np.concatenate([np.zeros_like(rows[:1]), rows.cumsum(0)]), np.arange(len(rows))
+    first, last = np.maximum(time - window, 0), np.minimum(time + window + 1, len(rows))
+    means: np.ndarray = (sums[last] - sums[first]) / (last - first)[:, None]
+    return means
 
 
 def _only(chosen: np.ndarray, blocks: Iterable[np.ndarray]) -> Iterator[np.ndarray]:

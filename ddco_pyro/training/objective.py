@@ -99,7 +99,8 @@ class Objective:
         else:
             given, read = self.known[0].get(level), hierarchy.read_by(level)
             best = self.progress.restart == 0  # further restarts are to differ
-            start = Clusters(data.train, count, seed, kind != "vq", given, read, best)
+            window = data.spec.training.window
+            start = Clusters(data.train, count, seed, kind != "vq", given, read, best, window)
         for known, batch in zip(self.known, (data.train, data.tune), strict=True):
             choices = start.choices(batch)
             labelled = known.get(level, choices)

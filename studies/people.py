@@ -1,0 +1,243 @@
+"""Gestures of surgeons: options without labels, and with a few, beside what a user would try instead (JIGSAWS).
+
+    python studies/people.py --data FOLDER [--tasks Knot_Tying Suturing] [--splits last surgeon trial]
+        [--labelled 0 1 3 5 all] [--jobs 2] [--summarize]
+
+FOLDER holds ``TASK.hdf5``, of ``ddco-pyro import JIGSAWS/TASK --hz 10``. No licence lets anyone share these data; Johns
+Hopkins University gives them on request.
+
+``last`` holds out the last trial of each surgeon. ``trial`` and ``surgeon`` are the official splits: each trial, and
+each surgeon, is held out in turn. The spec is what ``ddco-pyro init`` writes for the training demonstrations. Labelled
+demonstrations are spread evenly over them. A cell that was done is not done again. Adds its numbers to
+``docs/results/people.csv``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import study
+from sklearn.cluster import KMeans
+from sklearn.metrics import normalized_mutual_info_score
+from study import Cell, Row, Settings, described
+
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.inspection import inspect
+from ddco_pyro.data.starting import starting_spec
+from ddco_pyro.errors import BadInput
+from ddco_pyro.evaluation.agreement import confusion, equal_lengths
+from ddco_pyro.fitting.fit import fit
+from ddco_pyro.fitting.fitted import Fit
+from ddco_pyro.model.batch import encode
+from ddco_pyro.model.recogniser import Windows
+from ddco_pyro.segmenting.baselines import segment
+from ddco_pyro.selection.small import decide
+from ddco_pyro.spec import parse_spec, with_overrides
+from ddco_pyro.spec.yaml import read_yaml
+from ddco_pyro.statistics import edit_score
+
+LABELS, KNOWN = "gesture", "known"
+ALL, SPLITS = "all", ["last", "surgeon", "trial"]
+SECOND = 10  # steps
+DEFAULTS = Settings({"seed": 0}, Path("runs/people"))
+
+
+@dataclass(frozen=True)
+class PeopleCell(Cell):
+    """A task, what is held out, and how many training demonstrations have their labels."""
+
+    data: str
+    task: str
+    fold: str
+    labelled: str
+
+    @property
+    def name(self) -> str:
+        """Of its files."""
+        return f"{self.task}-{self.fold}-{self.labelled}"
+
+    def depends(self, settings: Settings) -> dict[str, Any]:
+        """What decides its results; the place of the data does not."""
+        return {key: value for key, value in asdict(self).items() if key != "data"} | settings.kept()
+
+    def results(self, settings: Settings, folder: Path) -> dict[str, Any]:
+        """Fit, and compare with the gestures of the held-out demonstrations."""
+        path = Path(self.data) / f"{self.task}.hdf5"
+        demos = divided(labelled_demonstrations(path), self.fold)
+        train, valid = (demos.select(demos.masks[part]) for part in ("train", "valid"))
+        facts = inspect(path, exclude=[name for name in Demonstrations.read(path).names if name not in train.names])
+        plain = parse_spec(read_yaml(starting_spec(replace(facts, excluded=(), masks={}), path).text))
+        small = decide(plain, replace(train, masks={}), demos.frequency)
+        text = starting_spec(replace(facts, excluded=(), masks={}), path, decided=small).text
+        spec = with_overrides(parse_spec(read_yaml(text)), ALONE | {"seed": settings.values["seed"]})
+        truth, count = [demo.labels[LABELS] for demo in valid], spec.hierarchy.levels[0].count if spec.hierarchy else 1
+        if self.labelled == "0":
+            found = fit(spec, demos)
+            kinds = {"options": list(found.segment(valid)[0]), "windowed k-means": clusters(found, train, valid, count)}
+            kinds |= {name: segment(key, train, valid, count, 0, spec.observations) for name, key in BASELINES.items()}
+            kinds["options, β = 1"] = list(fit(with_overrides(spec, USUAL), demos).segment(valid)[0])
+            typical = float(np.median(np.concatenate([lengths(demo.labels[LABELS]) for demo in train])))
+            asked = decide(plain, replace(train, masks={}), demos.frequency, typical)
+            as_asked = starting_spec(replace(facts, excluded=(), masks={}), path, decided=asked).text
+            longer = with_overrides(parse_spec(read_yaml(as_asked)), ALONE | {"seed": settings.values["seed"]})
+            kinds["options, --segment"] = list(fit(longer, demos).segment(valid)[0])
+            kinds["equal lengths"] = [equal_lengths(len(demo), count) for demo in valid]
+            named = {name: matched(own, truth) for name, own in kinds.items()}
+            return {"scores": {name: scored(own, kinds[name], truth) for name, own in named.items()}}
+        given = {"level": "option", "from": KNOWN}
+        own = with_labels(demos, train, len(train) if self.labelled == ALL else int(self.labelled))
+        found = fit(with_overrides(spec, {"training.labels": given | {"recogniser": {"cross_validated": True}}}), own)
+        alone = [row[:steps].numpy() for piece in found.infer(valid) for row, steps in recognised(piece)]
+        kinds = {"options": list(found.segment(valid)[0]), "recogniser": alone}
+        if self.fold == "last":
+            clamped = fit(with_overrides(spec, {"training.labels": given, "control.power": 1.0}), own)
+            kinds["labels alone, β = 1"] = list(clamped.segment(valid)[0])
+        values = found.metrics.trained_labels
+        assert values is not None  # it trains on labels
+        names = np.array([-9, *values.values, *[-9] * count])
+        chosen = found.metrics.training.recogniser
+        return {
+            "scores": {name: scored([names[row] for row in own], own, truth) for name, own in kinds.items()},
+            "chosen": None if chosen is None else [chosen.power, chosen.weight, chosen.ridge],
+        }
+
+    def rows(self, results: Mapping[str, Any]) -> Iterator[Row]:
+        """Agreement of each method; the fold stands for the seed."""
+        split, _, own = self.fold.partition("-")
+        for method, scores in results["scores"].items():
+            for measure, value in scores.items():
+                yield Row(f"people, {split}", self.task, f"{method}, {self.labelled} labelled", None, own or 0,
+                          measure, value)  # fmt: skip
+
+
+ALONE: dict[str, Any] = {"compare_with": []}
+BASELINES = {"Gaussian HMM": "hmm", "change points": "change_points"}
+USUAL: dict[str, Any] = {
+    "control.power": 1.0,
+    "control.parts": [],
+    "training.window": 0,
+    "training.optimizer.ridge": {"cross_validated": True},
+}
+"""What the paper's likelihood is, with small ridges."""
+
+
+def labelled_demonstrations(path: Path) -> Demonstrations:
+    """The demonstrations that have gestures."""
+    if not path.is_file():
+        raise BadInput(f"{path}: is missing; make it with: ddco-pyro import JIGSAWS/{path.stem} --out {path} --hz 10")
+    demos = Demonstrations.read(path, labels=[LABELS])
+    names = [demo.name for demo in demos if (demo.labels[LABELS] >= 0).any()]
+    return demos.select(names)
+
+
+def folds(demos: Demonstrations, split: str) -> list[str]:
+    """The folds of a split by name."""
+    if split == "last":
+        return ["last"]
+    return [f"{split}-{value}" for value in sorted({str(demo.attributes[split]) for demo in demos})]
+
+
+def divided(demos: Demonstrations, fold: str) -> Demonstrations:
+    """The demonstrations with masks of a fold."""
+    split, _, value = fold.partition("-")
+    if split == "last":
+        of: dict[str, list[tuple[int, str]]] = {}
+        for demo in demos:
+            of.setdefault(str(demo.attributes["surgeon"]), []).append((int(demo.attributes["trial"]), demo.name))
+        valid = {max(trials)[1] for trials in of.values()}
+    else:
+        valid = {demo.name for demo in demos if str(demo.attributes[split]) == value}
+    masks = {"train": tuple(name for name in demos.names if name not in valid), "valid": tuple(sorted(valid))}
+    return replace(demos, masks=masks)
+
+
+def with_labels(demos: Demonstrations, train: Demonstrations, number: int) -> Demonstrations:
+    """The labels of so many training demonstrations, spread over them in order; -1 in others."""
+    chosen = {train.names[place] for place in np.linspace(0, len(train) - 1, number).round().astype(int)}
+    return replace(
+        demos,
+        demonstrations=tuple(
+            replace(demo, labels={**demo.labels, KNOWN: np.where(demo.name in chosen, demo.labels[LABELS], -1)})
+            for demo in demos
+        ),
+    )
+
+
+def lengths(labels: np.ndarray) -> np.ndarray:
+    """Steps of each labelled segment."""
+    edges = np.flatnonzero(np.diff(labels, prepend=-2, append=-2))
+    steps: np.ndarray = np.diff(edges)[labels[edges[:-1]] >= 0]
+    return steps
+
+
+def clusters(found: Fit, train: Demonstrations, valid: Demonstrations, count: int) -> list[np.ndarray]:
+    """k-means on observations and controls averaged over a second before and after each step."""
+    model, rows = found.hierarchy, []
+    for part in (train, valid):
+        batch = encode(part, model.encoder, model.scaling)
+        windows = Windows(count, model.input_shape, batch.actions.shape[-1], past=False)
+        windows.widths.fill_(SECOND)
+        size = windows.weight.shape[0] // (1 + len(windows.widths))
+        features = windows.features(batch.inputs, batch.actions, batch.lengths)[..., size : 2 * size].numpy()
+        rows.append([own[:length] for own, length in zip(features, batch.lengths.tolist(), strict=True)])
+    fitted = KMeans(count, n_init=10, random_state=0).fit(np.concatenate(rows[0]))
+    return [fitted.predict(own) for own in rows[1]]
+
+
+def recognised(piece: Any) -> Iterator[tuple[Any, int]]:
+    """The options that the recogniser alone finds, and the steps, of each demonstration."""
+    return zip(piece.recognised, piece.lengths, strict=True)
+
+
+def matched(kinds: Sequence[np.ndarray], truth: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Kinds as the labels that they are matched with, one for all demonstrations; -9 for none."""
+    table = confusion(kinds, truth)
+    label = {kind: -9 if name is None else name for kind, name in zip(table.options, table.matched, strict=True)}
+    return [np.array([label.get(kind, -9) for kind in own.tolist()]) for own in kinds]
+
+
+def scored(named: Sequence[np.ndarray], kinds: Sequence[np.ndarray], truth: Sequence[np.ndarray]) -> dict[str, float]:
+    """Over labelled steps: the share that is right, the mean edit score, the NMI, and segments in a demonstration."""
+    known = [label >= 0 for label in truth]
+    right = np.concatenate([(own == label)[at] for own, label, at in zip(named, truth, known, strict=True)])
+    edits = [edit_score(own[at], label[at]) for own, label, at in zip(named, truth, known, strict=True)]
+    ours, theirs = (np.concatenate([own[at] for own, at in zip(part, known, strict=True)]) for part in (kinds, truth))
+    segments = [1 + int((np.diff(own[at]) != 0).sum()) for own, at in zip(kinds, known, strict=True)]
+    return {
+        "accuracy": float(right.mean()),
+        "edit": float(np.mean(edits)),
+        "NMI": float(normalized_mutual_info_score(theirs, ours)),
+        "segments": float(np.mean(segments)),
+    }
+
+
+def cells(own: argparse.Namespace) -> list[PeopleCell]:
+    """All of a split before another."""
+    found = []
+    for split, task in itertools.product(own.splits, own.tasks):
+        demos = labelled_demonstrations(own.data / f"{task}.hdf5")
+        names = folds(demos, split)
+        found += [PeopleCell(str(own.data), task, fold, labelled) for fold in names for labelled in own.labelled]
+    return found
+
+
+def main() -> None:
+    """Run the study."""
+    parser = described(__doc__)
+    parser.add_argument("--data", type=Path, required=True, metavar="FOLDER")
+    parser.add_argument("--tasks", nargs="+", default=["Knot_Tying", "Suturing"], metavar="TASK")
+    parser.add_argument(
+        "--splits", nargs="+", default=["last", "surgeon", "trial"], choices=["last", "surgeon", "trial"]
+    )
+    parser.add_argument("--labelled", nargs="+", default=["0", "1", "3", "5", ALL])
+    study.main("people", parser, DEFAULTS, cells)
+
+
+if __name__ == "__main__":
+    main()
