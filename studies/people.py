@@ -112,7 +112,7 @@ class PeopleCell(Cell):
         split, _, own = self.fold.partition("-")
         for method, scores in results["scores"].items():
             for measure, value in scores.items():
-                yield Row(f"people, {split}", self.task, f"{method}, {self.labelled} labelled", None, own or 0,
+                yield Row(split, self.task, f"{method}, {self.labelled} labelled", None, own or 0,
                           measure, value)  # fmt: skip
 
 

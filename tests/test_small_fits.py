@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import yaml
@@ -12,8 +13,9 @@ from random_demonstrations import numbered
 from sklearn.metrics import normalized_mutual_info_score
 
 import ddco_pyro
+from ddco_pyro.acting.monitor import run_lengths
 from ddco_pyro.errors import BadInput
-from ddco_pyro.selection.small import in_steps, lasting, median_segment
+from ddco_pyro.selection.small import heavy_tails, in_steps, lasting, median_segment
 from ddco_pyro.spec import load_spec, parse_spec, with_overrides
 
 SLOW = 30
@@ -83,3 +85,34 @@ def test_init_writes_what_it_found(tmp_path: Path):
     both = call("init", file, "--out", spec, "--force", "--segments", "5", "--segment", "3s")
     assert both.status == 2
     assert "exclude each other" in both.err
+
+
+def test_segments_are_coarser_or_finer_as_asked(tmp_path: Path):
+    file, spec, run = tmp_path / "demos.hdf5", tmp_path / "spec.yaml", tmp_path / "run"
+    skills_within_which_speed_varies().write(file)
+    spec.write_text(SPEC.replace("FILE", str(file)))
+    ddco_pyro.fit(spec, out=run)
+    ended = call("segment", run, file, "--granularity", "coarse", "--out", tmp_path / "labelled.hdf5")
+    assert ended.status == 0, ended.err
+    with h5py.File(tmp_path / "labelled.hdf5") as labelled:
+        levels = [demo["labels"] for demo in labelled["data"].values()]
+        medians = {
+            name: np.median(np.concatenate(run_lengths([level[name][:] for level in levels], 2)))
+            for name in ("option", "option_medium", "option_fine")
+        }
+    assert medians["option_fine"] <= medians["option_medium"] <= medians["option"]
+    assert (run / "granularity" / "coarse" / "metrics.json").is_file()
+    wrong = call("segment", run, file, "--granularity", "huge", "--out", tmp_path / "other.hdf5")
+    assert wrong.status == 2
+    assert "coarse, medium, fine" in wrong.err
+
+
+def test_heavy_tails_are_found_where_they_predict_better():
+    random = np.random.default_rng(0)
+    observed = [random.normal(size=(60, 2)) for _ in range(8)]
+    spec = parse_spec(yaml.safe_load(SPEC.replace(", labels: skill", "").replace("count: 2", "count: 1")))
+    for degrees, dims in ((1.5, (0, 1)), (1000.0, ())):
+        scale = [1 / np.sqrt(random.chisquare(degrees, size=(60, 1)) / degrees) for _ in observed]
+        noise = [0.3 * own * random.normal(size=(60, 2)) for own in scale]
+        demos = numbered(({"state": x}, x + e) for x, e in zip(observed, noise, strict=True))
+        assert heavy_tails(spec, demos) == dims
