@@ -213,7 +213,12 @@ def processes(number: int, *modules: str) -> Iterator[tuple[Submit, int]]:
     finally:
         _OPEN.remove(here)
         if executor.cache_info().currsize:
+            shown, threading.excepthook = (
+                threading.excepthook,
+                lambda _: None,
+            )  # loky's thread misses calls that are gone
             executor().shutdown(kill_workers=True)
+            threading.excepthook = shown
 
 
 def end_with(parent: int) -> None:
