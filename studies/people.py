@@ -98,25 +98,31 @@ class PeopleCell(Cell):
         if self.fold == "last":
             clamped = fit(with_overrides(spec, {"training.labels": given, "control.power": 1.0}), own)
             kinds["labels alone, β = 1"] = list(clamped.segment(valid)[0])
+        chosen = found.metrics.training.recogniser
+        assert chosen is not None  # it has one
+        only = {"recogniser": {"weight": ALONE_WEIGHT, "ridge": chosen.ridge}}
+        smooth = fit(with_overrides(spec, {"training.labels": given | only, "control.power": NOTHING}), own)
+        kinds["recogniser, transitions"] = list(smooth.segment(valid)[0])
         values = found.metrics.trained_labels
         assert values is not None  # it trains on labels
         names = np.array([-9, *values.values, *[-9] * count])
-        chosen = found.metrics.training.recogniser
         return {
             "scores": {name: scored([names[row] for row in own], own, truth) for name, own in kinds.items()},
-            "chosen": None if chosen is None else [chosen.power, chosen.weight, chosen.ridge],
+            "chosen": {"power": chosen.power, "weight": chosen.weight, "ridge": chosen.ridge},
         }
 
     def rows(self, results: Mapping[str, Any]) -> Iterator[Row]:
-        """Agreement of each method; the fold stands for the seed."""
+        """Agreement of each method, and what cross-validation chose; the fold stands for the seed."""
         split, _, own = self.fold.partition("-")
-        for method, scores in results["scores"].items():
+        for method, scores in {**results["scores"], "chosen": results.get("chosen", {})}.items():
             for measure, value in scores.items():
-                yield Row(split, self.task, f"{method}, {self.labelled} labelled", None, own or 0,
-                          measure, value)  # fmt: skip
+                named = f"{method}, {self.labelled} labelled"
+                yield Row(split, self.task, named, None, own or 0, measure, value)
 
 
 ALONE: dict[str, Any] = {"compare_with": []}
+NOTHING, ALONE_WEIGHT = 1e-6, 0.3
+"""The power with which controls count nothing, and the recogniser's weight beside transitions."""
 BASELINES = {"Gaussian HMM": "hmm", "change points": "change_points"}
 USUAL: dict[str, Any] = {
     "control.power": 1.0,

@@ -23,7 +23,7 @@ from ddco_pyro.evaluation.inferred import infer
 from ddco_pyro.inference import log_likelihood, segment
 from ddco_pyro.model.batch import encode
 from ddco_pyro.report import write_report
-from ddco_pyro.spec import SpecError
+from ddco_pyro.spec import SpecError, parse_spec
 from ddco_pyro.training.checkpoint import Progress
 from ddco_pyro.training.initialization import Clusters
 from ddco_pyro.training.labels import Labels
@@ -492,3 +492,20 @@ def test_each_level_is_measured_with_its_own_labels(tmp_path, monkeypatch, label
     assert call("segment", "run", "demos.hdf5", "--html", "page.html").status == 0
     shown = (tmp_path / "page.html").read_text()
     assert [shown.count(f"Agreement with the label “{name}”") for name in names] == [names.count(one) for one in names]
+
+
+@pytest.mark.parametrize(
+    ("windows", "says"),
+    [(["1s", 3], "does not say its control frequency"), (["1x", 3], "or seconds such as 1s, got '1x'")],
+)
+def test_windows_that_are_no_lengths_are_refused_before_anything_is_written(windows, says, tmp_path):
+    demos = numbered(
+        ({"state": np.zeros((6, 2))}, np.arange(6.0)[:, None], {"skill": np.arange(6) // 3}) for _ in range(4)
+    )
+    labels = {"level": "option", "from": "skill", "recogniser": {"windows": windows}}
+    levels = [{"name": "option", "count": 2, "policy": {"network": "linear"}, "termination": {"network": "linear"}}]
+    hierarchy = {"levels": levels, "meta_policy": {"network": "linear"}}
+    given = {"demonstrations": {"path": "no.hdf5"}, "observations": ["state"], "hierarchy": hierarchy}
+    with pytest.raises(SpecError, match=says):
+        ddco_pyro.fit(parse_spec({**given, "training": {"labels": labels}}), demos, tmp_path / "run")
+    assert not (tmp_path / "run").exists()

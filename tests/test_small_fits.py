@@ -90,7 +90,10 @@ def test_init_writes_what_it_found(tmp_path: Path):
 def test_segments_are_coarser_or_finer_as_asked(tmp_path: Path):
     file, spec, run = tmp_path / "demos.hdf5", tmp_path / "spec.yaml", tmp_path / "run"
     skills_within_which_speed_varies().write(file)
-    spec.write_text(SPEC.replace("FILE", str(file)))
+    spec.write_text(
+        SPEC.replace("FILE", str(file)).replace("fraction: 0", "fraction: 0.2")
+        + "compare_with: [{kind: flat, policy: {network: linear}}]\n"
+    )
     ddco_pyro.fit(spec, out=run)
     ended = call("segment", run, file, "--granularity", "coarse", "--out", tmp_path / "labelled.hdf5")
     assert ended.status == 0, ended.err
@@ -105,6 +108,8 @@ def test_segments_are_coarser_or_finer_as_asked(tmp_path: Path):
     wrong = call("segment", run, file, "--granularity", "huge", "--out", tmp_path / "other.hdf5")
     assert wrong.status == 2
     assert "coarse, medium, fine" in wrong.err
+    flat = call("segment", run / "baselines" / "flat", file, "--granularity", "fine", "--out", tmp_path / "other.hdf5")
+    assert (flat.status, "without options" in flat.err) == (2, True)
 
 
 def test_heavy_tails_are_found_where_they_predict_better():

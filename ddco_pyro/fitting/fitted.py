@@ -198,6 +198,14 @@ class Fit:
             *(tuple(_stacked(level, 0.0) for level in zip(*kind, strict=True)) for kind in zip(*parts, strict=True))
         )
 
+    def refuse_flat(self) -> None:
+        """Refuse a policy without options.
+
+        :raises BadInput: this is one.
+        """
+        if self.spec.hierarchy is None:
+            raise BadInput(f"{self.place}: is a {self.name} policy without options; name a run that has options")
+
     def segment(self, demos: Iterable[Demonstration]) -> tuple[Segmentation, ...]:
         """Choices of the most likely path, for each level, lowest first: of each demonstration an array [T].
 

@@ -17,7 +17,6 @@ from ddco_pyro.data.memory import Extent, refuse_too_much
 from ddco_pyro.data.sources import Recording, Source, open_source
 from ddco_pyro.data.sources.recording import label_names
 from ddco_pyro.drawing.colours import option_colour
-from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.agreement import agreement as scores_of  # a module here has that name
 from ddco_pyro.evaluation.agreement import of_equal_lengths
 from ddco_pyro.evaluation.inferred import Inferred, runs
@@ -176,8 +175,7 @@ def segments(fit: Fit, source: Source, on_event: OnEvent = ignore, intervals: bo
     :raises BadInput: the run has no options.
     :raises DemonstrationsError: a demonstration cannot be used, or lacks an observation of the run.
     """
-    if fit.spec.hierarchy is None:
-        raise BadInput(f"{fit.place}: is a {fit.name} policy without options; name a run that has options")
+    fit.refuse_flat()
     chosen, known = chosen_names(source, fit), label_names(source.attributes)
     labels: dict[str, dict[str, np.ndarray]] = {}
     segmented: list[Segments] = []

@@ -34,9 +34,9 @@ second."""
 LADDER = (0.5, 0.05, 0.02)
 """Powers that are tried in this order where no length is asked for, at last with constant gates."""
 USUAL = 0.5
-"""The power from which on gates have ridges of 1, and options begin from single steps."""
+"""Below this power gates and terminations have ridges of :data:`RIDGE`, and options begin from windows."""
 RIDGE = 100.0
-"""The ridge of gates and terminations below that: what they read of observations costs nothing else."""
+"""What gates and terminations read of observations costs nothing else."""
 GRANULARITIES = {"coarse": 2.0, "medium": 1.0, "fine": 0.5}
 """Median segments in units of a run's own."""
 STEPS_A_SECOND = 10
@@ -185,6 +185,7 @@ def cut(trained: Fit, granularity: str, on_event: OnEvent = ignore) -> Fit:
     :param granularity: one of :data:`GRANULARITIES`; ``medium`` is the run itself.
     :raises BadInput: the run has no options that last, or trains on labels.
     """
+    trained.refuse_flat()
     if GRANULARITIES[granularity] == 1:
         return trained
     if trained.spec.training.labels is not None:

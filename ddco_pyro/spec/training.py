@@ -52,7 +52,10 @@ class OptimizerSpec(Model):
             yield "momentum", f"is for name: momentum, and {self.name} does not use it; leave it out"
 
 
-Window = Annotated[int, Field(ge=1)] | Annotated[str, Field(pattern=r"^(\d+\.?\d*|\.\d+)s$")]
+Window = Annotated[
+    Annotated[int, Field(ge=1)] | Annotated[str, Field(pattern=r"^(\d+\.?\d*|\.\d+)s$")],
+    nested((), int, "a number of steps from 1 on, or seconds such as 1s"),
+]
 
 
 class RecogniserSpec(Model):

@@ -76,10 +76,16 @@ class Labels:
 def used(spec: Spec, demos: Demonstrations) -> Labels | None:
     """The labels that a fit to these demonstrations uses; None where the spec names none.
 
-    :raises SpecError: as :meth:`Labels.of`.
+    :raises SpecError: as :meth:`Labels.of`, or a recogniser's windows are in seconds whose steps nobody knows.
     """
-    if spec.training.labels is None:
+    if (labels := spec.training.labels) is None:
         return None
+    windows = (labels.recogniser and labels.recogniser.windows) or ()
+    if demos.frequency is None and any(isinstance(width, str) for width in windows):
+        raise SpecError(
+            "training.labels.recogniser.windows: are in seconds, and the file does not say its control frequency; give "
+            "numbers of steps"
+        )
     return Labels.of(spec, *tuning_split(spec, Dimensions.of(demos), parts(spec, demos)["train"]))
 
 

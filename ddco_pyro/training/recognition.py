@@ -16,7 +16,7 @@ from ddco_pyro.model.batch import Batch, encode
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.recogniser import Windows
 from ddco_pyro.model.tables import Tables
-from ddco_pyro.spec import SpecError, with_overrides
+from ddco_pyro.spec import with_overrides
 from ddco_pyro.statistics import edit_score
 from ddco_pyro.training.checkpoint import Progress, Restart, State, TrainingData
 from ddco_pyro.training.em import Expectation
@@ -95,7 +95,6 @@ def recognise(model: Hierarchy, data: TrainingData, demos: Demonstrations) -> tu
     :param model: the hierarchy, with fitted encoder and scaling.
     :param demos: those to train and to tune with.
     :returns: the data with the power β of the control, and with starts and evidence of steps without labels.
-    :raises SpecError: windows are in seconds, and the frequency of the control is not known.
     """
     labels, own, recogniser = data.labels, data.spec.training.labels, model.recogniser
     assert labels is not None
@@ -178,11 +177,6 @@ def _widths(windows: tuple[int | str, ...] | None, options: Tensor, frequency: f
         lengths = [np.diff(at)[own[at[:-1]] > 0] for own, at in zip(options.numpy(), edges, strict=True)]
         typical = float(np.median(np.concatenate(lengths)))
         return tuple(max(1, round(share * typical)) for share in SHARES)
-    if frequency is None and any(isinstance(width, str) for width in windows):
-        raise SpecError(
-            "training.labels.recogniser.windows: are in seconds, and the file does not say its control frequency; give "
-            "numbers of steps"
-        )
     steps = (
         width if isinstance(width, int) else float(width.removesuffix("s")) * (frequency or 1) for width in windows
     )
