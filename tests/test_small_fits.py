@@ -15,7 +15,8 @@ from sklearn.metrics import normalized_mutual_info_score
 import ddco_pyro
 from ddco_pyro.acting.monitor import run_lengths
 from ddco_pyro.errors import BadInput
-from ddco_pyro.selection.small import heavy_tails, in_steps, lasting, median_segment
+from ddco_pyro.evaluation.options import segments_of
+from ddco_pyro.selection.small import heavy_tails, in_steps, lasting, overrides
 from ddco_pyro.spec import load_spec, parse_spec, with_overrides
 
 SLOW = 30
@@ -50,13 +51,13 @@ training: {initialize: vq_controls, optimizer: {name: em}, epochs: 60}
 def test_options_last_as_long_as_is_asked():
     demos = skills_within_which_speed_varies()
     spec = parse_spec(yaml.safe_load(SPEC))
-    assert median_segment(ddco_pyro.fit(spec, demos), demos) < 6  # the speed
+    assert segments_of(ddco_pyro.fit(spec, demos).segment(demos)[0]).median < 6  # the speed
     found = lasting(spec, demos, SLOW)
-    assert SLOW / 1.5 < found.median < 1.5 * SLOW
-    fit = ddco_pyro.fit(with_overrides(spec, found.overrides(spec)), demos)
+    assert SLOW / 1.5 < found.segments.median < 1.5 * SLOW
+    fit = ddco_pyro.fit(with_overrides(spec, overrides(spec, found.power, found.constant, found.window)), demos)
     options = np.concatenate(fit.segment(demos)[0])
     assert normalized_mutual_info_score(np.concatenate([demo.labels["skill"] for demo in demos]), options) > 0.7
-    assert lasting(spec, demos, None, least=5).median >= 5
+    assert not lasting(spec, demos, None).segments.brief(None)
 
 
 @pytest.mark.parametrize(

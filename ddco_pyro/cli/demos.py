@@ -104,7 +104,7 @@ def init(
 ) -> None:
     """Write a commented spec for a file of demonstrations, ready to fit.
 
-    Without --segment or --segments, options last at least half a second, or five steps.
+    Without --segment or --segments, options do not switch within half a second, or five steps, all the time.
     """
     from ddco_pyro.data.inspection import inspect as look
     from ddco_pyro.data.sources import refuse_foreign

@@ -12,15 +12,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ddco_pyro.acting.monitor import run_lengths
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.starting import Decided
 from ddco_pyro.drawing.words import duration
 from ddco_pyro.errors import BadInput
+from ddco_pyro.evaluation.options import segments_of
 from ddco_pyro.events import LengthTried, OnEvent, ignore
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.fitted import Fit, load
 from ddco_pyro.fitting.run import is_finished
+from ddco_pyro.metrics import Segments
 from ddco_pyro.spec import Spec, with_overrides
 from ddco_pyro.training.data import parts
 
@@ -55,35 +56,30 @@ class Lasting(NamedTuple):
     :param power: β.
     :param constant: whether gates and terminations are constant.
     :param window: ``training.window`` of options that last long.
-    :param median: length of the lowest level's segments, steps.
+    :param segments: of the lowest level.
     """
 
     power: float
     constant: bool
     window: int
-    median: float
+    segments: Segments
 
-    def overrides(self, spec: Spec) -> dict[str, Any]:
-        """The key paths of a spec that have these values."""
-        values: dict[str, Any] = {"control.power": self.power}
-        if self.power < USUAL:
-            values |= {f"training.optimizer.ridge.{gate}": RIDGE for gate in ("gate", "termination")}
-            values["training.window"] = self.window
-        if self.constant and spec.hierarchy is not None:
-            levels = enumerate(spec.hierarchy.levels)
-            gates = [f"levels.{n}.{part}" for n, level in levels for part in _gates(n, level.lasts)]
-            values |= {f"hierarchy.{gate}.network": "constant" for gate in (*gates, "meta_policy")}
-        return values
+
+def overrides(spec: Spec, power: float, constant: bool, window: int) -> dict[str, Any]:
+    """The key paths of a spec whose options last as these values make them."""
+    values: dict[str, Any] = {"control.power": power}
+    if power < USUAL:
+        values |= {f"training.optimizer.ridge.{gate}": RIDGE for gate in ("gate", "termination")}
+        values["training.window"] = window
+    if constant and spec.hierarchy is not None:
+        levels = enumerate(spec.hierarchy.levels)
+        gates = [f"levels.{n}.{part}" for n, level in levels for part in _gates(n, level.lasts)]
+        values |= {f"hierarchy.{gate}.network": "constant" for gate in (*gates, "meta_policy")}
+    return values
 
 
 def _gates(number: int, lasts: bool) -> list[str]:
     return [*(["policy"] if number else []), *(["termination"] if lasts else [])]
-
-
-def median_segment(trained: Fit, demos: Demonstrations) -> float:
-    """The median length of the lowest level's segments in demonstrations, steps."""
-    level = trained.segment(demos)[0]
-    return float(np.median(np.concatenate(run_lengths(level, len(level.names) - 1))))
 
 
 def decide(
@@ -96,26 +92,24 @@ def decide(
     """What small fits to training demonstrations decide of a starting spec.
 
     :param frequency: steps per second (Hz); None where unknown.
-    :param steps: the median segment that is asked for; None for at least half a second, or five steps.
+    :param steps: the median segment that is asked for; None for any that is not too short for a skill.
     :raises BadInput: the spec has no options that last.
     """
     heavy = heavy_tails(spec, demos)
-    least = max(5.0, 0.5 * frequency) if frequency else 5.0
-    found = lasting(with_heavy_tails(spec, heavy), demos, steps, least, on_event)
+    found = lasting(with_heavy_tails(spec, heavy), demos, steps, on_event)
     asked = "" if steps is None else f"; asked: {duration(frequency, steps)}"
     window = found.window if found.power < USUAL else 0
-    why = f"median segment {duration(frequency, found.median)} in small fits{asked}"
+    why = f"median segment {duration(frequency, found.segments.median)} in small fits{asked}"
     return Decided(found.power, found.constant, window, why, heavy)
 
 
-def lasting(
-    spec: Spec, demos: Demonstrations, steps: float | None, least: float = 5.0, on_event: OnEvent = ignore
-) -> Lasting:
+def lasting(spec: Spec, demos: Demonstrations, steps: float | None, on_event: OnEvent = ignore) -> Lasting:
     """The power, and gates, with which a fit's median segment has a length that is asked for.
 
     Fits are of the model alone, to some of the training demonstrations.
 
-    :param steps: the length, in steps; None for the first of :data:`LADDER` that gives at least ``least``.
+    :param steps: the length, in steps; None for the first of :data:`LADDER` whose segments are not
+        :meth:`~ddco_pyro.metrics.Segments.brief`.
     :raises BadInput: the spec has no options that last.
     """
     if spec.hierarchy is None or not spec.hierarchy.levels[0].lasts:
@@ -125,16 +119,16 @@ def lasting(
     window = max(1, round(demos.frequency or STEPS_A_SECOND))
 
     def tried(power: float, constant: bool) -> Lasting:
-        settings = Lasting(power, constant, window, 0.0).overrides(spec)
-        found = Lasting(power, constant, window, median_segment(fit(with_overrides(sketch, settings), some), some))
-        on_event(LengthTried(power, constant, found.median))
-        return found
+        settings = overrides(spec, power, constant, window)
+        segments = segments_of(fit(with_overrides(sketch, settings), some).segment(some)[0])
+        on_event(LengthTried(power, constant, segments.median))
+        return Lasting(power, constant, window, segments)
 
     if steps is not None:
         return _searched(tried, steps)
     for power in LADDER:
         found = tried(power, power == LADDER[-1])
-        if found.median >= least:
+        if not found.segments.brief(demos.frequency):
             break
     return found
 
@@ -196,9 +190,10 @@ def cut(trained: Fit, granularity: str, on_event: OnEvent = ignore) -> Fit:
     spec, demos = trained.spec, trained.demonstrations
     train = parts(spec, demos)["train"]
     half = float(np.mean([len(demo) for demo in train])) / 2  # a whole demonstration is no skill
-    steps = min(GRANULARITIES[granularity] * median_segment(trained, train), half)
+    steps = min(GRANULARITIES[granularity] * segments_of(trained.segment(train)[0]).median, half)
     alone = {"compare_with": [], "demonstrations.leave_one_out": False}
-    changes = lasting(spec, demos, steps, on_event=on_event).overrides(spec) | alone
+    found = lasting(spec, demos, steps, on_event)
+    changes = overrides(spec, found.power, found.constant, found.window) | alone
     return fit(with_overrides(spec, changes), demos, folder, on_event, keep=False)
 
 
@@ -230,7 +225,7 @@ def _searched(tried: Callable[[float, bool], Lasting], steps: float) -> Lasting:
         shorter, power = 1.0, FIRST
         while power >= LEAST:
             found.append(tried(power, constant))
-            if found[-1].median >= steps:
+            if found[-1].segments.median >= steps:
                 break
             shorter, power = power, power / 2
         else:
@@ -239,7 +234,7 @@ def _searched(tried: Callable[[float, bool], Lasting], steps: float) -> Lasting:
             if _off(min(found, key=lambda one: _off(one, steps)), steps) < NEAR:
                 break
             found.append(tried(float(f"{math.sqrt(shorter * power):.2g}"), constant))
-            longer = found[-1].median >= steps
+            longer = found[-1].segments.median >= steps
             shorter, power = (shorter, found[-1].power) if longer else (found[-1].power, power)
         best = min(found, key=lambda one: _off(one, steps))
         if _off(best, steps) < FAR:
@@ -249,7 +244,7 @@ def _searched(tried: Callable[[float, bool], Lasting], steps: float) -> Lasting:
 
 def _off(found: Lasting, steps: float) -> float:
     """The factor between a median and the length asked for, at least 1."""
-    return max(found.median / steps, steps / found.median)
+    return max(found.segments.median / steps, steps / found.segments.median)
 
 
 def _some(demos: Demonstrations) -> Demonstrations:
