@@ -76,7 +76,7 @@ class Labels:
 def used(spec: Spec, demos: Demonstrations) -> Labels | None:
     """The labels that a fit to these demonstrations uses; None where the spec names none.
 
-    :raises SpecError: as :meth:`Labels.of`, or a recogniser's windows are in seconds whose steps nobody knows.
+    :raises SpecError: as :meth:`Labels.of`, or windows of a recogniser are in seconds and the frequency is unknown.
     """
     if (labels := spec.training.labels) is None:
         return None
