@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 import study
+import torch
 from sklearn.cluster import KMeans
 from sklearn.metrics import normalized_mutual_info_score
 from study import Cell, Row, Settings, described
@@ -35,7 +36,7 @@ from ddco_pyro.evaluation.agreement import confusion, equal_lengths
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.model.batch import encode
-from ddco_pyro.model.recogniser import Windows
+from ddco_pyro.model.recogniser import observed, window_means
 from ddco_pyro.segmenting.baselines import segment
 from ddco_pyro.selection.small import decide
 from ddco_pyro.spec import parse_spec, with_overrides
@@ -187,10 +188,8 @@ def clusters(found: Fit, train: Demonstrations, valid: Demonstrations, count: in
     model, rows = found.hierarchy, []
     for part in (train, valid):
         batch = encode(part, model.encoder, model.scaling)
-        windows = Windows(count, model.input_shape, batch.actions.shape[-1], past=False)
-        windows.widths.fill_(SECOND)
-        size = windows.weight.shape[0] // (1 + len(windows.widths))
-        features = windows.features(batch.inputs, batch.actions, batch.lengths)[..., size : 2 * size].numpy()
+        x = torch.cat([observed(batch.inputs), batch.actions.double()], dim=-1)
+        features = window_means(x, batch.lengths, SECOND, SECOND).numpy()
         rows.append([own[:length] for own, length in zip(features, batch.lengths.tolist(), strict=True)])
     fitted = KMeans(count, n_init=10, random_state=0).fit(np.concatenate(rows[0]))
     return [fitted.predict(own) for own in rows[1]]

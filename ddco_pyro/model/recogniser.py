@@ -58,14 +58,8 @@ class Windows(nn.Module):
         if self.past:
             actions = pad(actions[:, :-1], (0, 0, 1, 0))
         x = torch.cat([observed(inputs), actions.double()], dim=-1)
-        sums, time = pad(x.cumsum(1), (0, 0, 1, 0)), torch.arange(x.shape[1])
-        columns = [x]
-        for width in self.widths.tolist():
-            first = (time - width).clamp(min=0).expand(len(x), -1)
-            last = torch.minimum(time + (0 if self.past else width) + 1, lengths[:, None]).maximum(first + 1)
-            low, high = (sums.gather(1, end.unsqueeze(-1).expand(*end.shape, x.shape[-1])) for end in (first, last))
-            columns.append((high - low) / (last - first).unsqueeze(-1))
-        return torch.cat(columns, dim=-1)
+        widths = self.widths.tolist()
+        return torch.cat([x, *(window_means(x, lengths, width, 0 if self.past else width) for width in widths)], dim=-1)
 
     def latest(self, rows: Sequence[Tensor]) -> Tensor:
         """The features [3 F] of the last of consecutive steps, from x of each [F]; for a regression on the past."""
@@ -83,6 +77,19 @@ class Windows(nn.Module):
         """
         ratio = self.log_probability(features).clamp(min=FLOOR) - self.share.log()
         return pad(torch.where(self.share > 0, ratio, 0.0), (1, 0))
+
+
+def window_means(x: Tensor, lengths: Tensor, before: int, after: int) -> Tensor:
+    """The mean of each step and of so many steps before and after it, fewer at the ends, [N, T, F].
+
+    :param x: [N, T, F].
+    :param lengths: steps of each trajectory, [N]; means of steps past them are arbitrary.
+    """
+    sums, time = pad(x.cumsum(1), (0, 0, 1, 0)), torch.arange(x.shape[1])
+    first = (time - before).clamp(min=0).expand(len(x), -1)
+    last = torch.minimum(time + after + 1, lengths[:, None]).maximum(first + 1)
+    low, high = (sums.gather(1, end.unsqueeze(-1).expand(*end.shape, x.shape[-1])) for end in (first, last))
+    return (high - low) / (last - first).unsqueeze(-1)
 
 
 class Recogniser(nn.Module):

@@ -20,7 +20,7 @@ from torch import Tensor
 from ddco_pyro.data.memory import share
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import BYTES_AT_ONCE
-from ddco_pyro.model.recogniser import FRAMES_AT_ONCE, block_means
+from ddco_pyro.model.recogniser import FRAMES_AT_ONCE, block_means, window_means
 
 if TYPE_CHECKING:
     from sklearn.cluster import KMeans
@@ -87,26 +87,22 @@ class Clusters:
         """The features of consecutive steps [B, F], trajectory after trajectory."""
         for row, length in enumerate(batch.lengths.tolist()):
             blocks = self._of_trajectory(batch, row, length)
-            yield from [averaged(np.concatenate(list(blocks)), self._window)] if self._window else blocks
+            if not self._window:
+                yield from blocks
+                continue
+            rows = torch.from_numpy(np.concatenate(list(blocks)))
+            yield window_means(rows.unsqueeze(0), torch.tensor([length]), self._window, self._window)[0].numpy()
 
     def _of_trajectory(self, batch: Batch, row: int, length: int) -> Iterator[np.ndarray]:
         alone, first = batch.inputs.part(torch.tensor([row]), slice(0, length)), 0
         for inputs in alone.chunks(FRAMES_AT_ONCE if alone.images else length):
             loaded = inputs.loaded()
             read = loaded.select(self._read) if self._read else loaded
-            means = [block_means(image[0].cpu()) for image in read.images.values()]
-            seen = torch.cat([read.vector[0], *means], dim=-1).double().numpy()
+            pooled = [block_means(image[0].cpu()) for image in read.images.values()]
+            seen = torch.cat([read.vector[0], *pooled], dim=-1).double().numpy()
             last = first + len(seen)
             yield joined(seen, batch.actions[row, first:last].double().numpy()) if self._controls else seen
             first = last
-
-
-def averaged(rows: np.ndarray, window: int) -> np.ndarray:
-    """The mean of each row [T, F] and of so many rows before and after it, fewer at the ends."""
-    sums, time = np.concatenate([np.zeros_like(rows[:1]), rows.cumsum(0)]), np.arange(len(rows))
-    first, last = np.maximum(time - window, 0), np.minimum(time + window + 1, len(rows))
-    means: np.ndarray = (sums[last] - sums[first]) / (last - first)[:, None]
-    return means
 
 
 def _only(chosen: np.ndarray, blocks: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
