@@ -365,11 +365,6 @@ def test_windows_are_in_steps_or_seconds_or_follow_from_labelled_segments(window
     assert _widths(windows, options, hertz) == widths
 
 
-def test_seconds_need_a_frequency():
-    with pytest.raises(SpecError, match="the file does not say its control frequency"):
-        _widths(("1s", "3s"), torch.ones(1, 4, dtype=torch.long), None)
-
-
 def test_demonstrations_are_left_out_whole_and_a_single_one_by_parts():
     options, lengths = torch.tensor([[1, 2, 1, 2, 1], [-1] * 5, [2, 2, 1, -1, -1]]), torch.tensor([5, 4, 3])
     each = [hidden.any(1).tolist() for hidden in _left_out(options, lengths)]
