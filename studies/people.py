@@ -1,22 +1,23 @@
 """Gestures of surgeons: options without labels, and with a few, beside what a user would try instead (JIGSAWS).
 
-    python studies/people.py --data FOLDER [--tasks Knot_Tying Suturing] [--splits last surgeon trial]
+    python studies/people.py --data FOLDER [--tasks Knot_Tying Suturing] [--splits last surgeon trial pusht]
         [--labelled 0 1 3 5 all] [--jobs 2] [--summarize]
 
 FOLDER holds ``TASK.hdf5``, of ``ddco-pyro import JIGSAWS/TASK --hz 10``. No licence lets anyone share these data; Johns
 Hopkins University gives them on request.
 
 ``last`` holds out the last trial of each surgeon. ``trial`` and ``surgeon`` are the official splits: each trial, and
-each surgeon, is held out in turn. The spec is what ``ddco-pyro init`` writes for the training demonstrations. Labelled
-demonstrations are spread evenly over them. A cell that was done is not done again. Adds its numbers to
-``docs/results/people.csv``.
+each surgeon, is held out in turn. ``pusht`` is pushing by mouse without labels, ``FOLDER/pusht_human.hdf5``. The spec
+is what ``ddco-pyro init`` writes for the training demonstrations. Labelled demonstrations are spread evenly over them.
+A cell that was done is not done again. Adds its numbers to ``docs/results/people.csv``.
 """
 
 from __future__ import annotations
 
 import argparse
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,10 @@ import numpy as np
 import study
 import torch
 from sklearn.cluster import KMeans
+from sklearn.decomposition import PCA
 from sklearn.metrics import normalized_mutual_info_score
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
 from study import Cell, Row, Settings, described
 
 from ddco_pyro.data.demonstrations import Demonstrations
@@ -42,9 +46,11 @@ from ddco_pyro.selection.small import decide
 from ddco_pyro.spec import parse_spec, with_overrides
 from ddco_pyro.spec.yaml import read_yaml
 from ddco_pyro.statistics import edit_score
+from ddco_pyro.training.data import demonstrations as read_demonstrations
+from ddco_pyro.training.data import parts
 
 LABELS, KNOWN = "gesture", "known"
-ALL, SPLITS = "all", ["last", "surgeon", "trial"]
+ALL, SPLITS = "all", ["last", "surgeon", "trial", "pusht"]
 SECOND = 10  # steps
 DEFAULTS = Settings({"seed": 0}, Path("runs/people"))
 
@@ -79,11 +85,11 @@ class PeopleCell(Cell):
         spec = with_overrides(parse_spec(read_yaml(text)), ALONE | {"seed": settings.values["seed"]})
         truth, count = [demo.labels[LABELS] for demo in valid], spec.hierarchy.levels[0].count if spec.hierarchy else 1
         if self.labelled == "0":
-            found = fit(spec, demos)
+            found, typical = fit(spec, demos), typical_length(demo.labels[LABELS] for demo in train)
             kinds = {"options": list(found.segment(valid)[0]), "windowed k-means": clusters(found, train, valid, count)}
             kinds |= {name: segment(key, train, valid, count, 0, spec.observations) for name, key in BASELINES.items()}
+            kinds |= dict(zip(("AR-HMM", "AR-HMM, sticky"), autoregressive(train, valid, count, typical), strict=True))
             kinds["options, β = 1"] = list(fit(with_overrides(spec, USUAL), demos).segment(valid)[0])
-            typical = float(np.median(np.concatenate([lengths(demo.labels[LABELS]) for demo in train])))
             asked = decide(plain, replace(train, masks={}), demos.frequency, typical)
             as_asked = starting_spec(replace(facts, excluded=(), masks={}), path, decided=asked).text
             longer = with_overrides(parse_spec(read_yaml(as_asked)), ALONE | {"seed": settings.values["seed"]})
@@ -121,6 +127,52 @@ class PeopleCell(Cell):
                 yield Row(split, self.task, named, None, own or 0, measure, value)
 
 
+@dataclass(frozen=True)
+class PushTCell(Cell):
+    """PushT has no labels: how long segments are, and how much fits with other training seeds agree."""
+
+    data: str
+    method: str
+
+    @property
+    def name(self) -> str:
+        """Of its files."""
+        return f"PushT-{self.method}"
+
+    def depends(self, settings: Settings) -> dict[str, Any]:
+        """What decides its results; the place of the data does not."""
+        return {"method": self.method, "seeds": SEEDS} | settings.kept()
+
+    def results(self, settings: Settings, folder: Path) -> dict[str, Any]:
+        """Fit with each seed, and compare the segments of the held-out demonstrations."""
+        path = Path(self.data) / "pusht_human.hdf5"
+        facts = inspect(path)
+        decided = decide(parse_spec(read_yaml(starting_spec(facts, path).text)), Demonstrations.read(path), SECOND)
+        spec = with_overrides(parse_spec(read_yaml(starting_spec(facts, path, decided=decided).text)), ALONE)
+        spec = with_overrides(spec, USUAL if self.method == "options, β = 1" else {})
+        demos = read_demonstrations(spec)
+        train, valid = (parts(spec, demos)[part] for part in ("train", "valid"))
+        if self.method == "windowed k-means":
+            found, count = fit(spec, demos), spec.hierarchy.levels[0].count if spec.hierarchy else 1
+            kinds = [clusters(found, train, valid, count, seed) for seed in range(SEEDS)]
+        else:
+            fits = [fit(with_overrides(spec, {"training.seed": seed}), demos) for seed in range(SEEDS)]
+            kinds = [list(each.segment(valid)[0]) for each in fits]
+        pairs = itertools.combinations(map(np.concatenate, kinds), 2)
+        return {
+            "median": [typical_length(own) / SECOND for own in kinds],
+            "segments": [float(np.mean([1 + (np.diff(row) != 0).sum() for row in own])) for own in kinds],
+            "NMI of pairs": [float(normalized_mutual_info_score(*pair)) for pair in pairs],
+        }
+
+    def rows(self, results: Mapping[str, Any]) -> Iterator[Row]:
+        """Of each seed the median segment in seconds and the number of segments; the agreement of each two seeds."""
+        for measure, values in results.items():
+            for seed, value in enumerate(values):
+                yield Row("PushT", "PushT", self.method, None, seed, measure, value)
+
+
+SEEDS, METHODS = 5, ("options", "options, β = 1", "windowed k-means")
 ALONE: dict[str, Any] = {"compare_with": []}
 NOTHING, ALONE_WEIGHT = 1e-6, 0.3
 """The power with which controls count nothing, and the recogniser's weight beside transitions."""
@@ -176,14 +228,16 @@ def with_labels(demos: Demonstrations, train: Demonstrations, number: int) -> De
     )
 
 
-def lengths(labels: np.ndarray) -> np.ndarray:
-    """Steps of each labelled segment."""
-    edges = np.flatnonzero(np.diff(labels, prepend=-2, append=-2))
-    steps: np.ndarray = np.diff(edges)[labels[edges[:-1]] >= 0]
-    return steps
+def typical_length(labels: Iterable[np.ndarray]) -> float:
+    """The median steps of a segment, over all demonstrations; -1 is no segment."""
+    lengths = []
+    for row in labels:
+        edges = np.flatnonzero(np.diff(row, prepend=-2, append=-2))
+        lengths.append(np.diff(edges)[row[edges[:-1]] >= 0])
+    return float(np.median(np.concatenate(lengths)))
 
 
-def clusters(found: Fit, train: Demonstrations, valid: Demonstrations, count: int) -> list[np.ndarray]:
+def clusters(found: Fit, train: Demonstrations, valid: Demonstrations, count: int, seed: int = 0) -> list[np.ndarray]:
     """k-means on observations and controls averaged over a second before and after each step."""
     model, rows = found.hierarchy, []
     for part in (train, valid):
@@ -191,8 +245,42 @@ def clusters(found: Fit, train: Demonstrations, valid: Demonstrations, count: in
         x = torch.cat([observed(batch.inputs), batch.actions.double()], dim=-1)
         features = window_means(x, batch.lengths, SECOND, SECOND).numpy()
         rows.append([own[:length] for own, length in zip(features, batch.lengths.tolist(), strict=True)])
-    fitted = KMeans(count, n_init=10, random_state=0).fit(np.concatenate(rows[0]))
+    fitted = KMeans(count, n_init=10, random_state=seed).fit(np.concatenate(rows[0]))
     return [fitted.predict(own) for own in rows[1]]
+
+
+def autoregressive(
+    train: Demonstrations, valid: Demonstrations, count: int, typical: float
+) -> Iterator[list[np.ndarray]]:
+    """States of dynamax' AR-HMM, without stickiness, and with the one whose median segment is about as long as asked.
+
+    It sees principal directions of observations and controls, whitened, and predicts each step from the one before.
+
+    :param typical: the median steps that are asked for, of the segments of the training demonstrations.
+    """
+    import jax
+    from dynamax.hidden_markov_model import LinearAutoregressiveHMM
+
+    jax.config.update("jax_enable_x64", True)
+    rows = [np.concatenate([*demo.observations.values(), demo.actions], 1, dtype=float) for demo in (*train, *valid)]
+    whitened = make_pipeline(StandardScaler(), PCA(DIRECTIONS, whiten=True)).fit(np.concatenate(rows[: len(train)]))
+    rows = [whitened.transform(row) for row in rows]
+    after, before = (np.concatenate([row[part] for row in rows[: len(train)]]) for part in (slice(1, None), slice(-1)))
+    tried = []
+    for stickiness in STICKINESS:
+        model = LinearAutoregressiveHMM(count, DIRECTIONS, transition_matrix_stickiness=stickiness)
+        start = model.initialize(jax.random.PRNGKey(0), method="kmeans", emissions=after)
+        learned, _ = model.fit_em(*start, after, inputs=before, num_iters=50, verbose=False)
+        states = [np.asarray(model.most_likely_states(learned, row[1:], inputs=row[:-1])) + 1 for row in rows]
+        states = [np.insert(own, 0, own[0]) for own in states]
+        median = typical_length(states[: len(train)])
+        tried.append((abs(math.log(median / typical)), stickiness, states[len(train) :]))
+    yield tried[0][-1]
+    yield min(tried)[-1]
+
+
+DIRECTIONS, STICKINESS = 10, (0.0, *(10.0**power for power in range(3, 9)))
+"""Of an AR-HMM: the principal directions that it sees, and the pseudo-counts of staying that are tried."""
 
 
 def recognised(piece: Any) -> Iterator[tuple[Any, int]]:
@@ -222,10 +310,10 @@ def scored(named: Sequence[np.ndarray], kinds: Sequence[np.ndarray], truth: Sequ
     }
 
 
-def cells(own: argparse.Namespace) -> list[PeopleCell]:
+def cells(own: argparse.Namespace) -> list[Cell]:
     """All of a split before another."""
-    found = []
-    for split, task in itertools.product(own.splits, own.tasks):
+    found: list[Cell] = [PushTCell(str(own.data), method) for method in METHODS if "pusht" in own.splits]
+    for split, task in itertools.product([split for split in own.splits if split != "pusht"], own.tasks):
         demos = labelled_demonstrations(own.data / f"{task}.hdf5")
         names = folds(demos, split)
         found += [PeopleCell(str(own.data), task, fold, labelled) for fold in names for labelled in own.labelled]
@@ -237,9 +325,7 @@ def main() -> None:
     parser = described(__doc__)
     parser.add_argument("--data", type=Path, required=True, metavar="FOLDER")
     parser.add_argument("--tasks", nargs="+", default=["Knot_Tying", "Suturing"], metavar="TASK")
-    parser.add_argument(
-        "--splits", nargs="+", default=["last", "surgeon", "trial"], choices=["last", "surgeon", "trial"]
-    )
+    parser.add_argument("--splits", nargs="+", default=SPLITS, choices=SPLITS)
     parser.add_argument("--labelled", nargs="+", default=["0", "1", "3", "5", ALL])
     study.main("people", parser, DEFAULTS, cells)
 
