@@ -19,6 +19,7 @@ from sklearn.metrics import normalized_mutual_info_score
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.evaluation.agreement import agreement
+from ddco_pyro.evaluation.effort import contributions
 from ddco_pyro.evaluation.inferred import infer
 from ddco_pyro.inference import log_likelihood, segment
 from ddco_pyro.model.batch import encode
@@ -325,7 +326,8 @@ def test_a_recogniser_places_what_labels_alone_do_not(tmp_path):
     for name, own in {"clamped": None, "recogniser": {"cross_validated": True}}.items():
         labels = {"level": "level-1", "from": "known", **({"recogniser": own} if own else {})}
         training = {"optimizer": {"name": "em"}, "labels": labels, "epochs": 40}
-        spec = small_spec((2,), training=training, demonstrations={"path": "unused.hdf5", "labels": "phase"})
+        read = {"path": "unused.hdf5", "labels": "phase"}
+        spec = small_spec((2,), training=training, demonstrations=read, compare_with=["mixture"] if own else [])
         fit = ddco_pyro.fit(spec, train, out=tmp_path / name)
         paths = [*fit.segment(held_out)[0]]
         truth = [demo.labels["phase"] + 1 for demo in held_out]
@@ -341,8 +343,15 @@ def test_a_recogniser_places_what_labels_alone_do_not(tmp_path):
     assert float(again.hierarchy.recogniser.gamma) == chosen.weight
     for own, other in zip(fit.segment(held_out)[0], again.segment(held_out)[0], strict=True):
         np.testing.assert_array_equal(own, other)
+    mixture = again.baselines["mixture"]
+    shared = mixture.spec.training.labels.recogniser
+    assert not shared.cross_validated
+    assert (mixture.spec.control.power, shared.weight, shared.ridge) == (chosen.power, chosen.weight, chosen.ridge)
+    assert float(mixture.hierarchy.recogniser.gamma) == chosen.weight
+    said = contributions(again.metrics.training)
+    assert max(map(sum, said.values())) == sum(said["labels, recogniser and policies, as chosen"])
     page = write_report(again, again.demonstrations).read_text()
-    assert "of left-out labelled demonstrations: chosen" in page
+    assert f"<td>labels alone</td><td>{said['labels alone'][0]:.2f}</td>" in page
     row = again.metrics.agreement.recogniser["train"]
     assert f"<td>recogniser alone, training</td><td>{row.nmi:.2f}</td>" in page
 

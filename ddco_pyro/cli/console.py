@@ -299,6 +299,8 @@ def names(fit: Fit) -> None:
     }
     if told := effort.recogniser(fit.metrics.training):
         say(f"labels: {told}")
+    for row, (accuracy, edit) in effort.contributions(fit.metrics.training).items():
+        say(f"  left out, {row}: accuracy {words.number(accuracy)}, edit score {words.number(edit)}")
     written = [
         f"{name} {words.number(one.agreement)}" if one and one.name == name else name
         for level in fit.named

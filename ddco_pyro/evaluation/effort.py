@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from statistics import fmean
 
 from ddco_pyro.drawing.words import capital, listed, number, verb
 from ddco_pyro.metrics import Candidate, Metrics, Stage, Training
@@ -22,25 +23,32 @@ def _over_all(training: Training) -> str:
 
 
 def recogniser(training: Training) -> str:
-    """How much a recogniser's evidence counts, and what left-out demonstrations said of it; empty without one."""
+    """How much a recogniser's evidence counts; empty without one."""
     own = training.recogniser
     if own is None:
         return ""
-    said = f"the controls count {own.power:g} times, the recogniser {own.weight:g} times (ridge {own.ridge:g})"
-    if not own.tried:
-        return said
-    taken = own.power, own.weight, own.ridge
-    each = {
-        "chosen": next(one for one in own.tried if (one.power, one.weight, one.ridge) == taken),
-        "recogniser alone": max((one for one in own.tried if one.power == own.tried[0].power), key=_score),
-        "labels alone": max((one for one in own.tried if not one.weight), key=_score),
+    return f"the controls count {own.power:g} times, the recogniser {own.weight:g} times (ridge {own.ridge:g})"
+
+
+def contributions(training: Training) -> dict[str, tuple[float, float]]:
+    """What labels, recogniser and policies contribute: accuracy and edit score of left-out labelled demonstrations.
+
+    Means over ridges, by which the first row was chosen; empty without cross-validation.
+    """
+    own, pairs = training.recogniser, dict[tuple[float, float], list[Candidate]]()
+    for one in () if own is None else own.tried:
+        pairs.setdefault((one.power, one.weight), []).append(one)
+    if own is None or not pairs:
+        return {}
+    rows = {
+        "labels, recogniser and policies, as chosen": (own.power, own.weight),
+        "recogniser with transitions": min(pairs),
+        "labels alone": next(pair for pair in pairs if not pair[1]),
     }
-    scores = (f"{name} {number(one.accuracy)} and {number(one.edit)}" for name, one in each.items())
-    return f"{said}; accuracy and edit score of left-out labelled demonstrations: {', '.join(scores)}"
-
-
-def _score(candidate: Candidate) -> float:
-    return candidate.accuracy + candidate.edit
+    return {
+        name: (fmean(one.accuracy for one in pairs[pair]), fmean(one.edit for one in pairs[pair]))
+        for name, pair in rows.items()
+    }
 
 
 def spent(training: Training) -> str:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -180,12 +181,16 @@ def _fit_model(
         on_event = clock.go_on(folder, on_event)
     split, size = parts(spec, demos), Dimensions.of(demos)
     checkpoints = folder / "checkpoints" if folder else None
-    fits = {
-        baseline: partial(_fit_baseline, its, demos, folder and folder / "baselines" / baseline, folder, baseline)
-        for baseline, (its, _) in baselines.items()
-    }
-    long = {name: fits[name] for name, model in baselines.items() if short and _worth_a_process(*model, demos)}
-    waiting = {name: training_began(its, name) for name, (its, _) in baselines.items()}
+    specs = {name: its for name, (its, _) in baselines.items()}
+
+    def fit_of(name: str) -> Callable[..., Fit]:
+        place = folder and folder / "baselines" / name
+        return partial(_fit_baseline, specs[name], demos, place, folder, name)
+
+    later = {name for name, its in specs.items() if _shares_recogniser(its)}
+    own = [name for name in specs if name not in later]
+    long = {name: fit_of(name) for name in own if short and _worth_a_process(*baselines[name], demos)}
+    waiting = {name: training_began(its, name) for name, its in specs.items()}
     if long:
         compile_all()
     with run_all(long, workers, "trained a baseline", on_event, beside=1, waiting=waiting) as fitted_beside:
@@ -196,9 +201,10 @@ def _fit_model(
         if folder:
             write_history(folder, trained.history)
             write_model(folder, hierarchy)
+        specs |= {name: _with_recogniser(specs[name], trained.summary["recogniser"]) for name in later}
         with clock("baselines"):
-            others = {name: fits[name](on_event, workers) for name in fits if name not in long} | dict(fitted_beside)
-            by_name = {name: replace(others[name], given=demos) for name in fits}
+            others = {name: fit_of(name)(on_event, workers) for name in specs if name not in long} | dict(fitted_beside)
+            by_name = {name: replace(others[name], given=demos) for name in specs}
     with clock("training"):
         alone = workers if _worth_a_process(spec, hierarchy, demos) else ALONE
         apart = _leave_one_out(spec, size, demos, folder, on_event, alone)
@@ -233,6 +239,22 @@ def _fit_model(
     if folder:
         metrics.write(folder)
     return replace(fitted, metrics=metrics, named=named or {})
+
+
+def _shares_recogniser(baseline: Spec) -> bool:
+    """Whether a baseline takes what cross-validation chooses for the model, rather than doing the same itself."""
+    labels = baseline.training.labels
+    return labels is not None and labels.recogniser is not None and labels.recogniser.cross_validated
+
+
+def _with_recogniser(baseline: Spec, chosen: Mapping[str, Any]) -> Spec:
+    """A baseline's spec with the model's recogniser, which leaves the policies and what lasts to differ.
+
+    :param chosen: of :meth:`~ddco_pyro.training.recognition.Recognition.as_data`.
+    """
+    recogniser = {"weight": chosen["weight"], "ridge": chosen["ridge"], "cross_validated": False}
+    values = {f"training.labels.recogniser.{key}": value for key, value in recogniser.items()}
+    return with_overrides(baseline, {"control.power": chosen["power"]} | values)
 
 
 def _versions() -> dict[str, str]:

@@ -8,7 +8,7 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.sources.recording import label_names
 from ddco_pyro.drawing.page import Block, Section, Table, Text, footnote, note
 from ddco_pyro.drawing.words import capital, number, percent
-from ddco_pyro.evaluation.effort import recogniser
+from ddco_pyro.evaluation.effort import contributions, recogniser
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Confusion, Scores
 from ddco_pyro.names import label_name, option_name
@@ -43,6 +43,9 @@ def section(fit: Fit, demos: Demonstrations) -> Section | None:
     blocks.append(footnote(f"{EXPLAINED} {tolerances(demos.frequency)}"))
     if told := recogniser(fit.metrics.training):
         blocks.append(Text(f"{capital(told)}."))
+    if each := contributions(fit.metrics.training):
+        rows = [[name, number(accuracy), number(edit)] for name, (accuracy, edit) in each.items()]
+        blocks += [Text("Left-out labelled demonstrations", "heading"), Table(["", "Accuracy", "Edit score"], rows)]
     for level, label, own in zip(names, truth, record.confusion, strict=True):
         names_of_labels = [label_name(label, value, known.get(label, ()), level) for value in own.labels]
         title = f"Where each label’s steps lie: level “{level}”, label “{label}”"
