@@ -91,11 +91,13 @@ class Inferred:
 
     :param names: of the demonstrations.
     :param batch: the demonstrations, encoded for the networks.
+    :param given: tables in place of the model's, such as with labels; None for the model's.
     """
 
     names: tuple[str, ...]
     batch: Batch
     hierarchy: Hierarchy
+    given: Tables | None = None
 
     @property
     def lengths(self) -> tuple[int, ...]:
@@ -111,6 +113,8 @@ class Inferred:
     @cached_property
     def tables(self) -> Tables:
         """The log-probabilities that exact inference works on, with the evidence of a recogniser."""
+        if self.given is not None:
+            return self.given
         with torch.no_grad():
             return self.hierarchy.recognised(self.outputs.tables(self.batch.actions), self.batch)
 

@@ -1,0 +1,1 @@
+"""Labels by hand: a model proposes segments, a person corrects them, and the posterior follows at once."""

@@ -1,0 +1,128 @@
+"""The file of edits: each is on disk before it is acknowledged, and the file gives the document back."""
+
+from __future__ import annotations
+
+import fcntl
+import getpass
+import hashlib
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ddco_pyro.errors import BadInput
+from ddco_pyro.labelling.document import Change, Document
+
+SUFFIX = ".journal"
+"""Of the file of edits, beside the file of labels."""
+
+UNDO, REDO = "undo", "redo"
+
+
+def version(path: Path) -> list[int]:
+    """Size and time of change of a file."""
+    stat = path.stat()
+    return [stat.st_size, stat.st_mtime_ns]
+
+
+def digest(lengths: dict[str, int], level: str) -> str:
+    """What the labels of a document are for: demonstrations by name, their steps, and the level."""
+    return hashlib.sha256(json.dumps([level, *lengths.items()]).encode()).hexdigest()
+
+
+class Journal:
+    """A file of edits that one process has open.
+
+    :param path: of the file; it is made where it is missing.
+    :param document: gets the edits of the file. Its lengths and ``level`` must be those of the file.
+    :param names: of the options where the file is new.
+    :raises BadInput: another process has the file, or it is of other demonstrations.
+    """
+
+    def __init__(self, path: Path, document: Document, level: str) -> None:
+        self.path, self.document = path, document
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self.file = open(path, "a+b")  # noqa: SIM115  (open as long as this object)
+        try:
+            fcntl.flock(self.file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            self.file.close()
+            raise BadInput(f"{path}: is open in {self._holder()}; end it, or give another --out") from None
+        self.file.seek(0)
+        lines = self.file.read().split(b"\n")
+        whole = sum(len(line) + 1 for line in lines[:-1])
+        self.file.truncate(whole)  # a torn last line was never acknowledged
+        header = {"labels": digest(dict(document.lengths), level), "names": list(document.names)}
+        if whole:
+            known = json.loads(lines[0])
+            if known.get("labels") != header["labels"]:
+                self.close()
+                raise BadInput(f"{path}: has edits of other demonstrations or of another level; give another --out")
+            document.names = tuple(known["names"])
+            for line in lines[1:-1]:
+                self._apply(json.loads(line))
+        else:
+            self._append(header)
+        self._held_by(f"a process of {getpass.getuser()}, {os.getpid()}")
+
+    def edit(self, changes: Sequence[Change]) -> None:
+        """Make an edit of the document, once it is on disk."""
+        self._write([list(change) for change in changes])
+
+    def undo(self) -> None:
+        """Take the last edit back.
+
+        :raises BadInput: there is none.
+        """
+        if not self.document.done:
+            raise BadInput("nothing to undo")
+        self._write(UNDO)
+
+    def redo(self) -> None:
+        """Make the edit again that was taken back last.
+
+        :raises BadInput: there is none.
+        """
+        if not self.document.undone:
+            raise BadInput("nothing to redo")
+        self._write(REDO)
+
+    def at(self, address: str) -> None:
+        """Say where the document can be edited, for processes that are refused."""
+        self._held_by(f"a process of {getpass.getuser()}, {os.getpid()}, at {address}")
+
+    def close(self) -> None:
+        """Leave the file to other processes."""
+        self.file.close()
+        self._lock.unlink(missing_ok=True)
+
+    def _write(self, entry: Any) -> None:
+        self._append(entry)
+        self._apply(entry)
+
+    def _append(self, entry: Any) -> None:
+        self.file.write(json.dumps(entry, separators=(",", ":")).encode() + b"\n")
+        self.file.flush()
+        os.fsync(self.file.fileno())
+
+    def _apply(self, entry: Any) -> None:
+        if entry == UNDO:
+            self.document.undo()
+        elif entry == REDO:
+            self.document.redo()
+        else:
+            self.document.edit([tuple(change) for change in entry])
+
+    @property
+    def _lock(self) -> Path:
+        return self.path.with_name(self.path.name + ".lock")
+
+    def _held_by(self, text: str) -> None:
+        self._lock.write_text(text)
+
+    def _holder(self) -> str:
+        try:
+            return self._lock.read_text()
+        except OSError:
+            return "another process"

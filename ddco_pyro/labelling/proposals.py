@@ -1,0 +1,194 @@
+"""What a model makes of all demonstrations, given what a person has said of some steps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.optimize import linear_sum_assignment
+from torch import Tensor
+
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.evaluation.inferred import Inferred, runs
+from ddco_pyro.fitting.fitted import Fit
+from ddco_pyro.model.recogniser import Windows
+from ddco_pyro.spec import Spec, with_overrides
+from ddco_pyro.training.recognition import SHARES, learn
+
+SAID = "said"
+"""The labels of the demonstrations of a refit."""
+
+RIDGE = 50.0
+"""Of the recogniser of the steps that a person has named."""
+
+EPOCHS = 40
+"""EM steps of a refit, of all stages together; it begins from the labels and what a recogniser says of other steps."""
+
+
+def weight(power: float) -> float:
+    """γ of the recogniser's evidence beside controls that count β times: 3 β, at most 1.
+
+    Cross-validation on surgeons' demonstrations chooses about this ratio at every β.
+    """
+    return min(1.0, 3 * power)
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What is shown of a demonstration.
+
+    :param options: of each step, 1 to k, [T]; 0 where the caller emits the control.
+    :param probability: posterior probability of that option, [T]; 1 of a step that a person has named.
+    """
+
+    options: np.ndarray
+    probability: np.ndarray
+
+
+class Proposals:
+    """The exact posterior of a level, with the named steps clamped and a recogniser's evidence of the others.
+
+    :param level: 1 is the lowest.
+    :param count: the options that a person can name.
+    :ivar options: of the person, for each option 0 to k of the model.
+    """
+
+    def __init__(self, fit: Fit, demos: Demonstrations, level: int, count: int) -> None:
+        self.fit, self.level = fit, level
+        levels = fit.spec.hierarchy.levels if fit.spec.hierarchy else ()
+        self.lasts, self.size = [own.lasts for own in levels], levels[level - 1].count
+        self.pieces = list(fit.infer(demos))
+        self.options = np.arange(max(count, self.size) + 1)[: self.size + 1]
+        self.place = {name: (piece, row) for piece, own in enumerate(self.pieces) for row, name in enumerate(own.names)}
+        with torch.no_grad():
+            self.alone = [piece.outputs.tables(piece.batch.actions) for piece in self.pieces]
+        model = fit.hierarchy
+        self.windows = Windows(self.size, model.input_shape, len(model.scaling.varying), past=False)
+        lengths = [stop - start for name in demos.names for _, start, stop in self.runs(name)]
+        typical = float(np.median(lengths))
+        self.windows.widths.copy_(torch.tensor([max(1, round(share * typical)) for share in SHARES]))
+        self.features = [
+            self.windows.features(piece.batch.inputs, piece.batch.actions, piece.batch.lengths) for piece in self.pieces
+        ]
+        every = torch.cat([self.features[piece][row, : len(demos[n])] for n, (piece, row) in self._places(demos)])
+        self.middle, self.spread = every.mean(0), every.std(0).clamp(min=1e-9)
+
+    def _places(self, demos: Demonstrations) -> list[tuple[int, tuple[int, int]]]:
+        return [(n, self.place[name]) for n, name in enumerate(demos.names)]
+
+    def update(self, labels: Mapping[str, np.ndarray]) -> None:
+        """Learn the recogniser of the named steps, clamp these, and infer everything else again.
+
+        :param labels: an option of the person for each step, [T]; below 1 where the model proposes. An option that the
+            model does not have yet clamps nothing.
+        """
+        known = [self._known(piece, labels) for piece in self.pieces]
+        named = torch.cat([rows[own > 0] for rows, own in zip(self.features, known, strict=True)])
+        options = torch.cat([own[own > 0] for own in known])
+        evident = len(options.unique()) > 1
+        if evident:
+            learn(self.windows, named, options, RIDGE)
+        gamma, again = weight(float(self.fit.hierarchy.power)), []
+        for piece, tables, rows, own in zip(self.pieces, self.alone, self.features, known, strict=True):
+            own = own[:, : tables.steps]
+            if evident:
+                ratio = gamma * self.windows.log_ratio(rows[:, : tables.steps])
+                tables = tables.with_evidence(self.level, torch.where((own > 0).unsqueeze(-1), 0.0, ratio))
+            again.append(Inferred(piece.names, piece.batch, piece.hierarchy, tables.clamp(self.level, own)))
+        self.pieces = again
+
+    def _known(self, piece: Inferred, labels: Mapping[str, np.ndarray]) -> Tensor:
+        """The model's options of named steps, [N, T]; -1 of others."""
+        models = np.full(int(max(self.options.max(), max(own.max() for own in labels.values()))) + 1, -1)
+        models[self.options] = np.arange(self.size + 1)
+        models[0] = -1
+        known = torch.full(piece.batch.actions.shape[:2], -1)
+        for row, name in enumerate(piece.names):
+            own = labels[name]
+            known[row, : len(own)] = torch.as_tensor(np.where(own > 0, models[np.maximum(own, 0)], -1))
+        return known
+
+    def shown(self, name: str, labels: np.ndarray | None = None) -> Shown:
+        """The most likely options of a demonstration where its labels say nothing."""
+        piece, row = self.place[name]
+        own, steps = self.pieces[piece], self.pieces[piece].lengths[row]
+        path = own.path.choices[self.level - 1][row, :steps].numpy()
+        probability = own.posterior.u[self.level - 1][row, :steps].numpy()[np.arange(steps), path]
+        options = self.options[path]
+        if labels is not None:
+            options = np.where(labels > 0, labels, options)
+            probability = np.where(labels > 0, 1.0, probability)
+        return Shown(options, np.minimum(probability, 1.0))
+
+    def runs(self, name: str) -> list[tuple[int, int, int]]:
+        """The segments of the most likely path: (option of the model, first step, step after the last)."""
+        piece, row = self.place[name]
+        options, starts = self.pieces[piece].segmented(row, self.lasts)[self.level - 1]
+        return (
+            runs(options, np.diff(options, prepend=-1) != 0)
+            if not self.lasts[self.level - 1]
+            else runs(options, starts)
+        )
+
+    def intervals(self, name: str) -> dict[int, tuple[int, int]]:
+        """The 90 % interval of each boundary of the most likely path, by its step."""
+        piece, row = self.place[name]
+        ends = self.pieces[piece].intervals(row, self.lasts)[self.level - 1].tolist()
+        return {start: (low, high) for (_, start, _), (low, high) in zip(self.runs(name), ends, strict=True)}
+
+    def upper(self, name: str) -> list[tuple[int, list[tuple[int, int, int]]]]:
+        """The segments of the other levels, with their numbers, 1 for the lowest."""
+        piece, row = self.place[name]
+        every = self.pieces[piece].segmented(row, self.lasts)
+        return [(n, runs(*own)) for n, own in enumerate(every, start=1) if n != self.level]
+
+    def centre(self, name: str, start: int, stop: int) -> np.ndarray:
+        """The mean standardised features of steps of a demonstration."""
+        piece, row = self.place[name]
+        rows = self.features[piece][row, start:stop]
+        centre: np.ndarray = ((rows - self.middle) / self.spread).mean(0).numpy()
+        return centre
+
+
+def as_before(new: Sequence[np.ndarray], old: Sequence[np.ndarray], given: Mapping[int, int], size: int) -> np.ndarray:
+    """The person's options of a new model's options 0 to k: those that its labels say, others by most common steps.
+
+    :param given: the person's options of the new model's options that have labels.
+    """
+    taken = [0, *(given.get(option, 0) for option in range(1, size + 1))]
+    free = [option for option in range(1, size + 1) if option not in given]
+    left = [option for option in range(1, size + 1) if option not in given.values()]
+    theirs, ours = np.concatenate(new), np.concatenate(old)
+    common = np.array([[np.sum((theirs == one) & (ours == other)) for other in left] for one in free])
+    if free:
+        for one, other in zip(*linear_sum_assignment(-common), strict=True):
+            taken[free[one]] = left[other]
+    return np.array(taken)
+
+
+def refit_spec(fit: Fit, level: str, count: int) -> Spec:
+    """The spec of a quick fit with the labels :data:`SAID`: the model alone, and a recogniser of the named steps."""
+    assert fit.spec.hierarchy is not None
+    place = [own.name for own in fit.spec.hierarchy.levels].index(level)
+    recogniser = {"weight": weight(float(fit.hierarchy.power)), "ridge": RIDGE}
+    changes: dict[str, Any] = {
+        "compare_with": [],
+        "demonstrations.labels": None,
+        "demonstrations.leave_one_out": False,
+        "demonstrations.valid_fraction": 0.0,
+        "demonstrations.exclude": [],
+        "training.restarts": 1,
+        "training.epochs": EPOCHS,
+        "training.labels": {"level": level, "from": SAID, "recogniser": recogniser},
+        f"hierarchy.levels.{place}.count": count,
+    }
+    return with_overrides(fit.spec, changes)
+
+
+def labelled(demos: Demonstrations, labels: Mapping[str, np.ndarray]) -> Demonstrations:
+    """The demonstrations with a person's labels alone, all to train with."""
+    each = tuple(replace(demo, labels={SAID: labels[demo.name]}) for demo in demos)
+    return replace(demos, demonstrations=each, masks={})
