@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ FREE, OPEN = -1, -2
 
 Change = tuple[Any, ...]
 """("paint", demonstration, start, stop, option), ("cut", demonstration, step, whether), ("accept", demonstration,
-whether) or ("names", names of the options 1 to k)."""
+whether, steps of it that were expected wrong, steps of it that were) or ("names", names of the options 1 to k)."""
 
 
 @dataclass
@@ -27,7 +28,8 @@ class Document:
     :param names: of the options 1 to k.
     :ivar labels: of each demonstration [T]: an option 1 to k, :data:`FREE` or :data:`OPEN`.
     :ivar cuts: steps at which a segment begins although the option stays.
-    :ivar accepted: demonstrations that a person is done with.
+    :ivar accepted: demonstrations that a person is done with: of each the steps whose first proposal was expected to be
+        wrong, and the steps in which it was.
     :ivar undone: edits that can be done again, the next one last.
     """
 
@@ -35,7 +37,7 @@ class Document:
     names: tuple[str, ...]
     labels: dict[str, np.ndarray] = field(init=False)
     cuts: dict[str, set[int]] = field(init=False)
-    accepted: set[str] = field(init=False, default_factory=set)
+    accepted: dict[str, tuple[float, int]] = field(init=False, default_factory=dict)
     done: list[tuple[Change, ...]] = field(init=False, default_factory=list)
     undone: list[tuple[Change, ...]] = field(init=False, default_factory=list)
 
@@ -78,8 +80,7 @@ class Document:
             start, stop, option = of[1:]
             labels = self.labels[name]
             edges = [start, *(np.flatnonzero(np.diff(labels[start:stop])) + start + 1).tolist(), stop]
-            runs = zip(edges, edges[1:], strict=False)
-            backs: list[Change] = [("paint", name, one, next_, int(labels[one])) for one, next_ in runs]
+            backs: list[Change] = [("paint", name, one, after, int(labels[one])) for one, after in pairwise(edges)]
             labels[start:stop] = option
             return backs
         if kind == "cut":
@@ -87,6 +88,7 @@ class Document:
             before = step in self.cuts[name]
             (self.cuts[name].add if whether else self.cuts[name].discard)(step)
             return [("cut", name, step, before)]
-        before = name in self.accepted
-        (self.accepted.add if of[1] else self.accepted.discard)(name)
-        return [("accept", name, before)]
+        known = self.accepted.pop(name, None)
+        if of[1]:
+            self.accepted[name] = (of[2], of[3])
+        return [("accept", name, known is not None, *(known or (0.0, 0)))]

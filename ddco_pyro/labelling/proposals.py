@@ -67,8 +67,9 @@ class Proposals:
             self.alone = [piece.outputs.tables(piece.batch.actions) for piece in self.pieces]
         model = fit.hierarchy
         self.windows = Windows(self.size, model.input_shape, len(model.scaling.varying), past=False)
-        lengths = [stop - start for name in demos.names for _, start, stop in self.runs(name)]
-        typical = float(np.median(lengths))
+        every_run = [run for name in demos.names for run in self.runs(name)]
+        self.occurring = {option for option, _, _ in every_run} - {0}
+        typical = float(np.median([stop - start for _, start, stop in every_run]))
         self.windows.widths.copy_(torch.tensor([max(1, round(share * typical)) for share in SHARES]))
         self.features = [
             self.windows.features(piece.batch.inputs, piece.batch.actions, piece.batch.lengths) for piece in self.pieces
@@ -82,13 +83,15 @@ class Proposals:
     def update(self, labels: Mapping[str, np.ndarray]) -> None:
         """Learn the recogniser of the named steps, clamp these, and infer everything else again.
 
+        The recogniser waits until every option that occurs has named steps, or it would speak against the others.
+
         :param labels: an option of the person for each step, [T]; below 1 where the model proposes. An option that the
             model does not have yet clamps nothing.
         """
         known = [self._known(piece, labels) for piece in self.pieces]
         named = torch.cat([rows[own > 0] for rows, own in zip(self.features, known, strict=True)])
         options = torch.cat([own[own > 0] for own in known])
-        evident = len(options.unique()) > 1
+        evident = self.occurring <= {*options.tolist()} and len(self.occurring) > 1
         if evident:
             learn(self.windows, named, options, RIDGE)
         gamma, again = weight(float(self.fit.hierarchy.power)), []

@@ -1,0 +1,678 @@
+"""A person's labels with a model: what is shown, what a command changes, and the fits in the background."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from sklearn.metrics import normalized_mutual_info_score
+
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.pictures import Observed
+from ddco_pyro.data.sources import open_source
+from ddco_pyro.data.sources.recording import label_names
+from ddco_pyro.drawing.colours import option_colour
+from ddco_pyro.drawing.shown import frames, jpeg, paths_of, stored_pictures
+from ddco_pyro.drawing.timeline import following, text
+from ddco_pyro.errors import BadInput, Failed
+from ddco_pyro.evaluation.inferred import runs
+from ddco_pyro.fitting.fit import fit as fit_to
+from ddco_pyro.fitting.fitted import Fit
+from ddco_pyro.jobs import Workers, run_all
+from ddco_pyro.labelling.document import FREE, OPEN, Change, Document
+from ddco_pyro.labelling.journal import SUFFIX, Journal, version
+from ddco_pyro.labelling.proposals import Proposals, Shown, as_before, labelled, refit_spec
+from ddco_pyro.names import choice_names
+from ddco_pyro.segmenting import LevelLabels, Segmented, Segments, segments
+from ddco_pyro.segmenting.formats.labels import check_copy, check_labels, write_labels
+from ddco_pyro.selection.small import GRANULARITIES, cut
+from ddco_pyro.spec import with_overrides
+
+ASKED = 3
+"""Demonstrations of the first question."""
+
+SEEDS = (1, 2)
+"""Further training seeds of the first question."""
+
+ALIKE = 0.9
+"""The NMI of segments from which on two ways to cut are the same."""
+
+NEAREST = 5
+"""Segments elsewhere that are shown for one."""
+
+PICTURE_HEIGHT = 240
+
+UNCERTAIN = 20
+"""Boundaries that are named as the most uncertain ones."""
+
+Exporter = Callable[[Segmented, Fit, Path, str], Path]
+"""Writes segments in a format: gets them, the model, a folder and the level; gives the file or folder."""
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A segment that is shown: an option 0 to k from one step to before another, and who says so."""
+
+    start: int
+    stop: int
+    option: int
+    said: str
+
+
+class Session:
+    """Labels of one level of a run's options, which people correct.
+
+    Every method may be called from any thread. Steps are counted from 0, and ``stop`` is the step after the last.
+
+    :param fit: has options.
+    :param path: an HDF5 file of demonstrations.
+    :param out: the file of labels; the same as ``path`` to write into it.
+    :param level: the lowest one by default.
+    :param exporters: what writes each format, by its name.
+    :raises BadInput: the run has no options or no such level, ``out`` is something else, or another process labels it.
+    """
+
+    def __init__(
+        self,
+        fit: Fit,
+        path: Path,
+        out: Path,
+        level: str | None = None,
+        exporters: Mapping[str, Exporter] | None = None,
+    ) -> None:
+        fit.refuse_flat()
+        self.exporters = exporters or {}
+        self.run, self.fit, self.path, self.out = fit, fit, path, out
+        self.level = level or next(iter(fit.names))
+        if self.level not in fit.names:
+            raise BadInput(f"--level: there is no level {self.level!r} (there is: {', '.join(fit.names)})")
+        if not (out.exists() and out.samefile(path)):
+            check_copy(path, out)
+        self.demos = Demonstrations.read(path)
+        check_labels(path, [self.level], self.demos.names)
+        self.version, self.frequency = version(path), self.demos.frequency
+        self.document = Document({demo.name: len(demo) for demo in self.demos}, fit.names[self.level][1:])
+        self.journal = Journal(out.with_name(out.name + SUFFIX), self.document, self.level)
+        self.lock, self.revision, self.edits, self.saved, self.changed = threading.RLock(), 0, 0, 0, set[int]()
+        self.granularity, self.ways, self.message, self.error = "medium", dict[str, Fit](), "", ""
+        self.refits, self.running, self.again = 0, False, False
+        self.first: dict[str, Shown] = {}
+        self.take(fit)
+
+    # --- the model ----------------------------------------------------------------------------------------------------
+
+    @property
+    def number(self) -> int:
+        """The level's number, 1 for the lowest."""
+        return [*self.fit.names].index(self.level) + 1
+
+    def take(self, fit: Fit, given: Mapping[int, int] | None = None) -> None:
+        """Show another model's proposals.
+
+        :param given: the person's options of those options of the model that labels have; None for the same numbers.
+        """
+        proposals = Proposals(fit, self.demos, [*fit.names].index(self.level) + 1, len(self.document.names))
+        proposals.update(self.document.labels)
+        with self.lock:
+            if given is not None:
+                names = self.demos.names
+                new = [proposals.shown(name).options for name in names]
+                old = [self.shown[name].options for name in names]
+                proposals.options = as_before(new, old, given, proposals.size)
+            self.fit, self.proposals = fit, proposals
+            self._update(self._shown_now() if hasattr(self, "shown") else {})
+
+    def _shown_now(self) -> dict[str, np.ndarray]:
+        return {name: shown.options for name, shown in self.shown.items()}
+
+    def _update(self, before: Mapping[str, np.ndarray], edited: str | None = None) -> None:
+        """Infer again what is shown, and mark demonstrations in which it differs from what was shown before."""
+        self.proposals.update(self.document.labels)
+        labels = self.document.labels
+        self.shown: dict[str, Shown] = {name: self.proposals.shown(name, labels[name]) for name in self.demos.names}
+        self.first |= {name: self.shown[name] for name, own in labels.items() if (own == FREE).all()}
+        self.changed = {
+            place
+            for place, name in enumerate(self.demos.names)
+            if name in before and name != edited and not np.array_equal(before[name], self.shown[name].options)
+        }
+        expected, wrong = np.sum([(0.0, 0.0), *self.document.accepted.values()], axis=0)
+        self.calibration = (wrong + 1) / (expected + 1)
+        self.wrong = {
+            name: float(np.minimum(self.calibration * (1 - shown.probability), 1).sum())
+            for name, shown in self.shown.items()
+        }
+        self.revision += 1
+
+    # --- what is shown ------------------------------------------------------------------------------------------------
+
+    def state(self) -> dict[str, Any]:
+        """Everything but the demonstrations themselves."""
+        with self.lock:
+            document, names = self.document, self.demos.names
+            order, reasons = self._order()
+            demos = [
+                {
+                    "name": name,
+                    "steps": document.lengths[name],
+                    "accepted": name in document.accepted,
+                    "labelled": int(document.said(name).sum()),
+                    "expected_wrong": round(self.wrong[name], 2),
+                    "changed": place in self.changed,
+                    "held_out": name in self.run.held_out,
+                    "reason": reasons[name],
+                    "strip": [[own.start, own.option, own.said] for own in self.segments(name)],
+                }
+                for place, name in enumerate(names)
+            ]
+            return {
+                "title": self.path.name,
+                "formats": [*self.exporters],
+                "uncertain": self._uncertain(),
+                "revision": self.revision,
+                "level": self.level,
+                "levels": [*self.fit.names],
+                "names": list(document.names),
+                "colours": [option_colour(option + 1) for option in range(len(document.names))],
+                "frequency": self.frequency,
+                "demos": demos,
+                "order": order,
+                "summary": self.summary(),
+                "can_undo": bool(document.done),
+                "can_redo": bool(document.undone),
+                "refit": {
+                    "running": self.running,
+                    "progress": None,
+                    "message": self.message,
+                    "done": self.refits,
+                    "error": self.error,
+                },
+                "question": self._question(),
+                "granularity": self.granularity,
+                "warnings": self.warnings(),
+                "out": str(self.out),
+                "dirty": self.edits != self.saved,
+            }
+
+    def _uncertain(self) -> list[dict[str, int]]:
+        """The boundaries at which the shown option is least likely, the least likely first."""
+        found = [
+            (float(self.shown[name].probability[max(own.start - 1, 0) : own.start + 1].min()), place, own.start)
+            for place, name in enumerate(self.demos.names)
+            for own in self.segments(name)[1:]
+            if self.document.labels[name][own.start - 1 : own.start + 1].min() == FREE
+        ]
+        return [{"demo": place, "step": step} for _, place, step in sorted(found)[:UNCERTAIN]]
+
+    def summary(self) -> dict[str, Any]:
+        """The expected share of wrong steps, how much of it one more demonstration saves, and labelled ones.
+
+        What posteriors expect is multiplied by the ratio of wrong to expected steps of accepted demonstrations.
+        """
+        steps = sum(self.document.lengths.values())
+        left = [self.wrong[name] for name in self.demos.names if name not in self.document.accepted]
+        return {
+            "expected_wrong": sum(self.wrong.values()) / steps,
+            "one_more": max(left, default=0.0) / steps,
+            "labelled": len(self.document.accepted),
+        }
+
+    def warnings(self) -> list[str]:
+        """What a person should know: the file of demonstrations that changed underneath."""
+        return [] if self._unchanged() else [f"{self.path} changed while it was labelled; start again to go on with it"]
+
+    def _unchanged(self) -> bool:
+        return self.path.exists() and version(self.path) == self.version
+
+    def _order(self) -> tuple[list[int], dict[str, str]]:
+        """Demonstrations that are not accepted, the most informative first, and why; then the others."""
+        document, names = self.document, self.demos.names
+        centres = {name: self.proposals.centre(name, 0, document.lengths[name]) for name in names}
+        known = [centres[name] for name in names if name in document.accepted]
+        away = {
+            name: min((float(np.linalg.norm(own - one)) for one in known), default=1.0) for name, own in centres.items()
+        }
+        typical = float(np.median([*away.values()])) or 1.0
+        value = {name: self.wrong[name] * (1 + away[name] / typical) for name in names}
+        farthest = max(names, key=lambda name: away[name])
+        reasons = {}
+        for name in names:
+            said = f"{self.wrong[name]:.0f} of {document.lengths[name]} steps expected wrong"
+            reasons[name] = f"{said}; the least like those you labelled" if known and name == farthest else said
+        ranks = sorted(range(len(names)), key=lambda n: (names[n] in document.accepted, -value[names[n]]))
+        return ranks, reasons
+
+    def segments(self, name: str) -> list[Segment]:
+        """The segments of a demonstration that are shown."""
+        options, labels = self.shown[name].options, self.document.labels[name]
+        starts = (np.diff(options, prepend=-1) != 0) | (np.diff((labels == OPEN).astype(int), prepend=0) != 0)
+        starts[[*self.document.cuts[name], 0]] = True
+        found = []
+        for option, start, stop in runs(options, starts):
+            own = labels[start:stop]
+            said = "open" if (own == OPEN).all() else "said" if (own > 0).all() else "proposed"
+            found.append(Segment(start, stop, int(option), said))
+        return found
+
+    def demo(self, index: int) -> dict[str, Any]:
+        """One demonstration with its segments, boundaries, and what follows the cursor."""
+        with self.lock:
+            name = self._name(index)
+            shown, ends, own = self.shown[name], self.proposals.intervals(name), self.segments(name)
+            boundaries = [
+                {
+                    "step": segment.start,
+                    "low": ends.get(segment.start, (segment.start,) * 2)[0],
+                    "high": ends.get(segment.start, (segment.start,) * 2)[1],
+                    "probability": round(float(shown.probability[segment.start]), 4),
+                    "said": bool(self.document.labels[name][segment.start - 1 : segment.start + 1].min() > 0),
+                }
+                for segment in own[1:]
+            ]
+            levels = [*self.fit.names]
+            upper = [
+                {
+                    "level": levels[number - 1],
+                    "names": list(self.fit.names[levels[number - 1]][1:]),
+                    "colours": [option_colour(n) for n in range(1, len(self.fit.names[levels[number - 1]]))],
+                    "segments": [{"start": start, "stop": stop, "option": option} for option, start, stop in every],
+                }
+                for number, every in self.proposals.upper(name)
+            ]
+            self.changed.discard(index)
+            return {
+                "index": index,
+                "name": name,
+                "steps": len(shown.options),
+                "revision": self.revision,
+                "segments": [vars(segment) for segment in own],
+                "boundaries": boundaries,
+                "probability": text(np.rint(255 * shown.probability)),
+                "upper": upper,
+                "pictures": len(self._pictures[index]) if self._pictures else 0,
+                **self._followed(index),
+            }
+
+    def _followed(self, index: int) -> dict[str, Any]:
+        """Numbers and paths in space that follow the cursor."""
+        demo = self.demos[index]
+        if not hasattr(self, "_paths"):
+            self._paths = paths_of(self.run.spec.report.trajectory, self.demos)
+        (found,) = following([demo], [], len(demo), self._paths)
+        return {"numbers": found.get("n"), "paths": found.get("paths"), "view": found.get("view")}
+
+    @property
+    def _pictures(self) -> list[Observed]:
+        if not hasattr(self, "_stored"):
+            self._source = open_source(self.path)
+            self._stored = stored_pictures(self._source.__enter__(), self.document.lengths)
+        return self._stored
+
+    def picture(self, index: int, step: int) -> bytes:
+        """The picture of a step as JPEG.
+
+        :raises BadInput: there is none.
+        """
+        with self.lock:
+            name = self._name(index)
+            if not self._pictures or not 0 <= step < self.document.lengths[name]:
+                raise BadInput(f"{name}: has no picture of step {step}")
+            return jpeg(frames(self._pictures[index], [step], PICTURE_HEIGHT)[0])
+
+    def nearest(self, index: int, step: int) -> list[dict[str, Any]]:
+        """The segments of other demonstrations that are most like the one at a step."""
+        with self.lock:
+            name = self._name(index)
+            here = self._at(name, step)
+            centre, found = self.proposals.centre(name, here.start, here.stop), []
+            for place, other in enumerate(self.demos.names):
+                if other != name:
+                    for own in self.segments(other):
+                        away = float(np.linalg.norm(self.proposals.centre(other, own.start, own.stop) - centre))
+                        found.append((away, place, own))
+            found.sort(key=lambda one: one[0])
+            return [
+                {"index": place, "start": own.start, "stop": own.stop, "option": own.option}
+                for _, place, own in found[:NEAREST]
+            ]
+
+    # --- what a person says -------------------------------------------------------------------------------------------
+
+    def edit(self, command: Mapping[str, Any]) -> dict[str, Any]:
+        """Do what a person asks, on disk before this returns.
+
+        :raises BadInput: the command is none, or cannot be done here.
+        """
+        with self.lock:
+            before, do = self._shown_now(), command.get("do")
+            index = _whole(command, "demo") if "demo" in command else None
+            name = None if index is None else self._name(index)
+            if do in ("undo", "redo"):
+                getattr(self.journal, do)()
+                last = (self.document.undone if do == "undo" else self.document.done)[-1]
+                touched = next((change[1] for change in last if change[0] != "names"), None)
+                index = None if touched is None else self.demos.names.index(touched)
+            else:
+                self.journal.edit(self._changes(str(do), name, command))
+            self.edits += 1
+            self._update(before, None if index is None else self.demos.names[index])
+            self._name_options()
+            if do == "accept":
+                self.refit()
+            return {
+                "revision": self.revision,
+                "demo": index,
+                "changed": sorted(self.changed),
+                "summary": self.summary(),
+                "can_undo": bool(self.document.done),
+                "can_redo": bool(self.document.undone),
+            }
+
+    def _changes(self, do: str, name: str | None, command: Mapping[str, Any]) -> list[Change]:
+        """The changes of the document that a command stands for."""
+        names = self.document.names
+        if do == "new":
+            return [("names", [*names, self._text(command)])]
+        if do == "rename":
+            option = self._option(command, 1)
+            return [("names", [*names[: option - 1], self._text(command), *names[option:]])]
+        if name is None:
+            raise BadInput(f"{do}: names no demonstration, or is no command")
+        if do == "accept":
+            if name in self.document.accepted:
+                return [("accept", name, False, 0.0, 0)]
+            labels = self.document.labels[name]
+            painted = [
+                ("paint", name, start, stop, int(option))
+                for option, start, stop in runs(
+                    self.shown[name].options, np.diff(self.shown[name].options, prepend=-1) != 0
+                )
+                if option > 0
+            ]
+            opened = [
+                ("paint", name, start, stop, OPEN)
+                for value, start, stop in runs(labels, np.diff(labels, prepend=-9) != 0)
+                if value == OPEN
+            ]
+            return [*painted, *opened, ("accept", name, True, *self._first_wrong(name))]
+        if do == "paint":
+            start, stop = (_whole(command, key) for key in ("start", "stop"))
+            if not 0 <= start < stop <= self.document.lengths[name]:
+                raise BadInput(
+                    f"paint: steps {start} to {stop} are not in {name}, which has {self.document.lengths[name]}"
+                )
+            return [("paint", name, start, stop, self._option(command, 0) or OPEN)]
+        if do == "move":
+            return self._move(name, _whole(command, "boundary"), _whole(command, "to"))
+        step = _whole(command, "step")
+        here = self._at(name, step)
+        if do == "name":
+            return [("paint", name, here.start, here.stop, self._option(command, 1))]
+        if do == "open":
+            return [("paint", name, here.start, here.stop, OPEN)]
+        if do == "free":
+            return [("paint", name, here.start, here.stop, FREE)]
+        if do == "everywhere":
+            option = self._option(command, 1)
+            return [
+                ("paint", other, own.start, own.stop, option)
+                for other in self.demos.names
+                if other == name or other not in self.document.accepted
+                for own in self.segments(other)
+                if own.option == here.option and own.said != "open"
+            ]
+        if do == "split":
+            if step == here.start:
+                raise BadInput(f"split: a segment of {name} begins at step {step} already")
+            return [("cut", name, step, True)]
+        if do == "merge":
+            if here.stop == self.document.lengths[name]:
+                raise BadInput(f"merge: the segment at step {step} is the last of {name}; it has none to merge with")
+            after = self._at(name, here.stop)
+            if not here.option:
+                raise BadInput(f"merge: the segment at step {step} of {name} has no option; name it first")
+            return [("cut", name, here.stop, False), ("paint", name, here.start, after.stop, here.option)]
+        raise BadInput(f"{do}: is no command")
+
+    def _first_wrong(self, name: str) -> tuple[float, int]:
+        """The steps of a demonstration whose proposal, before anything was said of it, was expected to be wrong; and
+        the steps in which it is not what is shown now.
+        """
+        first = self.first.get(name, self.shown[name])
+        return float((1 - first.probability).sum()), int((first.options != self.shown[name].options).sum())
+
+    def _move(self, name: str, boundary: int, to: int) -> list[Change]:
+        """A boundary elsewhere: the steps between, and one on either side, are said."""
+        own = self.segments(name)
+        place = next((n for n, segment in enumerate(own) if n and segment.start == boundary), None)
+        if place is None:
+            raise BadInput(f"move: no segment of {name} begins at step {boundary}")
+        left, right = own[place - 1], own[place]
+        if not left.start < to < right.stop:
+            raise BadInput(f"move: step {to} is not within the segments at both sides of step {boundary} of {name}")
+        sides = [(segment, OPEN if segment.said == "open" else segment.option) for segment in (left, right)]
+        low, high = min(boundary, to) - 1, max(boundary, to) + 1
+        changes: list[Change] = [
+            ("paint", name, *ends, option)
+            for (_, option), ends in zip(sides, ((low, to), (to, high)), strict=True)
+            if option
+        ]
+        if boundary in self.document.cuts[name]:
+            changes += [("cut", name, boundary, False), ("cut", name, to, True)]
+        return changes
+
+    def _name(self, index: int) -> str:
+        if not 0 <= index < len(self.demos):
+            raise BadInput(f"there is no demonstration {index}; there are 0 to {len(self.demos) - 1}")
+        return self.demos.names[index]
+
+    def _at(self, name: str, step: int) -> Segment:
+        for segment in self.segments(name):
+            if segment.start <= step < segment.stop:
+                return segment
+        raise BadInput(f"{name}: has no step {step}; it has {self.document.lengths[name]}")
+
+    def _option(self, command: Mapping[str, Any], least: int) -> int:
+        option = _whole(command, "option")
+        if not least <= option <= len(self.document.names):
+            raise BadInput(f"there is no option {option}; there are {least} to {len(self.document.names)}")
+        return option
+
+    def _text(self, command: Mapping[str, Any]) -> str:
+        name = command.get("text")
+        if not isinstance(name, str) or not name.strip() or name.strip() in self.document.names:
+            raise BadInput("a name is a text that no other option has")
+        return name.strip()
+
+    def _name_options(self) -> None:
+        """Give the run the names, where it has as many options."""
+        names, run = self.document.names, self.run
+        if len(run.names[self.level]) == len(names) + 1 and run.names[self.level][1:] != names:
+            run.name_options(self.level, names)
+
+    # --- in the background --------------------------------------------------------------------------------------------
+
+    def refit(self) -> None:
+        """Fit again in another process, with the labels and a recogniser of them; what comes of it is shown then."""
+        with self.lock:
+            if not any(self.document.said(name).any() for name in self.demos.names):
+                raise BadInput("refit: nothing is labelled yet")
+            self.again = self.running
+            if not self.running:
+                self._start(self._refit, "fitting the labels")
+
+    def _start(self, work: Callable[[], None], message: str) -> None:
+        self.running, self.message, self.error = True, message, ""
+
+        def do() -> None:
+            try:
+                work()
+            except (BadInput, Failed) as error:
+                self.error = str(error)
+            finally:
+                with self.lock:
+                    self.running, self.message, again = False, "", self.again
+                    self.again = False
+                    self.revision += 1
+                    if again:
+                        self.refit()
+
+        threading.Thread(target=do, daemon=True).start()
+
+    def _refit(self) -> None:
+        with self.lock:
+            labels = {name: self.document.in_file(name) for name in self.demos.names}
+            spec = refit_spec(self.fit, self.level, len(self.document.names))
+        values = sorted({int(value) for own in labels.values() for value in np.unique(own) if value > 0})
+        keys = self.fit.spec.trained_with
+        demos = Demonstrations(
+            tuple(replace(demo, observations={key: demo.observations[key] for key in keys}) for demo in self.demos),
+            attributes=self.demos.attributes,
+        )
+        found = self._away({"refit": partial(fit_to, spec, labelled(demos, labels))})["refit"]
+        with self.lock:
+            self.refits += 1
+            self.take(found, dict(enumerate(values, start=1)))
+
+    def _away(self, calls: Mapping[str, Callable[..., Fit]]) -> dict[str, Fit]:
+        """The results of fits in another process, one after another."""
+        with run_all(calls, Workers(2), "fitted the labels", beside=len(calls)) as results:
+            return dict(results)
+
+    def ask(self) -> None:
+        """Prepare the first question, in the background: which way to cut is meant?"""
+        with self.lock:
+            if not (self.document.done or self.running):
+                self._start(self._ask, "looking for other ways to cut")
+
+    def _ask(self) -> None:
+        trained, names = self.run, self.demos.names
+        calls: dict[str, Callable[..., Fit]] = {}
+        if trained.spec.training.labels is None and self.number == 1:
+            calls = {name: partial(cut, trained, name) for name in GRANULARITIES if name != "medium"}
+        alone = {"compare_with": [], "demonstrations.leave_one_out": False}
+        for seed in SEEDS:
+            spec = with_overrides(trained.spec, alone | {"training.seed": seed})
+            calls[f"seed {seed}"] = partial(fit_to, spec, trained.demonstrations, keep=False)
+        ways, found = {"medium": trained}, {"medium": np.concatenate([self.shown[name].options for name in names])}
+        for name, each in self._away(calls).items():
+            options = np.concatenate([*each.segment(self.demos)[self.number - 1]])
+            alike = max(normalized_mutual_info_score(options, other) for other in found.values())
+            if name in GRANULARITIES or alike < ALIKE:
+                ways[name], found[name] = each, options
+        with self.lock:
+            order = [name for name in ("coarse", "medium", "fine", *calls) if name in ways]
+            self.ways = {name: ways[name] for name in dict.fromkeys(order)}
+
+    def _question(self) -> dict[str, Any] | None:
+        if len(self.ways) < 2 or self.document.done:
+            return None
+        asked = np.unique(np.linspace(0, len(self.demos) - 1, ASKED).round().astype(int)).tolist()
+        if not hasattr(self, "_answers"):
+            self._answers = [self._way(name, fit, asked) for name, fit in self.ways.items()]
+        return {"demos": asked, "proposals": self._answers}
+
+    def _way(self, name: str, fit: Fit, asked: Sequence[int]) -> dict[str, Any]:
+        own = fit.segment(self.demos)[self.number - 1]
+        lengths = [segment.steps for segment in own.segments]
+        each = [
+            [
+                {"start": start, "stop": stop, "option": int(option)}
+                for option, start, stop in runs(own[index], np.diff(own[index], prepend=-1) != 0)
+            ]
+            for index in asked
+        ]
+        names = list(fit.names[self.level][1:])
+        colours = [option_colour(option) for option in range(1, len(names) + 1)]
+        median = float(np.median(lengths))
+        return {"id": name, "name": name, "median": median, "demos": each, "names": names, "colours": colours}
+
+    def choose(self, way: str) -> None:
+        """Go on with one of the ways to cut.
+
+        :raises BadInput: there is no such way, or something is labelled already.
+        """
+        if way not in self.ways:
+            raise BadInput(f"there is no way to cut {way!r}; there is: {', '.join(self.ways) or 'none yet'}")
+        if self.document.done:
+            raise BadInput("choose: labels are given already; refit learns from them")
+        with self.lock:
+            self.granularity = way
+            self.take(self.ways[way])
+
+    # --- files --------------------------------------------------------------------------------------------------------
+
+    def segmented(self, said: bool = False) -> Segmented:
+        """All segments that are shown, as ``segment`` has them.
+
+        :param said: only those of steps that a person has named, -1 elsewhere, and no other level.
+        """
+        with self.lock, open_source(self.path) as source:
+            if said:
+                each = tuple(self._labels_of(name) for name in self.demos.names)
+                names: dict[str, Sequence[str]] = {}
+                names[self.level] = choice_names(len(self.document.names), self.document.names)
+                counts = {self.level: len(self.document.names)}
+                return Segmented(each, counts, self.frequency, {}, names, label_names(source.attributes))
+            if len(self.document.names) + 1 != len(self.fit.names[self.level]):
+                raise BadInput("an option is new; refit before you write segments")
+            model = segments(self.fit, source)
+            shown = []
+            for demo in model.segments:
+                own = self.shown[demo.name]
+                starts = np.diff(own.options, prepend=-1) != 0
+                level = LevelLabels(own.options, starts, own.probability)
+                shown.append(replace(demo, levels={**demo.levels, self.level: level}))
+            names = dict(model.names) | {self.level: choice_names(len(self.document.names), self.document.names)}
+            return replace(model, segments=tuple(shown), names=names)
+
+    def _labels_of(self, name: str) -> Segments:
+        labels = self.document.in_file(name)
+        starts = np.diff(labels, prepend=-9) != 0
+        starts[[*self.document.cuts[name]]] = True
+        return Segments(name, {self.level: LevelLabels(labels, starts, np.ones(len(labels)))}, 0.0, False)
+
+    def save(self) -> str:
+        """Write ``labels/<level>``, -1 where nothing is said, whole or not at all.
+
+        :returns: what was written, in words.
+        :raises BadInput: the demonstrations changed underneath.
+        """
+        with self.lock:
+            if not self._unchanged():
+                raise BadInput(self.warnings()[0])
+            write_labels(self.path, self.out, self.segmented(said=True))
+            if self.out.exists() and self.out.samefile(self.path):
+                self.version = version(self.path)
+            self.saved = self.edits
+            said = sum(int(self.document.said(name).sum()) for name in self.demos.names)
+            return f"{self.out}: labels/{self.level}, {said} of {sum(self.document.lengths.values())} steps"
+
+    def export(self, form: str, folder: Path) -> Path:
+        """Write the shown segments in one of ``segment``'s formats into a folder.
+
+        :returns: the file or folder that was written.
+        :raises BadInput: there is no such format, or it does not fit the demonstrations.
+        """
+        if form not in self.exporters:
+            raise BadInput(f"there is no format {form!r}; there is: {', '.join(self.exporters)}")
+        return self.exporters[form](self.segmented(), self.fit, folder, self.level)
+
+    def close(self) -> None:
+        """Save, and leave the labels to other processes."""
+        with self.lock:
+            if self.edits != self.saved and self._unchanged():
+                self.save()
+            self.journal.close()
+
+
+def _whole(command: Mapping[str, Any], key: str) -> int:
+    value = command.get(key)
+    if not isinstance(value, int) or isinstance(value, bool):
+        raise BadInput(f"{key}: give a whole number")
+    return value
