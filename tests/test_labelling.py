@@ -1,0 +1,188 @@
+"""The document of a person's labels and its journal, against the list of all its states."""
+
+import json
+import subprocess
+import sys
+from contextlib import nullcontext
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from ddco_pyro.errors import BadInput
+from ddco_pyro.labelling.document import FREE, OPEN, Document
+from ddco_pyro.labelling.journal import Journal
+
+LENGTHS, NAMES = {"demo_0": 6, "demo_1": 3}, ("reach", "grasp")
+QUICK = settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+
+
+@st.composite
+def paints(draw):
+    name = draw(st.sampled_from([*LENGTHS]))
+    start = draw(st.integers(0, LENGTHS[name] - 1))
+    return "paint", name, start, draw(st.integers(start + 1, LENGTHS[name])), draw(st.sampled_from([OPEN, FREE, 1, 2]))
+
+
+name = st.sampled_from([*LENGTHS])
+change = st.one_of(
+    paints(),
+    st.tuples(st.just("cut"), name, st.integers(1, 2), st.booleans()),
+    st.tuples(st.just("accept"), name, st.booleans()),
+    st.tuples(st.just("names"), st.sampled_from([NAMES, ("push", "grasp"), (*NAMES, "lift")])),
+)
+actions = st.lists(st.one_of(st.lists(change, min_size=1, max_size=4), st.sampled_from(["undo", "redo"])), max_size=12)
+
+
+def empty():
+    return Document(LENGTHS, NAMES)
+
+
+def said(document):
+    """What a document says, in plain data."""
+    labels = {name: own.tolist() for name, own in document.labels.items()}
+    return labels, {name: set(own) for name, own in document.cuts.items()}, set(document.accepted), document.names
+
+
+def act(labels, action):
+    """One action of a document or a journal."""
+    getattr(labels, action)() if isinstance(action, str) else labels.edit(action)
+
+
+def painted(changes, labels):
+    """Labels after the paints among some changes, step by step."""
+    after = {name: [*own] for name, own in labels.items()}
+    for kind, *of in changes:
+        if kind == "paint":
+            name, start, stop, option = of
+            for step in range(start, stop):
+                after[name][step] = option
+    return after
+
+
+@QUICK
+@given(actions)
+def test_undo_and_redo_walk_through_all_states(sequence):
+    document = empty()
+    past, future = [said(document)], []
+    for action in sequence:
+        if not {"undo": past[1:], "redo": future}.get(str(action), True):
+            continue
+        act(document, action)
+        if action == "undo":
+            future.append(past.pop())
+        elif action == "redo":
+            past.append(future.pop())
+        else:
+            assert said(document)[0] == painted(action, past[-1][0])
+            past.append(said(document))
+            future.clear()
+        assert said(document) == past[-1]
+        assert (len(document.done), len(document.undone)) == (len(past) - 1, len(future))
+    for state in past[-2::-1]:
+        document.undo()
+        assert said(document) == state
+    for state in past[1:]:
+        document.redo()
+        assert said(document) == state
+
+
+def test_what_is_in_a_file_is_named_or_minus_one():
+    document = empty()
+    document.edit([("paint", "demo_0", 1, 5, 2), ("paint", "demo_0", 2, 3, OPEN), ("cut", "demo_0", 4, True)])
+    assert document.labels["demo_0"].tolist() == [FREE, 2, OPEN, 2, 2, FREE]
+    assert document.in_file("demo_0").tolist() == [-1, 2, -1, 2, 2, -1]
+    assert document.said("demo_0").tolist() == [False, True, False, True, True, False]
+    assert document.in_file("demo_1").tolist() == [-1, -1, -1]
+    assert document.cuts == {"demo_0": {4}, "demo_1": set()}
+
+
+@QUICK
+@given(actions, st.data())
+def test_a_journal_torn_at_any_byte_gives_the_state_after_its_whole_lines(tmp_path, sequence, data):
+    path = tmp_path / "labels.journal"
+    path.unlink(missing_ok=True)
+    journal = Journal(path, empty(), "option")
+    states = {path.stat().st_size: said(journal.document)}
+    for action in sequence:
+        before, size = said(journal.document), path.stat().st_size
+        left = bool({"undo": journal.document.done, "redo": journal.document.undone}.get(str(action), True))
+        with nullcontext() if left else pytest.raises(BadInput, match=f"nothing to {action}"):
+            act(journal, action)
+        assert left or (said(journal.document), path.stat().st_size) == (before, size)
+        states[path.stat().st_size] = said(journal.document)
+    journal.close()
+    content = path.read_bytes()
+    size = data.draw(st.integers(0, len(content)))
+    path.write_bytes(content[:size])
+    again = empty()
+    journal = Journal(path, again, "option")
+    assert said(again) == next((states[at] for at in sorted(states, reverse=True) if at <= size), said(empty()))
+    journal.edit([("paint", "demo_1", 0, 3, 1)])  # what follows a torn line is kept whole
+    journal.close()
+    third = empty()
+    Journal(path, third, "option").close()
+    assert said(third) == said(again)
+
+
+def test_a_new_name_in_a_journal_outlives_the_process(tmp_path):
+    journal = Journal(tmp_path / "labels.journal", empty(), "option")
+    journal.edit([("names", (*NAMES, "lift")), ("paint", "demo_0", 0, 6, 3)])
+    journal.close()
+    again = empty()
+    Journal(tmp_path / "labels.journal", again, "option").close()
+    assert again.names == (*NAMES, "lift")
+    np.testing.assert_array_equal(again.labels["demo_0"], 3)
+
+
+@pytest.mark.parametrize(("lengths", "level"), [({**LENGTHS, "demo_1": 4}, "option"), (LENGTHS, "upper")])
+def test_edits_of_something_else_are_refused_and_kept(tmp_path, lengths, level):
+    path = tmp_path / "labels.journal"
+    journal = Journal(path, empty(), "option")
+    journal.edit([("paint", "demo_0", 0, 6, 1)])
+    journal.close()
+    content = path.read_bytes()
+    with pytest.raises(BadInput, match="edits of other demonstrations or of another level; give another --out"):
+        Journal(path, Document(lengths, NAMES), level)
+    assert path.read_bytes() == content
+    Journal(path, empty(), "option").close()  # and left to others
+
+
+WRITER = """
+import sys
+from pathlib import Path
+from ddco_pyro.labelling.document import Document
+from ddco_pyro.labelling.journal import Journal
+journal = Journal(Path(sys.argv[1]), Document({"demo_0": 6, "demo_1": 3}, ("reach", "grasp")), "option")
+journal.at("http://127.0.0.1:8000/")
+for number in range(10**6):
+    journal.edit([("paint", "demo_0", number % 6, 6, number % 2 + 1)])
+    print(number, flush=True)
+"""
+
+
+def test_kill_9_loses_at_most_the_edit_in_flight_and_a_second_process_is_refused(tmp_path):
+    path = tmp_path / "labels.journal"
+    writer = subprocess.Popen([sys.executable, "-c", WRITER, path], stdout=subprocess.PIPE, text=True)
+    assert writer.stdout is not None
+    done = [int(writer.stdout.readline()) for _ in range(40)]
+    with pytest.raises(BadInput, match=rf"is open in a process of \S+, {writer.pid}, at http://127.0.0.1:8000/; end"):
+        Journal(path, empty(), "option")
+    writer.kill()
+    done += [int(line) for line in writer.stdout.read().split("\n") if line]
+    writer.wait()
+    document, expected = empty(), empty()
+    Journal(path, document, "option").close()
+    assert len(document.done) - len(done) in (0, 1)
+    for number in range(len(document.done)):
+        expected.edit([("paint", "demo_0", number % 6, 6, number % 2 + 1)])
+    assert said(document) == said(expected)
+
+
+def test_an_edit_is_on_disk_when_the_call_returns(tmp_path):
+    path = tmp_path / "labels.journal"
+    journal = Journal(path, empty(), "option")
+    journal.edit([("accept", "demo_1", True)])
+    assert json.loads(path.read_bytes().splitlines()[-1]) == [["accept", "demo_1", True]]
+    journal.close()
