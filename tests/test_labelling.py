@@ -29,7 +29,7 @@ name = st.sampled_from([*LENGTHS])
 change = st.one_of(
     paints(),
     st.tuples(st.just("cut"), name, st.integers(1, 2), st.booleans()),
-    st.tuples(st.just("accept"), name, st.booleans()),
+    st.tuples(st.just("accept"), name, st.booleans(), st.floats(0, 9), st.integers(0, 9)),
     st.tuples(st.just("names"), st.sampled_from([NAMES, ("push", "grasp"), (*NAMES, "lift")])),
 )
 actions = st.lists(st.one_of(st.lists(change, min_size=1, max_size=4), st.sampled_from(["undo", "redo"])), max_size=12)
@@ -42,7 +42,7 @@ def empty():
 def said(document):
     """What a document says, in plain data."""
     labels = {name: own.tolist() for name, own in document.labels.items()}
-    return labels, {name: set(own) for name, own in document.cuts.items()}, set(document.accepted), document.names
+    return labels, {name: set(own) for name, own in document.cuts.items()}, dict(document.accepted), document.names
 
 
 def act(labels, action):
@@ -183,6 +183,6 @@ def test_kill_9_loses_at_most_the_edit_in_flight_and_a_second_process_is_refused
 def test_an_edit_is_on_disk_when_the_call_returns(tmp_path):
     path = tmp_path / "labels.journal"
     journal = Journal(path, empty(), "option")
-    journal.edit([("accept", "demo_1", True)])
-    assert json.loads(path.read_bytes().splitlines()[-1]) == [["accept", "demo_1", True]]
+    journal.edit([("accept", "demo_1", True, 0.5, 1)])
+    assert json.loads(path.read_bytes().splitlines()[-1]) == [["accept", "demo_1", True, 0.5, 1]]
     journal.close()
