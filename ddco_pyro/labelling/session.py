@@ -661,7 +661,8 @@ class Session:
         """
         if form not in self.exporters:
             raise BadInput(f"there is no format {form!r}; there is: {', '.join(self.exporters)}")
-        return self.exporters[form](self.segmented(), self.fit, folder, self.level)
+        named = replace(self.fit, named={**self.fit.named, self.level: self.document.names})
+        return self.exporters[form](self.segmented(), named, folder, self.level)
 
     def close(self) -> None:
         """Save, and leave the labels to other processes."""

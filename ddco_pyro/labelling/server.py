@@ -1,0 +1,300 @@
+"""The local web server of ``ddco-pyro label``: a :class:`Session` over HTTP, and the page that shows it.
+
+It listens on this machine alone. The first part of every path is a random token; a foreign ``Host`` or ``Origin`` is
+refused. No path of a request touches the file system.
+"""
+
+from __future__ import annotations
+
+import json
+import secrets
+import shutil
+import socket
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from importlib.resources import files
+from pathlib import Path
+from threading import Thread
+from typing import Any, Protocol
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.background import BackgroundTask
+from starlette.concurrency import run_in_threadpool
+from starlette.datastructures import Headers
+from starlette.exceptions import HTTPException
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, Response
+from starlette.routing import Route
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from ddco_pyro.errors import BadInput, Failed, reason
+
+LOOPBACK = "127.0.0.1"
+
+MOST_BYTES = 64 * 2**10
+"""Bytes of a request's body."""
+
+PATIENCE = 2
+"""Seconds that requests under way have when the server stops."""
+
+PAGE = {
+    "": ("index.html", "text/html"),
+    "page.css": ("page.css", "text/css"),
+    **{name: (name, "text/javascript") for name in ("app.js", "drawing.js", "panels.js", "timeline.js")},
+}
+"""The files of the page: the path in a request, the file and its type."""
+
+HEADERS = {
+    "Cache-Control": "no-store",
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "same-origin",
+    "X-Content-Type-Options": "nosniff",
+}
+"""Headers of every answer."""
+
+POLLED = ("revision", "refit", "warnings", "dirty")
+"""What a page that knows the revision is told of the state."""
+
+
+class Served(Protocol):
+    """What the server asks of a session; everything returned can be JSON unless it says otherwise."""
+
+    def state(self) -> dict[str, Any]:
+        """Everything but the demonstrations."""
+
+    def demo(self, index: int) -> dict[str, Any]:
+        """One demonstration, as it is shown."""
+
+    def nearest(self, index: int, step: int) -> list[dict[str, Any]]:
+        """Segments elsewhere that are like the one at a step."""
+
+    def picture(self, index: int, step: int) -> bytes:
+        """The picture at a step, a JPEG file."""
+
+    def edit(self, command: dict[str, Any]) -> dict[str, Any]:
+        """Do what a person said, and keep it before the answer."""
+
+    def refit(self) -> None:
+        """Fit again in the background."""
+
+    def choose(self, proposal: Any) -> None:
+        """Answer the question which way to cut is meant."""
+
+    def granularity(self, name: str) -> None:
+        """Propose shorter or longer segments."""
+
+    def save(self) -> str:
+        """Write the labels; a line that says where."""
+
+    def export(self, format: str, folder: Path) -> Path:
+        """Write one file of a format into a folder."""
+
+    def close(self) -> None:
+        """End what runs in the background."""
+
+
+@dataclass(frozen=True)
+class Listening:
+    """A socket of this machine and the token of who may use it."""
+
+    socket: socket.socket
+    token: str = field(default_factory=lambda: secrets.token_urlsafe(24))
+
+    @classmethod
+    def at(cls, port: int = 0) -> Listening:
+        """Listen on a port; 0 is any that is free.
+
+        :raises Failed: the port is taken or not allowed.
+        """
+        found = socket.socket()
+        try:
+            found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            found.bind((LOOPBACK, port))
+            found.listen()
+        except (OSError, OverflowError) as error:
+            found.close()
+            raise Failed(f"port {port}: {reason(OSError(*error.args))}; choose another one with --port") from error
+        return cls(found)
+
+    @property
+    def port(self) -> int:
+        """The port that is listened on."""
+        return int(self.socket.getsockname()[1])
+
+    @property
+    def address(self) -> str:
+        """Where the page is; the token is part of it."""
+        return f"http://{LOOPBACK}:{self.port}/{self.token}/"
+
+
+def serve(session: Served, listening: Listening, ready: Callable[[], None] = lambda: None) -> str:
+    """Serve a session until an interrupt; then save it and close it.
+
+    :param ready: called when the page answers.
+    :returns: a line that says what was saved.
+    """
+    settings = uvicorn.Config(
+        application(session, listening.token, listening.port),
+        log_config=None, access_log=False, lifespan="off", server_header=False, timeout_graceful_shutdown=PATIENCE,
+    )  # fmt: skip
+    server = uvicorn.Server(settings)
+    thread = Thread(target=server.run, kwargs={"sockets": [listening.socket]}, name="server")
+    thread.start()
+    try:
+        ready()
+        thread.join()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        server.should_exit = True
+        thread.join()
+        listening.socket.close()
+        try:
+            saved = session.save() if session.state()["dirty"] else "nothing new to save"
+        finally:
+            session.close()
+    return saved
+
+
+def application(session: Served, token: str, port: int) -> Starlette:
+    """The web application of a session, for requests to ``127.0.0.1:port/token/``."""
+    routes = [*_page(), *_answers(session)]
+    guard = Middleware(Guard, token=token, hosts=frozenset(f"{host}:{port}" for host in (LOOPBACK, "localhost")))
+    return Starlette(routes=routes, middleware=[guard], exception_handlers={HTTPException: _refused})
+
+
+class Guard:
+    """Refuses requests of others, and gives every answer the headers that keep a browser from harm."""
+
+    def __init__(self, app: ASGIApp, token: str, hosts: frozenset[str]) -> None:
+        self.app, self.token, self.hosts = app, token, hosts
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request, or refuse it."""
+
+        async def headed(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                extra = [(name.lower().encode(), value.encode()) for name, value in HEADERS.items()]
+                message = {**message, "headers": [*message["headers"], *extra]}
+            await send(message)
+
+        if scope["type"] != "http":
+            return
+        headers, (first, slash, _) = Headers(scope=scope), scope["path"].removeprefix("/").partition("/")
+        origin = headers.get("origin")
+        if headers.get("host") not in self.hosts or origin not in (None, f"http://{headers.get('host')}"):
+            app: ASGIApp = _error(403, "this address is not the page's")
+        elif not slash or not secrets.compare_digest(first.encode(), self.token.encode()):
+            app = _error(404, "there is nothing here")
+        else:
+            app, scope = self.app, {**scope, "root_path": f"/{first}"}
+        await app(scope, receive, headed)
+
+
+def _page() -> list[Route]:
+    """The routes of the page's files, which are read once."""
+    folder = files("ddco_pyro.labelling") / "static"
+
+    def route(path: str, name: str, kind: str) -> Route:
+        content = (folder / name).read_bytes()
+
+        async def sent(request: Request) -> Response:
+            return Response(content, media_type=kind)
+
+        return Route(f"/{path}", sent)
+
+    return [route(path, name, kind) for path, (name, kind) in PAGE.items()]
+
+
+def _answers(session: Served) -> list[Route]:
+    """The routes of the session's methods, each of which runs in a thread."""
+
+    def state(request: Request) -> dict[str, Any]:
+        found = session.state()
+        known = request.query_params.get("since") == str(found["revision"])
+        return {key: found[key] for key in POLLED} if known else found
+
+    def demo(request: Request) -> dict[str, Any]:
+        return session.demo(request.path_params["index"])
+
+    def nearest(request: Request) -> list[dict[str, Any]]:
+        return session.nearest(request.path_params["index"], request.path_params["step"])
+
+    def picture(request: Request) -> Response:
+        content = session.picture(request.path_params["index"], request.path_params["step"])
+        return Response(content, media_type="image/jpeg")
+
+    def exported(request: Request) -> Response:
+        folder = Path(tempfile.mkdtemp(prefix="ddco-pyro-"))
+        removed = BackgroundTask(shutil.rmtree, folder)
+        try:
+            path = session.export(request.path_params["format"], folder)
+            return FileResponse(path, filename=path.name, background=removed)
+        except BaseException:
+            removed.func(folder)
+            raise
+
+    def route(path: str, call: Callable[..., Any], method: str) -> Route:
+        async def answer(request: Request) -> Response:
+            arguments = [request] if method == "GET" else [await _asked(request)]
+            try:
+                found = await run_in_threadpool(call, *arguments)
+            except BadInput as error:
+                raise HTTPException(400, reason(error)) from error
+            except Exception as error:
+                raise HTTPException(500, reason(error)) from error
+            return found if isinstance(found, Response) else JSONResponse(found)
+
+        return Route(f"/{path}", answer, methods=[method])
+
+    gets = {
+        "state": state,
+        "demo/{index:int}": demo,
+        "demo/{index:int}/nearest/{step:int}": nearest,
+        "demo/{index:int}/picture/{step:int}": picture,
+        "export/{format}": exported,
+    }
+    posts = {
+        "edit": session.edit,
+        "refit": lambda asked: session.refit(),
+        "choose": lambda asked: session.choose(asked.get("proposal")),
+        "granularity": lambda asked: session.granularity(asked.get("name")),
+        "save": lambda asked: {"message": session.save()},
+    }
+    return [
+        *(route(path, call, "GET") for path, call in gets.items()),
+        *(route(path, call, "POST") for path, call in posts.items()),
+    ]
+
+
+async def _asked(request: Request) -> dict[str, Any]:
+    """The object in a request's body."""
+    if request.headers.get("content-type") != "application/json":
+        raise HTTPException(415, "the body has to be application/json")
+    body = b""
+    async for chunk in request.stream():
+        body += chunk
+        if len(body) > MOST_BYTES:
+            raise HTTPException(413, f"the body is longer than {MOST_BYTES} bytes")
+    try:
+        found = json.loads(body)
+    except (ValueError, RecursionError) as error:
+        raise HTTPException(400, "the body is no JSON") from error
+    if not isinstance(found, dict):
+        raise HTTPException(400, "the body has to be a JSON object")
+    return found
+
+
+def _error(status: int, message: str, headers: Mapping[str, str] | None = None) -> Response:
+    return JSONResponse({"error": message}, status, headers)
+
+
+async def _refused(request: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    return _error(error.status_code, error.detail, error.headers)

@@ -1,0 +1,154 @@
+// One demonstration over time: levels, boundaries, numbers; the cursor, and what is dragged or painted.
+import { Numbers, bytes, coloured, element, last, looks, row, sharp } from "./drawing.js";
+
+const GUTTER = 108, AXIS = 16, LANE = 18, MAIN = 34, BAND = 14, PLOT = 24, LEAST = 10, NEAR = 6;
+
+export class Timeline {
+  constructor(root, calls) {  // calls: seek(step), split(step), drop({boundary, to}), menu(step, x, y)
+    Object.assign(this, { root, calls, from: 0, to: 1, cursor: 0, preview: null, asked: false, stale: true });
+    this.canvas = element("canvas"); this.line = element("i", { className: "cursor" }); this.ghost = element("i", { className: "ghost", hidden: true });
+    root.append(this.canvas, this.ghost, this.line);
+    new ResizeObserver(() => this.redraw()).observe(root);
+    root.addEventListener("pointerdown", event => this.down(event));
+    root.addEventListener("pointermove", event => this.moved(event));
+    root.addEventListener("pointerup", () => this.up());
+    root.addEventListener("pointercancel", () => { this.drag = null; this.hold(null); });
+    root.addEventListener("dblclick", event => { if (event.offsetX >= GUTTER) calls.split(this.step(event)); });
+    root.addEventListener("contextmenu", event => {
+      event.preventDefault();
+      const box = root.getBoundingClientRect(), keyed = event.button !== 2;
+      if (!keyed) calls.seek(this.step(event));
+      calls.menu(keyed ? box.left + this.x(this.cursor) : event.clientX, keyed ? box.top + this.lanes : event.clientY);
+    });
+    root.addEventListener("wheel", event => {
+      if (event.ctrlKey || event.metaKey) this.zoom(1.2 ** Math.sign(event.deltaY), this.step(event));
+      else if (event.shiftKey) this.pan(this.from + (event.deltaX || event.deltaY) / this.each);
+      else return;
+      event.preventDefault();
+    }, { passive: false });
+  }
+  show(demo, state) {
+    if (this.demo?.index !== demo.index) [this.from, this.to] = [0, demo.steps];
+    Object.assign(this, { demo, state });
+    demo.heights ??= bytes(demo.probability);
+    if (demo.numbers) demo.numbers.decoded ??= new Numbers(demo.numbers, demo.steps);
+    this.rows = demo.numbers?.names ?? [];
+    this.lanes = AXIS + demo.upper.length * (LANE + 3) + MAIN + BAND + 4;
+    this.height = this.lanes + this.rows.length * PLOT;
+    this.root.style.height = `${this.height}px`;
+    this.redraw();
+  }
+  get each() { return (this.root.clientWidth - GUTTER) / (this.to - this.from); }
+  x(step) { return GUTTER + (step - this.from) * this.each; }
+  step(event) {
+    const at = Math.floor(this.from + (event.clientX - this.root.getBoundingClientRect().left - GUTTER) / this.each);
+    return Math.min(Math.max(at, 0), this.demo.steps - 1);
+  }
+  seek(step) {
+    this.cursor = step;
+    if (step < this.from || step >= this.to) this.pan(step - (this.to - this.from) / 4);
+    this.refresh();
+  }
+  hold(preview) { this.preview = preview; this.refresh(); }  // {boundary, to}, or {start, stop, option} while painting
+  zoom(factor, centre = this.cursor) {
+    const wide = Math.min(Math.max((this.to - this.from) * factor, LEAST), this.demo.steps), share = (centre + .5 - this.from) / (this.to - this.from);
+    this.to = this.from + wide;
+    this.pan(centre + .5 - Math.min(Math.max(share, 0), 1) * wide);
+  }
+  all() { [this.from, this.to] = [0, this.demo.steps]; this.redraw(); }
+  pan(start) {
+    const wide = this.to - this.from;
+    this.from = Math.min(Math.max(start, 0), this.demo.steps - wide); this.to = this.from + wide;
+    this.redraw();
+  }
+  near(event) {  // the boundary that is pointed at
+    const box = this.root.getBoundingClientRect(), x = event.clientX - box.left, y = event.clientY - box.top;
+    if (y > this.lanes || x < GUTTER) return null;
+    return this.demo.boundaries.map(one => [Math.abs(this.x(one.step) - x), one.step]).filter(([far]) => far <= NEAR).sort((a, b) => a[0] - b[0])[0]?.[1] ?? null;
+  }
+  down(event) {
+    if (event.button || !this.demo) return;
+    this.root.setPointerCapture(event.pointerId);
+    const boundary = this.near(event);
+    this.drag = { boundary };
+    if (boundary === null) this.calls.seek(this.step(event));
+  }
+  moved(event) {
+    if (!this.demo) return;
+    if (!this.drag) this.root.style.cursor = this.near(event) === null ? "" : "ew-resize";
+    else if (this.drag.boundary === null) this.calls.seek(this.step(event));
+    else this.hold({ boundary: this.drag.boundary, to: Math.max(1, Math.round(this.from + (event.clientX - this.root.getBoundingClientRect().left - GUTTER) / this.each)) });
+  }
+  up() {
+    const { drag, preview } = this;
+    this.drag = null;
+    if (drag && preview) this.calls.drop(preview);
+    else if (drag && drag.boundary !== null) this.calls.seek(drag.boundary);
+  }
+  redraw() { this.stale = true; this.refresh(); }
+  refresh() { if (!this.asked) { this.asked = true; requestAnimationFrame(() => { this.asked = false; this.frame(); }); } }
+  frame() {
+    if (!this.demo || !this.root.clientWidth) return;
+    if (this.stale) { this.stale = false; this.draw(); }
+    const x = this.x(this.cursor + .5), held = this.preview;
+    this.line.style.transform = `translateX(${Math.min(Math.max(x, GUTTER), this.root.clientWidth) - .5}px)`;
+    this.ghost.hidden = !held;
+    if (!held) return;
+    const [start, stop] = held.boundary === undefined ? [held.start, held.stop] : [held.boundary, held.to].sort((a, b) => a - b);
+    const left = Math.max(this.x(start), GUTTER), top = this.lanes - MAIN - BAND - 4, colours = this.state.colours;
+    const after = this.demo.segments[last(this.demo.segments.map(one => one.start), held.boundary - (held.to > held.boundary ? 1 : 0))];
+    const colour = coloured(colours, held.option ?? after?.option ?? 0);
+    Object.assign(this.ghost.style, { left: `${left}px`, width: `${Math.max(this.x(stop) - left, 1)}px`, top: `${top}px`, height: `${MAIN}px`, background: colour });
+  }
+  draw() {
+    const { demo, state } = this, width = this.root.clientWidth, context = sharp(this.canvas, width, this.height), place = step => this.x(step);
+    place.least = GUTTER;
+    const edge = Math.min(this.x(demo.steps), width), label = (text, y) => { context.fillStyle = looks.soft; context.fillText(text, 0, y, GUTTER - 8); };
+    this.axis(context, width);
+    let top = AXIS;
+    for (const level of [...demo.upper].reverse()) {
+      label(level.level, top + LANE / 2);
+      row(context, level.segments, { place, edge, top, height: LANE, colours: level.colours, names: option => option ? level.names[option - 1] : "control" });
+      top += LANE + 3;
+    }
+    label(state.level, top + MAIN / 2);
+    const names = option => option ? state.names[option - 1] : "control";
+    row(context, demo.segments, { place, edge, top, height: MAIN, colours: state.colours, names, heights: demo.heights });
+    top += MAIN;
+    label("boundaries", top + BAND / 2 + 2);
+    for (const { step, low, high, said } of demo.boundaries) {
+      const x = this.x(step), left = Math.max(this.x(low), GUTTER), right = Math.min(this.x(high + 1), width);
+      if (right < GUTTER || left > width) continue;
+      context.fillStyle = said ? looks.ink : looks.accent;
+      context.beginPath();
+      if (said) { context.moveTo(x - 4, top + 9); context.lineTo(x, top + 2); context.lineTo(x + 4, top + 9); }
+      else { context.moveTo(Math.min(left, x - 1), top + BAND); context.lineTo(Math.min(Math.max(x, left), right), top + 1); context.lineTo(Math.max(right, x + 1), top + BAND); }
+      context.fill();
+    }
+    top += BAND + 4;
+    this.rows.forEach((name, number) => this.plot(context, number, name, top + number * PLOT, width, label));
+  }
+  axis(context, width) {
+    const rough = (this.to - this.from) / Math.max(2, (width - GUTTER) / 100), power = 10 ** Math.floor(Math.log10(rough));
+    const tick = Math.max(1, [1, 2, 5, 10].find(one => one * power >= rough) * power), rate = this.state.frequency;
+    context.fillStyle = looks.soft;
+    for (let step = Math.ceil(this.from / tick) * tick; step < this.to; step += tick) {
+      const x = this.x(step);
+      context.fillRect(x, 11, 1, 4);
+      context.textAlign = x > width - 40 ? "right" : step ? "center" : "left";
+      context.fillText(rate ? `${step} (${+(step / rate).toFixed(2)} s)` : String(step), x, 5);
+    }
+    context.textAlign = "left"; context.fillText("step", 0, 6);
+  }
+  plot(context, number, name, top, width, label) {
+    const { numbers, steps } = this.demo, values = numbers.decoded, wide = Math.min(width, this.x(steps)), pixel = Math.max(this.each, 1) / this.each;
+    label(name, top + PLOT / 2);
+    context.strokeStyle = looks.line; context.lineWidth = 1; context.beginPath(); context.moveTo(GUTTER, top + PLOT - .5); context.lineTo(wide, top + PLOT - .5); context.stroke();
+    context.strokeStyle = looks.ink; context.beginPath();
+    for (let at = this.from; at < this.to; at += pixel) {
+      const step = Math.min(Math.floor(at), steps - 1);
+      context.lineTo(this.x(at), top + PLOT - 3 - (PLOT - 6) * values.share(number, step));
+    }
+    context.stroke();
+  }
+}
