@@ -141,6 +141,7 @@ def test_methods_bodies_and_commands_are_checked(client, session):
         assert answer.status_code == status, answer.text
         assert "\n" not in answer.json()["error"]
     assert client.get(f"/{TOKEN}/demo/99").status_code == 400
+    assert client.get(f"/{TOKEN}/demo/{'9' * 6000}").status_code == 400
     assert client.get(f"/{TOKEN}/export/floppy").status_code == 400
     assert session.revision == 1
 

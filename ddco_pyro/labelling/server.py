@@ -141,7 +141,8 @@ def serve(session: Served, listening: Listening, ready: Callable[[], None] = lam
     """
     settings = uvicorn.Config(
         application(session, listening.token, listening.port),
-        log_config=None, access_log=False, lifespan="off", server_header=False, timeout_graceful_shutdown=PATIENCE,
+        log_config=None, log_level="critical", lifespan="off", ws="none", server_header=False,
+        timeout_graceful_shutdown=PATIENCE,
     )  # fmt: skip
     server = uvicorn.Server(settings)
     thread = Thread(target=server.run, kwargs={"sockets": [listening.socket]}, name="server")
@@ -166,7 +167,7 @@ def application(session: Served, token: str, port: int) -> Starlette:
     """The web application of a session, for requests to ``127.0.0.1:port/token/``."""
     routes = [*_page(), *_answers(session)]
     guard = Middleware(Guard, token=token, hosts=frozenset(f"{host}:{port}" for host in (LOOPBACK, "localhost")))
-    return Starlette(routes=routes, middleware=[guard], exception_handlers={HTTPException: _refused})
+    return Starlette(routes=routes, middleware=[guard], exception_handlers={HTTPException: _refused, ValueError: _refused})
 
 
 class Guard:
@@ -296,5 +297,7 @@ def _error(status: int, message: str, headers: Mapping[str, str] | None = None) 
 
 
 async def _refused(request: Request, error: Exception) -> Response:
-    assert isinstance(error, HTTPException)
-    return _error(error.status_code, error.detail, error.headers)
+    """What is said of an error; starlette refuses numbers of thousands of digits by a ValueError."""
+    if isinstance(error, HTTPException):
+        return _error(error.status_code, error.detail, error.headers)
+    return _error(400, reason(error))

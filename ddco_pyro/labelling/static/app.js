@@ -1,0 +1,251 @@
+// The page: what the server says, what a person does, and the keys.
+import { Look, element, onScheme, within } from "./drawing.js";
+import { List, Options, Question, alike, optionName, readout, summary } from "./panels.js";
+import { Timeline } from "./timeline.js";
+
+const $ = id => document.getElementById(id), EVERY = 1000, ALIKE = 250;
+let state = null, demo = null, cursor = 0, playing = null, painting = null, moving = null, waiting = Promise.resolve(), asked = 0, silent = false;
+const shownAt = new Map();
+let known = 0;  // the revision when the page was opened: older changes are no news
+const seen = index => shownAt.get(index) ?? known;
+
+async function ask(path, body) {
+  let answer, found;
+  try {
+    answer = await fetch(path, body === undefined ? {} : { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
+    found = await answer.json();
+  } catch { throw new Error(body === undefined ? "the server does not answer" : "the server does not answer; what you did last may be lost"); }
+  if (!answer.ok) throw new Error(found.error);
+  return found;
+}
+const say = (text, bad = false) => { $("said").textContent = text; $("said").classList.toggle("bad", bad); };
+const tried = async work => { try { return await work(); } catch (error) { say(error.message, true); return null; } };
+const option = number => optionName(state, number);
+const others = indices => indices.length ? `; ${indices.length} other${indices.length > 1 ? "s" : ""} changed` : "";
+
+const seek = step => {
+  cursor = Math.min(Math.max(step, 0), demo.steps - 1);
+  timeline.seek(cursor); look.at(cursor); readout($("readout"), state, demo, cursor);
+  const segment = within(demo.segments, cursor), name = optionName(state, segment.option, segment.said);
+  $("timeline").setAttribute("aria-valuenow", cursor);
+  $("timeline").setAttribute("aria-valuetext", `step ${cursor} of ${demo.steps}, ${name}, ${segment.said}, steps ${segment.start} to ${segment.stop - 1}`);
+  clearTimeout(asked);
+  if (!playing) asked = setTimeout(neighbours, ALIKE);
+};
+async function neighbours() {
+  const { index } = demo, segment = within(demo.segments, cursor), found = await tried(() => ask(`demo/${index}/nearest/${cursor}`));
+  if (found && demo.index === index && within(demo.segments, cursor).start === segment.start) alike($("nearest"), state, found, demo.pictures, (other, step) => open(other, step));
+  history.replaceState(null, "", `#${index}/${cursor}`);
+}
+
+const timeline = new Timeline($("timeline"), { seek, split: step => edit({ do: "split", demo: demo.index, step }), drop, menu });
+const look = new Look($("look"), 280, 190);
+const list = new List($("list"), $("find"), $("count"), index => open(index));
+const options = new Options($("options"), {
+  name: number => act(number), rename: (number, text) => edit({ do: "rename", option: number, text }), add: text => edit({ do: "new", text }),
+});
+const question = new Question($("question"), {
+  choose: proposal => tried(async () => { await ask("choose", { proposal }); await refresh(); $("timeline").focus(); }),
+  granularity: name => tried(async () => { await ask("granularity", { name }); await refresh(); }),
+  demo: index => ask(`demo/${index}`),
+});
+
+function render(keep = true) {
+  document.title = `Labelling ${state.title}`;
+  $("title").textContent = state.title;
+  summary($("summary"), state);
+  status(state);
+  $("question").hidden = !state.question; $("work").hidden = Boolean(state.question);
+  document.querySelector("[data-do=undo]").disabled = !state.can_undo;
+  document.querySelector("[data-do=redo]").disabled = !state.can_redo;
+  if ($("export").length !== state.formats.length + 1) $("export").replaceChildren(element("option", { value: "", textContent: "Export …" }), ...state.formats.map(name => element("option", { textContent: name })));
+  if (state.question) { tried(() => question.show(state)); return; }
+  if (!demo) return;
+  shownAt.set(demo.index, demo.revision);
+  list.show(state, demo.index, seen, keep);
+  options.show(state);
+  const { name, accepted, held_out: held, reason } = state.demos[demo.index];
+  $("name").textContent = name;
+  $("reason").textContent = [accepted && "accepted", held && "held out", reason].filter(Boolean).join(" · ");
+  timeline.show(demo, state); look.show(demo, demo.segments, state.colours);
+  $("timeline").setAttribute("aria-valuemin", 0); $("timeline").setAttribute("aria-valuemax", demo.steps - 1);
+  seek(cursor);
+}
+function status({ refit, warnings, dirty }) {
+  $("fitting").hidden = !refit.running;
+  const bar = $("fitting").querySelector("progress");
+  if (refit.progress === null) bar.removeAttribute("value"); else bar.value = refit.progress;
+  $("fitting").querySelector("span").textContent = refit.message;
+  document.querySelector("[data-do=refit]").disabled = refit.running;
+  const lines = [...warnings, ...(refit.error ? [`the refit failed: ${refit.error}`] : []), ...(silent ? ["the server does not answer; start it again and open the address it prints"] : [])];
+  if ($("warnings").textContent !== lines.join("")) $("warnings").replaceChildren(...lines.map(text => element("li", { textContent: text })));
+  document.querySelector("[data-do=save]").textContent = dirty ? "Save •" : "Save";
+}
+async function refresh(index = demo?.index, step = cursor, keep = true) {  // what the server shows, whole: no answer is mixed with an older one
+  const found = await ask("state");
+  if (index === undefined && !found.question) [index, step] = whereTo(found);
+  const one = index === undefined || found.question ? null : await ask(`demo/${index}`);
+  if (state && found.revision < state.revision) return;
+  if (state && state.refit.done < found.refit.done) say(`Refit ${found.refit.done} is done`);
+  known ||= found.revision;
+  [state, silent] = [found, false];
+  if (one) { demo = one; cursor = step; }
+  render(keep && list.active === index);
+}
+function whereTo(found) {
+  const [, index, step] = location.hash.match(/^#(\d+)\/(\d+)$/) ?? [];
+  return index < found.demos.length ? [Number(index), Number(step)] : [found.order.find(one => !found.demos[one].accepted) ?? found.order[0], 0];
+}
+const open = (index, step = 0, keep = true) => tried(async () => { stop(); await refresh(index, step, keep); });
+
+// One edit after the other: each is in the journal when the server answers.
+const edit = (command, words) => waiting = waiting.then(() => tried(async () => {
+  const before = demo.index, found = await ask("edit", command), there = ["undo", "redo"].includes(command.do) ? found.demo : before;
+  await refresh(there, there === before ? cursor : 0);
+  say(`${words ?? { undo: "Undone", redo: "Done again", split: "Split", merge: "Merged", open: "Left open", move: "Moved", rename: "Renamed", new: "New option" }[command.do]} in ${state.demos[found.demo ?? before].name}${others(found.changed)}`);
+  return true;
+}));
+const act = number => edit({ do: "name", demo: demo.index, step: cursor, option: number }, option(number));
+const everywhere = number => edit({ do: "everywhere", demo: demo.index, step: cursor, option: number }, `${option(number)} everywhere, as`);
+function drop({ boundary, to }) {
+  return boundary === to ? timeline.hold(null) : edit({ do: "move", demo: demo.index, boundary, to }).then(done => { timeline.hold(null); if (done) seek(Math.min(to, demo.steps - 1)); });
+}
+async function accept() {
+  if (!await edit({ do: "accept", demo: demo.index }, "Accepted")) return;
+  const next = state.order.find(index => !state.demos[index].accepted);
+  if (next === undefined) say("All demonstrations are accepted");
+  else await open(next, 0, false);
+}
+function uncertain() {  // the most uncertain boundary; pressed again there, the next one
+  const places = state.uncertain, at = places.findIndex(one => one.demo === demo.index && one.step === cursor), next = places[(at + 1) % places.length];
+  if (next) open(next.demo, next.step).then(() => say(`Boundary ${(at + 1) % places.length + 1} of the ${places.length} most uncertain: ${demo.name}, step ${next.step}`));
+  else say("No boundary is uncertain");
+}
+const boundaries = () => demo.segments.slice(1).map(one => one.start);
+function shove(steps) {  // the nearest boundary moves when the key is released
+  if (!moving) {
+    const nearest = boundaries().sort((a, b) => Math.abs(a - cursor) - Math.abs(b - cursor))[0];
+    if (nearest === undefined) { say("There is no boundary", true); return; }
+    moving = { boundary: nearest, to: nearest };
+  }
+  moving.to = Math.min(Math.max(moving.to + steps, 1), demo.steps - 1);
+  timeline.hold(moving);
+  say(`Boundary ${moving.boundary} to step ${moving.to}`);
+}
+function release() {  // of what is held: a boundary that moves, or a number that paints
+  const [held, painted] = [moving, painting];
+  moving = painting = null;
+  if (held) drop(held);
+  if (!painted) return;
+  const stretch = timeline.preview ?? { start: painted.start, stop: painted.start + 1 };
+  edit({ do: "paint", demo: demo.index, start: stretch.start, stop: stretch.stop, option: painted.option }, `${painted.option ? option(painted.option) : "Open"} from step ${stretch.start} to ${stretch.stop - 1}`).then(() => timeline.hold(null));
+}
+
+function play() {
+  if (playing) { stop(); return; }
+  if (cursor >= demo.steps - 1) seek(0);
+  const begin = { step: cursor, time: performance.now() };
+  playing = begin;
+  document.querySelector("[data-do=play]").textContent = "Stop";
+  const turn = now => {
+    if (playing !== begin) return;
+    const rate = (state.frequency ?? 20) * Number($("speed").value), at = begin.step + Math.floor(Math.max(now - begin.time, 0) / 1000 * rate);
+    if (at !== cursor) seek(at);
+    if (painting) timeline.hold({ start: painting.start, stop: cursor + 1, option: painting.option });
+    if (at >= demo.steps - 1) { stop(); return; }
+    requestAnimationFrame(turn);
+  };
+  requestAnimationFrame(turn);
+}
+function stop() {
+  if (!playing) return;
+  playing = null;
+  document.querySelector("[data-do=play]").textContent = "Play";
+  release(); seek(cursor);
+}
+
+function menu(x, y) {
+  const box = $("menu"), close = () => { box.hidden = true; $("timeline").focus(); };
+  const item = (text, work) => { const made = element("button", { type: "button", role: "menuitem", textContent: text, tabIndex: -1, onclick: () => { close(); work(); } }); made.setAttribute("role", "menuitem"); return made; };
+  box.replaceChildren(...state.names.map((name, n) => item(`${n + 1}  ${name}`, () => act(n + 1))), item("New option …", () => options.added.focus()),
+    ...["split", "merge", "open", "accept"].map(name => item({ split: "Split here  S", merge: "Merge with the next  M", open: "Leave open  0", accept: "Accept all  Enter" }[name], commands[name])));
+  box.hidden = false;
+  Object.assign(box.style, { left: `${Math.min(x, innerWidth - box.offsetWidth - 8)}px`, top: `${Math.max(8, Math.min(y, innerHeight - box.offsetHeight - 8))}px` });
+  const items = [...box.children], go = step => items[(items.indexOf(document.activeElement) + step + items.length) % items.length].focus();
+  items[0].focus();
+  box.onkeydown = event => {
+    event.stopPropagation();
+    if (event.key === "ArrowDown") go(1); else if (event.key === "ArrowUp") go(-1);
+    else if (event.key === "Escape" || event.key === "Tab") close(); else return;
+    event.preventDefault();
+  };
+}
+addEventListener("pointerdown", event => { if (!$("menu").contains(event.target)) $("menu").hidden = true; });
+
+const here = name => () => edit({ do: name, demo: demo.index, step: cursor });
+const commands = {
+  undo: () => edit({ do: "undo" }), redo: () => edit({ do: "redo" }), split: here("split"), merge: here("merge"), open: here("open"), accept, play, uncertain,
+  refit: () => tried(async () => { await ask("refit", {}); await poll(); say("Refit begun"); }),
+  save: () => tried(async () => { say((await ask("save", {})).message); status(Object.assign(state, { dirty: false })); }),
+  help: () => $("help").showModal(), find: () => $("find").focus(),
+  closer: () => timeline.zoom(.5), wider: () => timeline.zoom(2), all: () => timeline.all(),
+  next: () => seek(boundaries().find(step => step > cursor) ?? cursor), previous: () => seek(boundaries().reverse().find(step => step < cursor) ?? 0),
+};
+const KEYS = {
+  " ": "play", j: "next", k: "previous", s: "split", m: "merge", Enter: "accept", g: "uncertain", u: "undo", "/": "find", "?": "help", "+": "closer", "=": "closer", "-": "wider", a: "all",
+};
+for (const button of document.querySelectorAll("[data-do]")) button.addEventListener("click", event => {
+  commands[button.dataset.do]();
+  if (event.detail && demo && button.dataset.do !== "help") $("timeline").focus();  // a click leaves the keys to the time line
+});
+$("export").onchange = () => {  // a download leaves the page where it is
+  const format = $("export").value;
+  $("export").value = "";
+  tried(async () => {
+    const answer = await fetch(`export/${encodeURIComponent(format)}`);
+    if (!answer.ok) throw new Error((await answer.json()).error);
+    const name = answer.headers.get("content-disposition").match(/filename="?([^";]+)/)[1], url = URL.createObjectURL(await answer.blob());
+    element("a", { href: url, download: name }).click();
+    setTimeout(() => URL.revokeObjectURL(url), EVERY);
+    say(`${name} is downloaded`);
+  });
+};
+
+addEventListener("keydown", event => {
+  const { target, key, code, shiftKey } = event, digit = code.match(/^(?:Digit|Numpad)(\d)$/)?.[1], typed = target.matches("input:not([type=range]), textarea, select");
+  if (event.defaultPrevented || $("help").open || !state) return;
+  if (typed) { if (key === "Escape" && target !== $("find")) $("timeline").focus(); return; }
+  const alone = !event.ctrlKey && !event.metaKey && !event.altKey, graphic = alone || event.getModifierState("AltGraph");
+  if (state.question) { const one = alone && state.question.proposals[digit - 1]; if (one) question.calls.choose(one.id); return; }
+  if (!demo || (target.matches("button, a, summary") && (key === " " || key === "Enter"))) return;
+  const bracket = graphic ? (key === "[" || code === "BracketLeft" && alone ? -1 : key === "]" || code === "BracketRight" && alone ? 1 : 0) : 0;
+  if (bracket) shove(bracket * (shiftKey && alone ? 10 : 1));
+  else if (key.toLowerCase() === "z" && (event.ctrlKey || event.metaKey)) commands[shiftKey ? "redo" : "undo"]();
+  else if (!alone) return;
+  else if (digit !== undefined && key !== "/" && key !== "=") {
+    if (event.repeat) { event.preventDefault(); return; }
+    if (Number(digit) > state.names.length) say(`There are ${state.names.length} options; name a new one first`, true);
+    else if (playing) painting = { code, option: Number(digit), start: cursor };
+    else if (digit === "0") commands.open();
+    else (shiftKey ? everywhere : act)(Number(digit));
+  } else if (key === "ArrowLeft" || key === "ArrowRight") { stop(); seek(cursor + (key === "ArrowLeft" ? -1 : 1) * (shiftKey ? 10 : 1)); }
+  else if (key === "Home") seek(0);
+  else if (key === "End") seek(demo.steps - 1);
+  else if (key.toLowerCase() === "u" && shiftKey) commands.redo();
+  else if (KEYS[key] ?? KEYS[key.toLowerCase()]) { if (!event.repeat || "jk".includes(key)) commands[KEYS[key] ?? KEYS[key.toLowerCase()]](); }
+  else return;
+  event.preventDefault();
+});
+addEventListener("keyup", event => { if (moving && /Bracket|^\[|^\]|Digit[89]/.test(event.code) || painting?.code === event.code) release(); });
+addEventListener("blur", () => { if (moving || painting) release(); });
+onScheme(() => { if (state) { question.draw(); question.coloured = null; render(); } });
+
+async function poll() {
+  try {
+    const found = await ask(`state?since=${state?.revision ?? ""}`);
+    silent = false;
+    if (found.order) { if (!playing && !timeline.drag && !moving) await refresh(); } else { Object.assign(state, found); status(state); }
+  } catch { silent = true; if (state) status(state); }
+}
+await tried(() => refresh());
+setInterval(poll, EVERY);

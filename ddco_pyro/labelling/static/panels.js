@@ -1,0 +1,188 @@
+// What stands beside the time line: the question, the list of demonstrations, options, the readout, and what is alike.
+import { Look, coloured, element, last, looks, percent, row, sharp, within } from "./drawing.js";
+
+const GRAINS = ["coarse", "medium", "fine"];
+const swatch = colour => { const made = element("span", { className: "swatch" }); made.style.background = colour; return made; };
+const seconds = (steps, rate) => rate ? `${steps} steps (${+(steps / rate).toPrecision(2)} s)` : `${steps} steps`;
+
+export const optionName = (state, option, said) => said === "open" ? "open" : option ? state.names[option - 1] ?? `option ${option}` : "control";
+
+export class Question {  // which of some ways to cut is meant, shown on three demonstrations
+  constructor(root, calls) {  // calls: choose(proposal), granularity(name), demo(index)
+    Object.assign(this, { root, calls });
+    this.looks = []; this.rows = [];
+    this.slider = element("input", { type: "range", id: "grain", min: 0, max: 2, step: 1 });
+    this.slider.onchange = () => calls.granularity(GRAINS[this.slider.value]);
+    this.cards = element("div", { className: "cards" }); this.heads = element("div", { className: "three" });
+    root.append(
+      element("h2", { textContent: "Which of these ways to cut do you mean?" }),
+      element("p", { className: "note", textContent: "Three demonstrations, and what each way makes of them. Point at a row to see its steps. You can correct everything afterwards." }),
+      element("label", { htmlFor: "grain", className: "grain" }, "Segments ", this.slider, this.grain = element("output")),
+      this.heads, this.cards);
+    addEventListener("resize", () => this.draw());
+  }
+  async show(state) {
+    const { question, granularity } = state, same = this.key === JSON.stringify(question);
+    this.state = state;
+    this.slider.value = GRAINS.indexOf(granularity);
+    this.grain.textContent = granularity; this.slider.setAttribute("aria-valuetext", granularity);
+    if (same) return;
+    this.key = JSON.stringify(question); this.rows = [];
+    this.cards.replaceChildren(...question.proposals.map((proposal, place) => this.card(proposal, place)));
+    this.draw();
+    this.demos = await Promise.all(question.demos.map(this.calls.demo));
+    this.heads.replaceChildren(...this.demos.map(demo => element("figure", {}, element("div"), element("figcaption", { textContent: demo.name }))));
+    this.looks = [...this.heads.querySelectorAll("div")].map(box => new Look(box, 200, 130));
+    this.colour(question.proposals.find(one => one.name === granularity) ?? question.proposals[0]);
+    this.cards.querySelector("button")?.focus();
+  }
+  card(proposal, place) {
+    const count = proposal.demos.reduce((sum, one) => sum + one.length, 0) / proposal.demos.length, rate = this.state.frequency;
+    const button = element("button", { type: "button", textContent: `${place + 1}  This one` });
+    button.setAttribute("aria-label", `Choose way ${place + 1}, ${proposal.name}`);
+    button.onclick = () => this.calls.choose(proposal.id);
+    button.onfocus = () => this.colour(proposal);
+    const canvases = proposal.demos.map((segments, column) => {
+      const canvas = element("canvas"), { steps, name } = this.state.demos[this.state.question.demos[column]];
+      canvas.setAttribute("role", "img");
+      canvas.setAttribute("aria-label", `${name}: ${segments.map(one => `${proposal.names[one.option - 1] ?? "control"} to step ${one.stop - 1}`).join(", ")}`);
+      canvas.onpointermove = event => {
+        this.colour(proposal);
+        this.looks[column]?.at(Math.min(Math.floor(event.offsetX / canvas.clientWidth * steps), steps - 1));
+      };
+      this.rows.push({ canvas, segments, steps, proposal });
+      return canvas;
+    });
+    return element("section", { className: "card" }, element("div", { className: "bar" }, button, element("strong", { textContent: proposal.name }),
+      element("span", { className: "note", textContent: `${+count.toFixed(1)} segments each, half longer than ${seconds(proposal.median, rate)}` })), element("div", { className: "three" }, ...canvases));
+  }
+  colour(proposal) {
+    if (this.coloured === proposal || !this.looks.length) return;
+    this.coloured = proposal;
+    this.looks.forEach((look, column) => look.show(this.demos[column], proposal.demos[column], proposal.colours));
+  }
+  draw() {
+    for (const { canvas, segments, steps, proposal } of this.rows) {
+      const width = canvas.clientWidth, context = sharp(canvas, width, 24);
+      row(context, segments, { place: step => step / steps * width, edge: width, top: 0, height: 24, colours: proposal.colours, names: option => option ? proposal.names[option - 1] : "control" });
+    }
+  }
+}
+
+export class List {  // all demonstrations, the most informative first, each with its segments
+  constructor(root, find, count, open) {
+    Object.assign(this, { root, find, count, open, rows: [], order: [] });
+    find.oninput = () => this.filter();
+    find.onkeydown = event => {
+      const first = this.shown()[0];
+      if (event.key === "Escape") { find.value = ""; this.filter(); root.focus(); }
+      else if (event.key === "Enter" && first !== undefined) { root.focus(); open(first); }
+      else return;
+      event.preventDefault(); event.stopPropagation();
+    };
+    root.onclick = event => { const row = event.target.closest("[role=option]"); if (row) open(Number(row.dataset.index)); };
+    root.onkeydown = event => {
+      const shown = this.shown(), at = shown.indexOf(this.active), step = { ArrowDown: 1, ArrowUp: -1, PageDown: 10, PageUp: -10, Home: -Infinity, End: Infinity }[event.key];
+      if (step === undefined || !shown.length) return;
+      event.preventDefault(); event.stopPropagation();
+      open(shown[Math.min(Math.max(at + step, 0), shown.length - 1)]);
+    };
+    new ResizeObserver(() => this.draw()).observe(root);
+  }
+  shown() { return this.order.filter(index => !this.rows[index].row.hidden); }
+  filter() {
+    const words = this.find.value.trim().toLowerCase();
+    this.rows.forEach(({ row, name }) => { row.hidden = !name.textContent.toLowerCase().includes(words); });
+    this.draw();
+  }
+  show(state, active, seen, keep) {  // keep: the order stays until another demonstration is opened
+    if (!this.rows.length) this.rows = state.demos.map((demo, index) => {
+      const [name, mark, reason, canvas] = [element("strong", { textContent: demo.name }), element("span", { className: "mark" }), element("small"), element("canvas")];
+      const row = element("div", { id: `demo-${index}` }, name, mark, reason, canvas);
+      row.setAttribute("role", "option"); row.dataset.index = index;
+      return { row, name, mark, reason, canvas };
+    });
+    if (!keep || !this.order.length) { this.order = state.order; this.root.replaceChildren(...state.order.map(index => this.rows[index].row)); }
+    state.demos.forEach((demo, index) => {
+      const { row, mark, reason } = this.rows[index], changed = demo.changed > seen(index) && index !== active;
+      row.setAttribute("aria-selected", index === active);
+      mark.textContent = [demo.accepted && "✓ accepted", changed && "● changed", demo.held_out && "held out"].filter(Boolean).join("  ");
+      reason.textContent = demo.accepted ? `${demo.steps} steps` : demo.reason;
+    });
+    this.state = state;
+    this.count.textContent = `${state.demos.filter(one => one.accepted).length} of ${state.demos.length} accepted`;
+    this.root.setAttribute("aria-activedescendant", `demo-${active}`);
+    if (this.active !== active) this.rows[active].row.scrollIntoView({ block: "nearest" });
+    this.active = active;
+    this.draw();
+  }
+  draw() {
+    if (!this.state) return;
+    const width = this.root.clientWidth - 18, longest = Math.max(...this.state.demos.map(one => one.steps));
+    this.state.demos.forEach(({ strip, steps }, index) => {
+      const { canvas, row: box } = this.rows[index], key = JSON.stringify([strip, width, longest, this.state.colours, looks.paper]);
+      if (box.hidden || canvas.key === key) return;
+      canvas.key = key;
+      const segments = strip.map(([start, option, said], n) => ({ start, stop: strip[n + 1]?.[0] ?? steps, option, said }));
+      row(sharp(canvas, width, 8), segments, { place: step => step / longest * width, edge: width, top: 0, height: 8, colours: this.state.colours });
+    });
+  }
+}
+
+export class Options {  // names of the options: a key or a click names the segment, a text renames the option
+  constructor(root, calls) {  // calls: name(option), rename(option, text), add(text)
+    Object.assign(this, { root, calls });
+    this.added = element("input", { placeholder: "new option", maxLength: 60 });
+    this.added.setAttribute("aria-label", "Name of a new option");
+    this.added.onchange = async () => { const text = this.added.value; if (text.trim() && await calls.add(text)) this.added.value = ""; };
+  }
+  show(state) {
+    const key = JSON.stringify([state.names, state.colours]), focused = this.root.contains(document.activeElement);
+    if (key === this.key) return;
+    this.key = key;
+    const place = focused ? [...this.root.querySelectorAll("input")].indexOf(document.activeElement) : -1;
+    this.root.replaceChildren(...state.names.map((name, n) => {
+      const button = element("button", { type: "button", title: `Name the segment under the cursor (${n + 1})` }, swatch(state.colours[n]), String(n + 1));
+      button.setAttribute("aria-label", `Name the segment ${name}`);
+      button.onclick = () => this.calls.name(n + 1);
+      const input = element("input", { value: name, maxLength: 60 });
+      input.setAttribute("aria-label", `Name of option ${n + 1}`);
+      input.onchange = async () => { if (!await this.calls.rename(n + 1, input.value)) input.value = name; };
+      return element("div", {}, button, input);
+    }), element("div", {}, element("span", { className: "note", textContent: "+" }), this.added));
+    if (place >= 0) this.root.querySelectorAll("input")[Math.min(place, state.names.length)].focus();
+  }
+}
+
+export function readout(root, state, demo, cursor) {
+  const segment = within(demo.segments, cursor), rate = state.frequency, boundary = demo.boundaries.find(one => one.step === segment.start), lines = [];
+  const at = step => rate ? `${step} (${(step / rate).toFixed(2)} s)` : String(step);
+  lines.push(["step", `${at(cursor)} of ${demo.steps}`]);
+  lines.push([state.level, optionName(state, segment.option, segment.said), segment.said === "open" ? null : coloured(state.colours, segment.option)]);
+  lines.push(["", segment.said === "proposed" ? `proposed, probability ${(demo.heights[cursor] / 255).toFixed(2)}` : segment.said === "said" ? "said by you" : "left open"]);
+  lines.push(["steps", `${segment.start} to ${segment.stop - 1}`]);
+  if (boundary && !boundary.said && boundary.high > boundary.low) lines.push(["begins at", `${boundary.low} to ${boundary.high}`]);
+  for (const level of demo.upper) {
+    const option = level.segments[last(level.segments.map(one => one.start), cursor)].option;
+    lines.push([level.level, option ? level.names[option - 1] : "control", coloured(level.colours, option)]);
+  }
+  for (const [row, name] of (demo.numbers?.names ?? []).entries()) lines.push([name, demo.numbers.decoded.value(row, cursor).toPrecision(3)]);
+  root.replaceChildren(element("dl", {}, ...lines.flatMap(([name, value, colour]) => [element("dt", { textContent: name }), element("dd", {}, ...(colour ? [swatch(colour)] : []), value)])));
+}
+
+export function summary(root, { summary, demos }) {
+  const { expected_wrong: wrong, one_more: saved, labelled } = summary;
+  root.textContent = wrong === null ? `${labelled} of ${demos.length} accepted` : `Expected wrong steps now ${percent(wrong)}`
+    + (saved === null ? "" : `; one more demonstration saves ${(100 * saved).toFixed(1)}`);
+}
+
+export function alike(root, state, found, pictures, open) {
+  root.hidden = !found.length;
+  root.replaceChildren(element("h3", { textContent: "Alike elsewhere" }), element("div", { className: "bar" }, ...found.map(({ index, start, stop }) => {
+    const { name, strip } = state.demos[index], [, option, said] = strip[last(strip.map(one => one[0]), start)], middle = (start + stop) >> 1;
+    const button = element("button", { type: "button" }, ...(pictures ? [element("img", { src: `demo/${index}/picture/${middle}`, alt: "", height: 72 })] : []),
+      element("span", {}, swatch(coloured(state.colours, option)), `${name}, steps ${start} to ${stop - 1}, ${optionName(state, option, said)}`));
+    button.onclick = () => open(index, start);
+    return button;
+  })));
+}

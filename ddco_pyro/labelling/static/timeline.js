@@ -77,7 +77,7 @@ export class Timeline {
     if (!this.demo) return;
     if (!this.drag) this.root.style.cursor = this.near(event) === null ? "" : "ew-resize";
     else if (this.drag.boundary === null) this.calls.seek(this.step(event));
-    else this.hold({ boundary: this.drag.boundary, to: Math.max(1, Math.round(this.from + (event.clientX - this.root.getBoundingClientRect().left - GUTTER) / this.each)) });
+    else this.hold({ boundary: this.drag.boundary, to: Math.min(Math.max(1, Math.round(this.from + (event.clientX - this.root.getBoundingClientRect().left - GUTTER) / this.each)), this.demo.steps - 1) });
   }
   up() {
     const { drag, preview } = this;
