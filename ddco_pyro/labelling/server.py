@@ -11,7 +11,8 @@ import secrets
 import shutil
 import socket
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
@@ -86,9 +87,6 @@ class Served(Protocol):
     def choose(self, proposal: Any) -> None:
         """Answer the question which way to cut is meant."""
 
-    def granularity(self, name: str) -> None:
-        """Propose shorter or longer segments."""
-
     def save(self) -> str:
         """Write the labels; a line that says where."""
 
@@ -133,12 +131,9 @@ class Listening:
         return f"http://{LOOPBACK}:{self.port}/{self.token}/"
 
 
-def serve(session: Served, listening: Listening, ready: Callable[[], None] = lambda: None) -> str:
-    """Serve a session until an interrupt; then save it and close it.
-
-    :param ready: called when the page answers.
-    :returns: a line that says what was saved.
-    """
+@contextmanager
+def running(session: Served, listening: Listening) -> Iterator[Thread]:
+    """Serve a session in a thread while the context lasts."""
     settings = uvicorn.Config(
         application(session, listening.token, listening.port),
         log_config=None, log_level="critical", lifespan="off", ws="none", server_header=False,
@@ -148,26 +143,35 @@ def serve(session: Served, listening: Listening, ready: Callable[[], None] = lam
     thread = Thread(target=server.run, kwargs={"sockets": [listening.socket]}, name="server")
     thread.start()
     try:
-        ready()
-        thread.join()
-    except KeyboardInterrupt:
-        pass
+        yield thread
     finally:
         server.should_exit = True
         thread.join()
         listening.socket.close()
-        try:
-            saved = session.save() if session.state()["dirty"] else "nothing new to save"
-        finally:
-            session.close()
-    return saved
+
+
+def serve(session: Served, listening: Listening, ready: Callable[[], None] = lambda: None) -> str:
+    """Serve a session until an interrupt; then save it and close it.
+
+    :param ready: called when the page can be asked for.
+    :returns: a line that says what was saved.
+    """
+    try:
+        with suppress(KeyboardInterrupt), running(session, listening) as thread:
+            ready()
+            thread.join()
+        return session.save() if session.state()["dirty"] else "nothing new to save"
+    finally:
+        session.close()
 
 
 def application(session: Served, token: str, port: int) -> Starlette:
     """The web application of a session, for requests to ``127.0.0.1:port/token/``."""
     routes = [*_page(), *_answers(session)]
     guard = Middleware(Guard, token=token, hosts=frozenset(f"{host}:{port}" for host in (LOOPBACK, "localhost")))
-    return Starlette(routes=routes, middleware=[guard], exception_handlers={HTTPException: _refused, ValueError: _refused})
+    return Starlette(
+        routes=routes, middleware=[guard], exception_handlers={HTTPException: _refused, ValueError: _refused}
+    )
 
 
 class Guard:
@@ -265,7 +269,6 @@ def _answers(session: Served) -> list[Route]:
         "edit": session.edit,
         "refit": lambda asked: session.refit(),
         "choose": lambda asked: session.choose(asked.get("proposal")),
-        "granularity": lambda asked: session.granularity(asked.get("name")),
         "save": lambda asked: {"message": session.save()},
     }
     return [

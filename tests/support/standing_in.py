@@ -32,12 +32,12 @@ class StandIn:
         generator = np.random.default_rng(0)
         self.steps, self.levels, self.asks, self.revision, self.dirty = steps, levels, ask, 1, False
         self.names = ["reach", "grasp", "lift", "place"]
-        self.grain, self.refits, self.running = "medium", 0, 0
+        self.refits, self.running = 0, 0
         each = max(steps // 8, 1)
         self.proposed = [np.repeat(generator.permutation(np.arange(8) % 4 + 1), each + 1)[:steps] for _ in range(demos)]
         self.said = [np.full(steps, FREE) for _ in range(demos)]
         self.cuts: list[set[int]] = [set() for _ in range(demos)]
-        self.accepted, self.changed = [False] * demos, [0] * demos
+        self.accepted, self.changed = [False] * demos, set[int]()
         self.done: list[tuple[Any, ...]] = []
         self.undone: list[tuple[Any, ...]] = []
         angle = np.linspace(0, 2 * np.pi, steps)
@@ -92,7 +92,7 @@ class StandIn:
                 {
                     "name": f"demo_{demo}", "steps": self.steps, "accepted": self.accepted[demo],
                     "labelled": int((self.said[demo] > 0).sum()), "expected_wrong": self.wrong(demo),
-                    "changed": self.changed[demo], "held_out": demo == count - 1,
+                    "changed": demo in self.changed, "held_out": demo == count - 1,
                     "reason": f"{self.wrong(demo):.0%} expected wrong",
                     "strip": [[one["start"], one["option"], one["said"]] for one in self.segments(demo)],
                 }
@@ -107,7 +107,7 @@ class StandIn:
                 "running": bool(self.running), "progress": 1 - self.running / 3 if self.running else None,
                 "message": "epoch 3 of 10" if self.running else "", "done": self.refits, "error": None,
             },
-            "question": question, "granularity": self.grain, "warnings": [], "out": "labelled.hdf5",
+            "question": question, "warnings": [], "out": "labelled.hdf5",
             "dirty": self.dirty, "formats": ["csv", "elan"],
         }  # fmt: skip
 
@@ -115,6 +115,7 @@ class StandIn:
         """One demonstration, as it is shown."""
         if index >= len(self.said):
             raise BadInput(f"demonstration {index}: there are {len(self.said)}")
+        self.changed.discard(index)
         shown, said, numbers = self.segments(index), self.said[index], self.numbers[index]
         low, span = numbers.min(1), np.ptp(numbers, 1)
         steps = np.arange(self.steps)
@@ -150,7 +151,7 @@ class StandIn:
         others = [demo for demo in range(len(self.said)) if demo != index][:3]
         found = [next((one for one in self.segments(demo) if one["option"] == option), None) for demo in others]
         pairs = zip(others, found, strict=True)
-        return [{"index": demo, "start": one["start"], "stop": one["stop"]} for demo, one in pairs if one]
+        return [{"index": demo, **one} for demo, one in pairs if one]
 
     def picture(self, index: int, step: int) -> bytes:
         """No demonstration has pictures."""
@@ -177,8 +178,7 @@ class StandIn:
         self.revision += 1
         self.dirty = True
         changed = [other for other in range(len(self.said)) if other != demo][:2]
-        for other in changed:
-            self.changed[other] = self.revision
+        self.changed = set(changed)
         can = {"can_undo": bool(self.done), "can_redo": bool(self.undone)}
         return {"revision": self.revision, "demo": demo, "changed": changed, "summary": self.summary(), **can}
 
@@ -243,11 +243,7 @@ class StandIn:
         """Answer the question."""
         if not self.asks or proposal not in (0, 1, 2):
             raise BadInput(f"proposal {proposal!r}: there is none")
-        self.asks, self.revision = False, self.revision + 1
-
-    def granularity(self, name: str) -> None:
-        """Note the name."""
-        self.grain, self.revision = name, self.revision + 1
+        self.asks, self.answered, self.revision = False, proposal, self.revision + 1
 
     def save(self) -> str:
         """Write nothing."""

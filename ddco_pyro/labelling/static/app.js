@@ -5,9 +5,6 @@ import { Timeline } from "./timeline.js";
 
 const $ = id => document.getElementById(id), EVERY = 1000, ALIKE = 250;
 let state = null, demo = null, cursor = 0, playing = null, painting = null, moving = null, waiting = Promise.resolve(), asked = 0, silent = false;
-const shownAt = new Map();
-let known = 0;  // the revision when the page was opened: older changes are no news
-const seen = index => shownAt.get(index) ?? known;
 
 async function ask(path, body) {
   let answer, found;
@@ -46,7 +43,6 @@ const options = new Options($("options"), {
 });
 const question = new Question($("question"), {
   choose: proposal => tried(async () => { await ask("choose", { proposal }); await refresh(); $("timeline").focus(); }),
-  granularity: name => tried(async () => { await ask("granularity", { name }); await refresh(); }),
   demo: index => ask(`demo/${index}`),
 });
 
@@ -55,14 +51,13 @@ function render(keep = true) {
   $("title").textContent = state.title;
   summary($("summary"), state);
   status(state);
-  $("question").hidden = !state.question; $("work").hidden = Boolean(state.question);
+  $("question").hidden = !state.question; $("work").hidden = $("labels").hidden = Boolean(state.question);
   document.querySelector("[data-do=undo]").disabled = !state.can_undo;
   document.querySelector("[data-do=redo]").disabled = !state.can_redo;
   if ($("export").length !== state.formats.length + 1) $("export").replaceChildren(element("option", { value: "", textContent: "Export …" }), ...state.formats.map(name => element("option", { textContent: name })));
   if (state.question) { tried(() => question.show(state)); return; }
   if (!demo) return;
-  shownAt.set(demo.index, demo.revision);
-  list.show(state, demo.index, seen, keep);
+  list.show(state, demo.index, keep);
   options.show(state);
   const { name, accepted, held_out: held, reason } = state.demos[demo.index];
   $("name").textContent = name;
@@ -81,15 +76,14 @@ function status({ refit, warnings, dirty }) {
   if ($("warnings").textContent !== lines.join("")) $("warnings").replaceChildren(...lines.map(text => element("li", { textContent: text })));
   document.querySelector("[data-do=save]").textContent = dirty ? "Save •" : "Save";
 }
-async function refresh(index = demo?.index, step = cursor, keep = true) {  // what the server shows, whole: no answer is mixed with an older one
+async function refresh(index = demo?.index, step = undefined, keep = true) {  // what the server shows, whole: no answer is mixed with an older one
   const found = await ask("state");
   if (index === undefined && !found.question) [index, step] = whereTo(found);
   const one = index === undefined || found.question ? null : await ask(`demo/${index}`);
   if (state && found.revision < state.revision) return;
   if (state && state.refit.done < found.refit.done) say(`Refit ${found.refit.done} is done`);
-  known ||= found.revision;
   [state, silent] = [found, false];
-  if (one) { demo = one; cursor = step; }
+  if (one) { demo = one; cursor = step ?? cursor; }
   render(keep && list.active === index);
 }
 function whereTo(found) {
@@ -101,7 +95,7 @@ const open = (index, step = 0, keep = true) => tried(async () => { stop(); await
 // One edit after the other: each is in the journal when the server answers.
 const edit = (command, words) => waiting = waiting.then(() => tried(async () => {
   const before = demo.index, found = await ask("edit", command), there = ["undo", "redo"].includes(command.do) ? found.demo : before;
-  await refresh(there, there === before ? cursor : 0);
+  await refresh(there, there === before ? undefined : 0);
   say(`${words ?? { undo: "Undone", redo: "Done again", split: "Split", merge: "Merged", open: "Left open", move: "Moved", rename: "Renamed", new: "New option" }[command.do]} in ${state.demos[found.demo ?? before].name}${others(found.changed)}`);
   return true;
 }));
@@ -110,8 +104,9 @@ const everywhere = number => edit({ do: "everywhere", demo: demo.index, step: cu
 function drop({ boundary, to }) {
   return boundary === to ? timeline.hold(null) : edit({ do: "move", demo: demo.index, boundary, to }).then(done => { timeline.hold(null); if (done) seek(Math.min(to, demo.steps - 1)); });
 }
-async function accept() {
-  if (!await edit({ do: "accept", demo: demo.index }, "Accepted")) return;
+async function accept() {  // an accepted demonstration is taken back
+  const before = state.demos[demo.index].accepted;
+  if (!await edit({ do: "accept", demo: demo.index }, before ? "Taken back" : "Accepted") || before) return;
   const next = state.order.find(index => !state.demos[index].accepted);
   if (next === undefined) say("All demonstrations are accepted");
   else await open(next, 0, false);
@@ -128,8 +123,7 @@ function shove(steps) {  // the nearest boundary moves when the key is released
     if (nearest === undefined) { say("There is no boundary", true); return; }
     moving = { boundary: nearest, to: nearest };
   }
-  moving.to = Math.min(Math.max(moving.to + steps, 1), demo.steps - 1);
-  timeline.hold(moving);
+  moving = timeline.moved(moving.boundary, moving.to + steps);
   say(`Boundary ${moving.boundary} to step ${moving.to}`);
 }
 function release() {  // of what is held: a boundary that moves, or a number that paints
@@ -216,7 +210,11 @@ addEventListener("keydown", event => {
   if (event.defaultPrevented || $("help").open || !state) return;
   if (typed) { if (key === "Escape" && target !== $("find")) $("timeline").focus(); return; }
   const alone = !event.ctrlKey && !event.metaKey && !event.altKey, graphic = alone || event.getModifierState("AltGraph");
-  if (state.question) { const one = alone && state.question.proposals[digit - 1]; if (one) question.calls.choose(one.id); return; }
+  if (state.question) {
+    const one = alone && (key === "Enter" && target.matches("input") ? question.coloured : state.question.proposals[digit - 1]);
+    if (one) question.calls.choose(one.id);
+    return;
+  }
   if (!demo || (target.matches("button, a, summary") && (key === " " || key === "Enter"))) return;
   const bracket = graphic ? (key === "[" || code === "BracketLeft" && alone ? -1 : key === "]" || code === "BracketRight" && alone ? 1 : 0) : 0;
   if (bracket) shove(bracket * (shiftKey && alone ? 10 : 1));

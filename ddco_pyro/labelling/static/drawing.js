@@ -61,11 +61,13 @@ export function row(context, segments, { place, edge, top, height, colours, name
       context.fillRect(left, top, right - left, height);
       context.globalAlpha = 1;
       if (heights && said === "proposed") {
-        const each = place(1) - place(0), wide = Math.max(1, each);
-        for (let x = left; x < right - .01; x += wide) {
-          const step = Math.min(Math.max(start, Math.floor((x - place(0)) / each + .001)), stop - 1), share = heights[step] / 255;
-          context.fillRect(x, top + height * (1 - share), Math.min(wide, right - x) + .3, height * share);
+        const each = place(1) - place(0), wide = Math.max(1, each), bottom = top + height;
+        context.beginPath(); context.moveTo(left, bottom);
+        for (let x = Math.max(place(start), left - wide); x < right - .01; x += wide) {
+          const step = Math.min(Math.max(start, Math.floor((x - place(0)) / each + .001)), stop - 1), y = bottom - height * heights[step] / 255;
+          context.lineTo(Math.max(x, left), y); context.lineTo(Math.min(x + wide, right), y);
         }
+        context.lineTo(right, bottom); context.fill();
       }
     }
     if (right - left > 6) { context.fillStyle = looks.paper; context.fillRect(right - 1, top, 1, height); }

@@ -1,40 +1,39 @@
 // What stands beside the time line: the question, the list of demonstrations, options, the readout, and what is alike.
 import { Look, coloured, element, last, looks, percent, row, sharp, within } from "./drawing.js";
 
-const GRAINS = ["coarse", "medium", "fine"];
 const swatch = colour => { const made = element("span", { className: "swatch" }); made.style.background = colour; return made; };
 const seconds = (steps, rate) => rate ? `${steps} steps (${+(steps / rate).toPrecision(2)} s)` : `${steps} steps`;
 
 export const optionName = (state, option, said) => said === "open" ? "open" : option ? state.names[option - 1] ?? `option ${option}` : "control";
 
 export class Question {  // which of some ways to cut is meant, shown on three demonstrations
-  constructor(root, calls) {  // calls: choose(proposal), granularity(name), demo(index)
+  constructor(root, calls) {  // calls: choose(proposal), demo(index)
     Object.assign(this, { root, calls });
     this.looks = []; this.rows = [];
-    this.slider = element("input", { type: "range", id: "grain", min: 0, max: 2, step: 1 });
-    this.slider.onchange = () => calls.granularity(GRAINS[this.slider.value]);
+    this.slider = element("input", { type: "range", id: "grain", min: 0, step: 1 });
+    this.slider.oninput = () => this.colour(this.ranked[this.slider.value]);
     this.cards = element("div", { className: "cards" }); this.heads = element("div", { className: "three" });
     root.append(
       element("h2", { textContent: "Which of these ways to cut do you mean?" }),
-      element("p", { className: "note", textContent: "Three demonstrations, and what each way makes of them. Point at a row to see its steps. You can correct everything afterwards." }),
+      element("p", { className: "note", textContent: "Three demonstrations, and what each way makes of them. The slider goes from long segments to short ones; point at a row to see its steps. Everything can be corrected afterwards." }),
       element("label", { htmlFor: "grain", className: "grain" }, "Segments ", this.slider, this.grain = element("output")),
       this.heads, this.cards);
     addEventListener("resize", () => this.draw());
   }
   async show(state) {
-    const { question, granularity } = state, same = this.key === JSON.stringify(question);
+    const { question } = state, key = JSON.stringify(question);
     this.state = state;
-    this.slider.value = GRAINS.indexOf(granularity);
-    this.grain.textContent = granularity; this.slider.setAttribute("aria-valuetext", granularity);
-    if (same) return;
-    this.key = JSON.stringify(question); this.rows = [];
+    if (this.key === key) return;
+    this.key = key; this.rows = []; this.coloured = null;
+    this.ranked = [...question.proposals].sort((a, b) => b.median - a.median);  // coarse to fine
+    this.slider.max = this.ranked.length - 1;
     this.cards.replaceChildren(...question.proposals.map((proposal, place) => this.card(proposal, place)));
     this.draw();
     this.demos = await Promise.all(question.demos.map(this.calls.demo));
     this.heads.replaceChildren(...this.demos.map(demo => element("figure", {}, element("div"), element("figcaption", { textContent: demo.name }))));
     this.looks = [...this.heads.querySelectorAll("div")].map(box => new Look(box, 200, 130));
-    this.colour(question.proposals.find(one => one.name === granularity) ?? question.proposals[0]);
-    this.cards.querySelector("button")?.focus();
+    this.colour(question.proposals.find(one => one.name === "medium") ?? question.proposals[0]);
+    this.slider.focus();
   }
   card(proposal, place) {
     const count = proposal.demos.reduce((sum, one) => sum + one.length, 0) / proposal.demos.length, rate = this.state.frequency;
@@ -59,6 +58,9 @@ export class Question {  // which of some ways to cut is meant, shown on three d
   colour(proposal) {
     if (this.coloured === proposal || !this.looks.length) return;
     this.coloured = proposal;
+    this.slider.value = this.ranked.indexOf(proposal); this.slider.setAttribute("aria-valuetext", proposal.name);
+    this.grain.textContent = proposal.name;
+    [...this.cards.children].forEach((card, place) => card.classList.toggle("on", this.state.question.proposals[place] === proposal));
     this.looks.forEach((look, column) => look.show(this.demos[column], proposal.demos[column], proposal.colours));
   }
   draw() {
@@ -95,7 +97,7 @@ export class List {  // all demonstrations, the most informative first, each wit
     this.rows.forEach(({ row, name }) => { row.hidden = !name.textContent.toLowerCase().includes(words); });
     this.draw();
   }
-  show(state, active, seen, keep) {  // keep: the order stays until another demonstration is opened
+  show(state, active, keep) {  // keep: the order stays until another demonstration is opened
     if (!this.rows.length) this.rows = state.demos.map((demo, index) => {
       const [name, mark, reason, canvas] = [element("strong", { textContent: demo.name }), element("span", { className: "mark" }), element("small"), element("canvas")];
       const row = element("div", { id: `demo-${index}` }, name, mark, reason, canvas);
@@ -104,7 +106,7 @@ export class List {  // all demonstrations, the most informative first, each wit
     });
     if (!keep || !this.order.length) { this.order = state.order; this.root.replaceChildren(...state.order.map(index => this.rows[index].row)); }
     state.demos.forEach((demo, index) => {
-      const { row, mark, reason } = this.rows[index], changed = demo.changed > seen(index) && index !== active;
+      const { row, mark, reason } = this.rows[index], changed = demo.changed && index !== active;
       row.setAttribute("aria-selected", index === active);
       mark.textContent = [demo.accepted && "✓ accepted", changed && "● changed", demo.held_out && "held out"].filter(Boolean).join("  ");
       reason.textContent = demo.accepted ? `${demo.steps} steps` : demo.reason;
@@ -166,8 +168,8 @@ export function readout(root, state, demo, cursor) {
     const option = level.segments[last(level.segments.map(one => one.start), cursor)].option;
     lines.push([level.level, option ? level.names[option - 1] : "control", coloured(level.colours, option)]);
   }
-  for (const [row, name] of (demo.numbers?.names ?? []).entries()) lines.push([name, demo.numbers.decoded.value(row, cursor).toPrecision(3)]);
-  root.replaceChildren(element("dl", {}, ...lines.flatMap(([name, value, colour]) => [element("dt", { textContent: name }), element("dd", {}, ...(colour ? [swatch(colour)] : []), value)])));
+  const numbers = (demo.numbers?.names ?? []).map((name, row) => [name, demo.numbers.decoded.value(row, cursor).toPrecision(3)]);
+  root.replaceChildren(...[lines, numbers].map(of => element("dl", {}, ...of.flatMap(([name, value, colour]) => [element("dt", { textContent: name }), element("dd", {}, ...(colour ? [swatch(colour)] : []), value)]))));
 }
 
 export function summary(root, { summary, demos }) {
@@ -178,8 +180,8 @@ export function summary(root, { summary, demos }) {
 
 export function alike(root, state, found, pictures, open) {
   root.hidden = !found.length;
-  root.replaceChildren(element("h3", { textContent: "Alike elsewhere" }), element("div", { className: "bar" }, ...found.map(({ index, start, stop }) => {
-    const { name, strip } = state.demos[index], [, option, said] = strip[last(strip.map(one => one[0]), start)], middle = (start + stop) >> 1;
+  root.replaceChildren(element("h3", { textContent: "Alike elsewhere" }), element("div", { className: "bar" }, ...found.map(({ index, start, stop, option, said }) => {
+    const { name } = state.demos[index], middle = (start + stop) >> 1;
     const button = element("button", { type: "button" }, ...(pictures ? [element("img", { src: `demo/${index}/picture/${middle}`, alt: "", height: 72 })] : []),
       element("span", {}, swatch(coloured(state.colours, option)), `${name}, steps ${start} to ${stop - 1}, ${optionName(state, option, said)}`));
     button.onclick = () => open(index, start);

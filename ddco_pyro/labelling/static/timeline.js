@@ -10,7 +10,7 @@ export class Timeline {
     root.append(this.canvas, this.ghost, this.line);
     new ResizeObserver(() => this.redraw()).observe(root);
     root.addEventListener("pointerdown", event => this.down(event));
-    root.addEventListener("pointermove", event => this.moved(event));
+    root.addEventListener("pointermove", event => this.point(event));
     root.addEventListener("pointerup", () => this.up());
     root.addEventListener("pointercancel", () => { this.drag = null; this.hold(null); });
     root.addEventListener("dblclick", event => { if (event.offsetX >= GUTTER) calls.split(this.step(event)); });
@@ -50,6 +50,11 @@ export class Timeline {
     this.refresh();
   }
   hold(preview) { this.preview = preview; this.refresh(); }  // {boundary, to}, or {start, stop, option} while painting
+  moved(boundary, to) {  // a boundary stays between its neighbours
+    const after = this.demo.segments.findIndex(one => one.start === boundary), [{ start }, { stop }] = this.demo.segments.slice(after - 1);
+    this.hold({ boundary, to: Math.min(Math.max(to, start + 1), stop - 1) });
+    return this.preview;
+  }
   zoom(factor, centre = this.cursor) {
     const wide = Math.min(Math.max((this.to - this.from) * factor, LEAST), this.demo.steps), share = (centre + .5 - this.from) / (this.to - this.from);
     this.to = this.from + wide;
@@ -73,11 +78,11 @@ export class Timeline {
     this.drag = { boundary };
     if (boundary === null) this.calls.seek(this.step(event));
   }
-  moved(event) {
+  point(event) {
     if (!this.demo) return;
     if (!this.drag) this.root.style.cursor = this.near(event) === null ? "" : "ew-resize";
     else if (this.drag.boundary === null) this.calls.seek(this.step(event));
-    else this.hold({ boundary: this.drag.boundary, to: Math.min(Math.max(1, Math.round(this.from + (event.clientX - this.root.getBoundingClientRect().left - GUTTER) / this.each)), this.demo.steps - 1) });
+    else this.moved(this.drag.boundary, Math.round(this.from + (event.clientX - this.root.getBoundingClientRect().left - GUTTER) / this.each));
   }
   up() {
     const { drag, preview } = this;

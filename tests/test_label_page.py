@@ -1,0 +1,357 @@
+"""The page of ``label`` in a browser: what keys and the mouse do, and what a person sees of it."""
+
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from standing_in import OPEN, StandIn
+
+from ddco_pyro.labelling.server import Listening, running
+
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+
+CHROMIUM = Path("/usr/bin/chromium")
+pytestmark = pytest.mark.skipif(not CHROMIUM.exists(), reason="there is no /usr/bin/chromium")
+
+GUTTER = 108
+SOON = 5000
+"""Milliseconds that the page has for what is expected."""
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with playwright.sync_playwright() as started:
+        browser = started.chromium.launch(executable_path=str(CHROMIUM), args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@contextmanager
+def served(session):
+    """The address of a session that is served."""
+    listening = Listening.at()
+    with running(session, listening):
+        yield listening.address
+
+
+@pytest.fixture
+def tabs(browser):
+    """Opens an address in a tab; whatever a tab complains of fails the test."""
+    context, complaints = browser.new_context(viewport={"width": 1200, "height": 850}), []
+    context.set_default_timeout(SOON)
+
+    def opened(address):
+        tab = context.new_page()
+        tab.on("pageerror", lambda error: complaints.append(str(error)))
+        tab.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
+        tab.on(
+            "request",
+            lambda asked: (
+                complaints.append(asked.url) if not asked.url.startswith((address, "data:", "blob:")) else None
+            ),
+        )
+        tab.goto(address)
+        return tab
+
+    yield opened
+    context.close()
+    refused = [text for text in complaints if "400" not in text]  # a command that is refused is shown to the person
+    assert not refused
+
+
+@pytest.fixture
+def session():
+    return StandIn(ask=False)
+
+
+@pytest.fixture
+def tab(tabs, session):
+    with served(session) as address:
+        tab = tabs(address)
+        tab.get_by_role("slider", name="Step").focus()
+        yield tab
+
+
+def said(tab, text):
+    """Wait until the page says a text."""
+    playwright.expect(tab.get_by_role("status")).to_contain_text(text, timeout=SOON)
+
+
+def keys(tab, *pressed):
+    for key in pressed:
+        tab.keyboard.press(key)
+
+
+def at(tab):
+    return int(tab.get_by_role("slider", name="Step").get_attribute("aria-valuenow"))
+
+
+def point(tab, step, steps, below=60):
+    """Where a step is on the time line; `below` its top is the labelled level."""
+    box = tab.locator("#timeline").bounding_box()
+    return box["x"] + GUTTER + step * (box["width"] - GUTTER) / steps, box["y"] + below
+
+
+def starts(session, demo):
+    return [one["start"] for one in session.segments(demo)]
+
+
+def test_the_question_comes_first_and_its_answer_is_what_is_shown(tabs):
+    session = StandIn()
+    with served(session) as address:
+        tab = tabs(address)
+        playwright.expect(tab.get_by_role("heading", name="Which of these ways")).to_be_visible()
+        assert tab.locator("#question canvas[role=img]").count() == 9
+        slider = tab.get_by_role("slider")
+        playwright.expect(slider).to_be_focused()
+        assert slider.get_attribute("aria-valuetext") == "medium"
+        keys(tab, "ArrowRight")
+        assert slider.get_attribute("aria-valuetext") == "fine"
+        assert session.asks
+        keys(tab, "Enter")
+        playwright.expect(tab.get_by_role("option")).to_have_count(6)
+        assert (session.asks, session.answered) == (False, 2)
+
+
+def test_each_key_does_what_the_list_says(tab, session):
+    demo = session.state()["order"][0]
+    first = starts(session, demo)
+    keys(tab, "ArrowRight", "ArrowRight", "Shift+ArrowRight", "ArrowLeft")
+    assert at(tab) == 11
+    keys(tab, "Home", "j")
+    assert at(tab) == first[1]
+    keys(tab, "j", "k")
+    assert at(tab) == first[1]
+    keys(tab, "ArrowRight", "ArrowRight", "s")
+    said(tab, "Split in")
+    assert starts(session, demo)[2] == first[1] + 2
+    keys(tab, "3")
+    said(tab, "lift in")
+    assert set(session.said[demo][first[1] + 2 : first[2]]) == {3}
+    assert (session.said[demo][: first[1] + 2] == -1).all()
+    keys(tab, "m")
+    said(tab, "Merged")
+    keys(tab, "0")
+    said(tab, "Left open")
+    assert (session.said[demo] == OPEN).any()
+    keys(tab, "u", "Control+z")
+    playwright.expect(tab.get_by_role("button", name="Redo")).to_be_enabled()
+    said(tab, "Undone")
+    keys(tab, "Control+z", "u")
+    playwright.expect(tab.get_by_role("button", name="Undo")).to_be_disabled()
+    assert starts(session, demo) == first
+    keys(tab, "Shift+U", "Control+Shift+Z", "Shift+U")
+    said(tab, "Done again")
+    keys(tab, "Shift+Digit2")
+    said(tab, "grasp everywhere")
+    keys(tab, "9")
+    said(tab, "There are 4 options")
+    keys(tab, "?")
+    playwright.expect(tab.get_by_role("dialog")).to_be_visible()
+    keys(tab, "Escape", "/")
+    tab.keyboard.type("demo_4")
+    playwright.expect(tab.get_by_role("option")).to_have_count(1)
+    keys(tab, "Enter")
+    playwright.expect(tab.get_by_role("heading", name="demo_4")).to_be_visible()
+    keys(tab, "g")
+    said(tab, "Boundary 1 of the 6 most uncertain")
+
+
+def test_brackets_move_the_nearest_boundary_once_they_are_released(tab, session):
+    demo = session.state()["order"][0]
+    first = starts(session, demo)
+    keys(tab, "j")
+    tab.keyboard.down("]")
+    tab.keyboard.down("]")
+    tab.keyboard.down("]")
+    said(tab, f"to step {first[1] + 3}")
+    assert session.revision == 1
+    tab.keyboard.up("]")
+    said(tab, "Moved in")
+    assert starts(session, demo)[1] == first[1] + 3
+    assert at(tab) == first[1] + 3
+    keys(tab, "Shift+BracketLeft")
+    said(tab, "Moved in")
+    keys(tab, "Control+z", "Control+z")
+    playwright.expect(tab.get_by_role("button", name="Undo")).to_be_disabled()
+    assert starts(session, demo) == first
+
+
+def test_a_number_that_is_held_while_playing_paints(tab, session):
+    demo = session.state()["order"][0]
+    keys(tab, " ")
+    tab.wait_for_function("Number(document.getElementById('timeline').getAttribute('aria-valuenow')) > 3")
+    tab.keyboard.down("2")
+    begin = at(tab)
+    tab.wait_for_function(f"Number(document.getElementById('timeline').getAttribute('aria-valuenow')) > {begin + 8}")
+    tab.keyboard.up("2")
+    said(tab, "grasp from step")
+    keys(tab, " ")
+    painted = (session.said[demo] == 2).nonzero()[0]
+    assert painted[0] in (begin, begin + 1)
+    assert len(painted) == painted[-1] - painted[0] + 1 >= 8
+    assert painted[-1] < at(tab) + 1
+    assert (session.said[demo] > 0).sum() == len(painted)
+
+
+def test_the_mouse_does_it_too(tab, session):
+    demo = session.state()["order"][0]
+    first = starts(session, demo)
+    tab.mouse.click(*point(tab, 40.5, 120))
+    assert at(tab) == 40
+    tab.mouse.move(*point(tab, first[2], 120))
+    tab.mouse.down()
+    tab.mouse.move(*point(tab, first[2] + 4.2, 120), steps=4)
+    tab.mouse.up()
+    said(tab, "Moved in")
+    assert starts(session, demo)[2] == first[2] + 4
+    tab.mouse.dblclick(*point(tab, 7.5, 120))
+    said(tab, "Split in")
+    assert starts(session, demo)[1] == 7
+    tab.mouse.click(*point(tab, 9.5, 120), button="right")
+    tab.get_by_role("menuitem", name="place").click()
+    said(tab, "place in")
+    assert set(session.said[demo][7 : first[1]]) == {4}
+    tab.get_by_role("option", name="demo_0").click()
+    playwright.expect(tab.get_by_role("heading", name="demo_0")).to_be_visible()
+    tab.get_by_role("button", name="Accept").click()
+    said(tab, "Accepted in demo_0")
+    assert session.accepted[0]
+    tab.get_by_label("Alike elsewhere").get_by_role("button").first.click()
+    with tab.expect_download() as sent:
+        tab.get_by_label("Export as").select_option("csv")
+    assert Path(sent.value.path()).read_text() == "6 demonstrations\n"
+
+
+def test_an_undo_goes_to_the_demonstration_that_it_changes(tab, session):
+    first = session.state()["order"][0]
+    keys(tab, "2", "Enter")
+    said(tab, "Accepted")
+    playwright.expect(tab.get_by_role("heading", level=2)).not_to_have_text(f"demo_{first}")
+    keys(tab, "u")
+    playwright.expect(tab.get_by_role("heading", level=2)).to_have_text(f"demo_{first}")
+    said(tab, f"Undone in demo_{first}")
+    assert not session.accepted[first]
+
+
+def test_the_keyboard_alone_does_everything(tabs):
+    session = StandIn()
+    with served(session) as address:
+        tab = tabs(address)
+        playwright.expect(tab.get_by_role("slider")).to_be_focused()
+        keys(tab, "1")
+        playwright.expect(tab.get_by_role("slider", name="Step")).to_be_focused()
+
+        def reached(what):
+            for _ in range(40):
+                if what.evaluate("one => one === document.activeElement"):
+                    return
+                tab.keyboard.press("Shift+Tab")
+            raise AssertionError("Tab does not lead there")
+
+        reached(tab.get_by_label("Name of option 2"))
+        keys(tab, "Control+a")
+        tab.keyboard.type("squeeze")
+        keys(tab, "Enter")
+        said(tab, "Renamed")
+        assert session.names[1] == "squeeze"
+        keys(tab, "Escape")
+        reached(tab.get_by_label("Name of a new option"))
+        tab.keyboard.type("wait 1")
+        keys(tab, "Enter")
+        said(tab, "New option")
+        keys(tab, "Escape", "5")
+        said(tab, "wait 1 in")
+        assert (session.said[session.state()["order"][0]] != 1).all()
+        keys(tab, "Shift+F10", "ArrowDown", "Enter")
+        said(tab, "squeeze in")
+        reached(tab.get_by_role("listbox"))
+        before = tab.get_by_role("heading", level=2).text_content()
+        keys(tab, "ArrowDown")
+        playwright.expect(tab.get_by_role("heading", level=2)).not_to_have_text(before)
+        reached(tab.get_by_role("button", name="Save"))
+        keys(tab, "Enter")
+        said(tab, "are in labelled.hdf5")
+        assert not session.dirty
+        assert not any(session.accepted)
+
+
+def test_two_tabs_agree_and_a_reload_loses_nothing(tab, tabs, session):
+    other = tabs(tab.url.partition("#")[0])
+    demo = session.state()["order"][0]
+    keys(tab, "j", "ArrowRight", "s")
+    said(tab, "Split in")
+    other.wait_for_function(
+        f"document.querySelector('#timeline').getAttribute('aria-valuemax') && !document.querySelector('[data-do=undo]').disabled"
+    )
+    other.get_by_role("slider", name="Step").focus()
+    keys(other, "u")
+    said(other, "Undone")
+    playwright.expect(tab.get_by_role("button", name="Undo")).to_be_disabled()
+    tab.wait_for_function("/^#\\d+\\/\\d+$/.test(location.hash)")
+    step = at(tab)
+    tab.reload()
+    playwright.expect(tab.get_by_role("heading", level=2)).to_have_text(f"demo_{demo}")
+    assert at(tab) == step
+    playwright.expect(tab.get_by_text("● changed").first).to_be_visible()
+
+
+def test_a_refit_is_shown_while_it_runs_and_said_when_it_is_done(tab, session):
+    tab.get_by_role("button", name="Refit").click()
+    playwright.expect(tab.get_by_role("progressbar")).to_be_visible()
+    playwright.expect(tab.get_by_role("button", name="Refit")).to_be_disabled()
+    said(tab, "Refit 1 is done")
+    playwright.expect(tab.get_by_role("progressbar")).to_be_hidden()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_axe_has_no_serious_complaint(browser, scheme):
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe-playwright-python is not installed")
+    session = StandIn()
+    session.accepted[1] = True
+    session.running = 100
+    context = browser.new_context(color_scheme=scheme, bypass_csp=True)
+    with served(session) as address:
+        tab = context.new_page()
+        tab.goto(address)
+        playwright.expect(tab.get_by_role("slider")).to_be_focused()
+
+        def complaints():
+            found = axe.Axe().run(tab).response["violations"]
+            return [(one["id"], one["nodes"][0]["html"]) for one in found if one["impact"] in ("serious", "critical")]
+
+        assert complaints() == []
+        keys(tab, "2")
+        playwright.expect(tab.get_by_role("slider", name="Step")).to_be_focused()
+        keys(tab, "0", "9")
+        said(tab, "There are 4 options")
+        assert complaints() == []
+        keys(tab, "?")
+        assert complaints() == []
+        keys(tab, "Escape", "Shift+F10")
+        assert complaints() == []
+    context.close()
+
+
+FRAMES = """async work => {
+  const times = [];
+  let going = true;
+  const turn = now => { times.push(now); work === "scroll" && document.getElementById("list").scrollBy(0, 40); if (going) requestAnimationFrame(turn); };
+  requestAnimationFrame(turn);
+  await new Promise(done => setTimeout(done, 1500));
+  going = false;
+  return (times.length - 1) / (times.at(-1) - times[0]) * 1000;
+}"""
+
+
+def test_two_hundred_demonstrations_of_two_thousand_steps_stay_smooth(tabs):
+    with served(StandIn(200, 2000, 3, ask=False)) as address:
+        tab = tabs(address)
+        tab.get_by_role("slider", name="Step").focus()
+        assert tab.get_by_role("option").count() == 200
+        assert tab.evaluate(FRAMES, "scroll") >= 30
+        tab.get_by_label("Speed").select_option("4")
+        tab.get_by_role("slider", name="Step").focus()
+        keys(tab, "+", "+", "+", "+", " ")
+        assert tab.evaluate(FRAMES, "play") >= 30
+        assert at(tab) > 80
