@@ -1,5 +1,6 @@
 """The page of ``label`` in a browser: what keys and the mouse do, and what a person sees of it."""
 
+import time
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -55,8 +56,8 @@ def tabs(browser):
 
     yield opened
     context.close()
-    refused = [text for text in complaints if "400" not in text]  # a command that is refused is shown to the person
-    assert not refused
+    expected = ("400", "ERR_CONNECTION_REFUSED")  # a command is refused, and says so; the server ends before its tabs
+    assert not [text for text in complaints if not any(part in text for part in expected)]
 
 
 @pytest.fixture
@@ -80,6 +81,19 @@ def said(tab, text):
 def keys(tab, *pressed):
     for key in pressed:
         tab.keyboard.press(key)
+
+
+def items(tab, name=None):
+    """The demonstrations in the list."""
+    return tab.get_by_role("listbox").get_by_role("option", name=name)
+
+
+def until(holds):
+    """Wait until something holds."""
+    end = time.monotonic() + SOON / 1000
+    while not holds():
+        assert time.monotonic() < end
+        time.sleep(0.02)
 
 
 def at(tab):
@@ -109,7 +123,7 @@ def test_the_question_comes_first_and_its_answer_is_what_is_shown(tabs):
         assert slider.get_attribute("aria-valuetext") == "fine"
         assert session.asks
         keys(tab, "Enter")
-        playwright.expect(tab.get_by_role("option")).to_have_count(6)
+        playwright.expect(items(tab)).to_have_count(6)
         assert (session.asks, session.answered) == (False, 2)
 
 
@@ -150,7 +164,7 @@ def test_each_key_does_what_the_list_says(tab, session):
     playwright.expect(tab.get_by_role("dialog")).to_be_visible()
     keys(tab, "Escape", "/")
     tab.keyboard.type("demo_4")
-    playwright.expect(tab.get_by_role("option")).to_have_count(1)
+    playwright.expect(items(tab)).to_have_count(1)
     keys(tab, "Enter")
     playwright.expect(tab.get_by_role("heading", name="demo_4")).to_be_visible()
     keys(tab, "g")
@@ -180,15 +194,16 @@ def test_brackets_move_the_nearest_boundary_once_they_are_released(tab, session)
 def test_a_number_that_is_held_while_playing_paints(tab, session):
     demo = session.state()["order"][0]
     keys(tab, " ")
-    tab.wait_for_function("Number(document.getElementById('timeline').getAttribute('aria-valuenow')) > 3")
+    until(lambda: at(tab) > 3)
+    before = at(tab)
     tab.keyboard.down("2")
     begin = at(tab)
-    tab.wait_for_function(f"Number(document.getElementById('timeline').getAttribute('aria-valuenow')) > {begin + 8}")
+    until(lambda: at(tab) > begin + 8)
     tab.keyboard.up("2")
     said(tab, "grasp from step")
     keys(tab, " ")
     painted = (session.said[demo] == 2).nonzero()[0]
-    assert painted[0] in (begin, begin + 1)
+    assert before <= painted[0] <= begin + 1
     assert len(painted) == painted[-1] - painted[0] + 1 >= 8
     assert painted[-1] < at(tab) + 1
     assert (session.said[demo] > 0).sum() == len(painted)
@@ -212,7 +227,7 @@ def test_the_mouse_does_it_too(tab, session):
     tab.get_by_role("menuitem", name="place").click()
     said(tab, "place in")
     assert set(session.said[demo][7 : first[1]]) == {4}
-    tab.get_by_role("option", name="demo_0").click()
+    items(tab, "demo_0").click()
     playwright.expect(tab.get_by_role("heading", name="demo_0")).to_be_visible()
     tab.get_by_role("button", name="Accept").click()
     said(tab, "Accepted in demo_0")
@@ -281,15 +296,13 @@ def test_two_tabs_agree_and_a_reload_loses_nothing(tab, tabs, session):
     demo = session.state()["order"][0]
     keys(tab, "j", "ArrowRight", "s")
     said(tab, "Split in")
-    other.wait_for_function(
-        f"document.querySelector('#timeline').getAttribute('aria-valuemax') && !document.querySelector('[data-do=undo]').disabled"
-    )
+    playwright.expect(other.get_by_role("button", name="Undo")).to_be_enabled()
     other.get_by_role("slider", name="Step").focus()
     keys(other, "u")
     said(other, "Undone")
     playwright.expect(tab.get_by_role("button", name="Undo")).to_be_disabled()
-    tab.wait_for_function("/^#\\d+\\/\\d+$/.test(location.hash)")
     step = at(tab)
+    until(lambda: tab.url.endswith(f"#{demo}/{step}"))
     tab.reload()
     playwright.expect(tab.get_by_role("heading", level=2)).to_have_text(f"demo_{demo}")
     assert at(tab) == step
@@ -304,7 +317,7 @@ def test_a_refit_is_shown_while_it_runs_and_said_when_it_is_done(tab, session):
     playwright.expect(tab.get_by_role("progressbar")).to_be_hidden()
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.slow)])
 def test_axe_has_no_serious_complaint(browser, scheme):
     axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe-playwright-python is not installed")
     session = StandIn()
@@ -323,7 +336,9 @@ def test_axe_has_no_serious_complaint(browser, scheme):
         assert complaints() == []
         keys(tab, "2")
         playwright.expect(tab.get_by_role("slider", name="Step")).to_be_focused()
-        keys(tab, "0", "9")
+        keys(tab, "0")
+        said(tab, "Left open")
+        keys(tab, "9")
         said(tab, "There are 4 options")
         assert complaints() == []
         keys(tab, "?")
@@ -336,7 +351,11 @@ def test_axe_has_no_serious_complaint(browser, scheme):
 FRAMES = """async work => {
   const times = [];
   let going = true;
-  const turn = now => { times.push(now); work === "scroll" && document.getElementById("list").scrollBy(0, 40); if (going) requestAnimationFrame(turn); };
+  const turn = now => {
+    times.push(now);
+    if (work === "scroll") document.getElementById("list").scrollBy(0, 40);
+    if (going) requestAnimationFrame(turn);
+  };
   requestAnimationFrame(turn);
   await new Promise(done => setTimeout(done, 1500));
   going = false;
@@ -348,7 +367,7 @@ def test_two_hundred_demonstrations_of_two_thousand_steps_stay_smooth(tabs):
     with served(StandIn(200, 2000, 3, ask=False)) as address:
         tab = tabs(address)
         tab.get_by_role("slider", name="Step").focus()
-        assert tab.get_by_role("option").count() == 200
+        assert items(tab).count() == 200
         assert tab.evaluate(FRAMES, "scroll") >= 30
         tab.get_by_label("Speed").select_option("4")
         tab.get_by_role("slider", name="Step").focus()
