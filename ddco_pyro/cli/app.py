@@ -20,7 +20,7 @@ from typing import Annotated, Any
 
 import typer
 
-from ddco_pyro.cli import NARROW, demos, fits, runs, starting, study
+from ddco_pyro.cli import NARROW, demos, fits, label, runs, starting, study
 from ddco_pyro.errors import BadInput, Failed, reason
 
 app = typer.Typer(
@@ -47,6 +47,7 @@ EXAMPLES: dict[Callable[..., None], str] = {
     demos.import_: "import pusht --out demos.hdf5",
     demos.encode: "encode demos.hdf5 --observation camera --encoder random_conv --out encoded.hdf5",
     runs.segment: "segment runs/mine mine.hdf5 --html segments.html",
+    label.label: "label runs/mine mine.hdf5 --out labelled.hdf5",
     runs.export: "export runs/mine --out controller --onnx",
     study.study: "study run studies/mine.yaml --jobs 2",
 }

@@ -313,7 +313,7 @@ def segment(
         beside = baseline_labels(fit) if baselines else ()
         beside += tuple(f"{level}_{name}" for level in fit.names for name in others)
         asked = Asked(fit, run, demos, source, level or next(iter(fit.names), ""), beside)
-        writers = [_writer(place, asked, settings) for place in places]
+        writers = [writer_of(place, asked, settings) for place in places]
         if fit.names:  # without options, segments() refuses the run
             for writer in writers:
                 writer.check()
@@ -338,7 +338,12 @@ def segment(
             print(writer.write(segmented))
 
 
-def _writer(place: Output, asked: Asked, settings: Mapping[str, Any]) -> Writer:
+def writer_of(place: Output, asked: Asked, settings: Mapping[str, Any]) -> Writer:
+    """What writes a format's file or folder.
+
+    :param settings: the formats' further options by name.
+    :raises BadInput: a package that the format needs is missing.
+    """
     (form,) = (form for form in FORMATS if form.option == place.option.replace("--in-place", "--out"))
     try:
         kind = resolve_name(f"ddco_pyro.segmenting.formats.{form.writer}")

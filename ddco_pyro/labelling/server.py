@@ -237,12 +237,17 @@ def _answers(session: Served) -> list[Route]:
 
     def exported(request: Request) -> Response:
         folder = Path(tempfile.mkdtemp(prefix="ddco-pyro-"))
-        removed = BackgroundTask(shutil.rmtree, folder)
+
+        def remove() -> None:
+            shutil.rmtree(folder)
+
         try:
             path = session.export(request.path_params["format"], folder)
-            return FileResponse(path, filename=path.name, background=removed)
+            if path.is_dir():
+                path = Path(shutil.make_archive(str(path), "zip", path))
+            return FileResponse(path, filename=path.name, background=BackgroundTask(remove))
         except BaseException:
-            removed.func(folder)
+            remove()
             raise
 
     def route(path: str, call: Callable[..., Any], method: str) -> Route:

@@ -1,0 +1,108 @@
+"""``label``: a page on which a person corrects segments."""
+
+from __future__ import annotations
+
+import webbrowser
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ddco_pyro.cli import AllowCode, Level, demos, fits, going_on, out_file, runs, written
+from ddco_pyro.data.files import Output, check_outputs
+from ddco_pyro.errors import BadInput
+
+if TYPE_CHECKING:
+    from ddco_pyro.fitting.fitted import Fit
+    from ddco_pyro.labelling.session import Exporter
+    from ddco_pyro.segmenting import Segmented
+
+SUFFIXES = {"--rabc": ".parquet", "--mimicgen": ".hdf5", "--isaac": ".hdf5"}
+"""Of the files of formats whose name says none."""
+
+
+def label(
+    paths: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="[RUN] DEMOS", help="A run with options, and an HDF5 file. Without a run, one is fitted first."
+        ),
+    ],
+    out: Annotated[
+        Path | None, written(out_file, "The copy of DEMOS that gets the labels; by default DEMOS_labels.hdf5, here.")
+    ] = None,
+    in_place: Annotated[bool, typer.Option("--in-place", help="Write the labels into DEMOS itself.")] = False,
+    level: Level = None,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page; 0 is any that is free.")] = 0,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")] = True,
+    allow_code: AllowCode = False,
+) -> None:
+    """Correct segments on a page of this machine; what you say is used for all other demonstrations at once.
+
+    Labels go into labels/LEVEL, -1 where you said nothing. Ctrl-C saves them. The same command goes on with them.
+    """
+    if len(paths) > 2:
+        raise BadInput("label: name a run and a file of demonstrations, or the file alone")
+    if out is not None and in_place:
+        raise BadInput("--out and --in-place exclude each other; keep one")
+    file = paths[-1]
+    place = file if in_place else out or Path(f"{file.stem}_labels.hdf5")
+    check_outputs([Output("--in-place" if in_place else "--out", place, "file")], [] if in_place else [file])
+    try:
+        from ddco_pyro.labelling.server import Listening, serve
+    except ModuleNotFoundError as error:
+        raise BadInput(f"label needs {error.name}; install it with: pip install 'ddco-pyro[label]'") from None
+    from ddco_pyro.fitting.fitted import load
+    from ddco_pyro.jobs import processes
+    from ddco_pyro.labelling.session import Session
+
+    run = paths[0] if len(paths) == 2 else _fitted(file)
+    with ExitStack() as stack:
+        stack.enter_context(processes(1))
+        listening = Listening.at(port)
+        session = Session(load(run, allow_code), file, place, level, _exporters(run, file))
+        session.journal.at(listening.address)
+        session.ask()
+
+        def ready() -> None:
+            print(f"{listening.address}\nCtrl-C saves the labels and ends", flush=True)
+            if browser:
+                webbrowser.open(listening.address)
+
+        print(serve(session, listening, ready))
+
+
+def _fitted(file: Path) -> Path:
+    """A run fitted to the file, without baselines; that of before where there is one."""
+    folder = Path("runs") / file.stem
+    spec, run = folder / "spec.yaml", folder / "run"
+    if not (run / "metrics.json").exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        with going_on():
+            if not spec.exists():
+                demos.init(file, spec)
+            fits.fit(spec, run, overrides=["compare_with=[]"], resume=True)
+    return run
+
+
+def _exporters(run: Path, file: Path) -> dict[str, Exporter]:
+    """What writes each format, but the copy with labels, which is saved anyway."""
+    return {form.option[2:]: partial(_export, form, run, file) for form in runs.FORMATS if form.option != "--out"}
+
+
+def _export(form: runs.Format, run: Path, file: Path, segmented: Segmented, fit: Fit, folder: Path, level: str) -> Path:
+    from ddco_pyro.data.sources import open_source
+    from ddco_pyro.segmenting.formats import Asked
+
+    name = form.option[2:]
+    suffix = "" if form.kind == "folder" else SUFFIXES.get(form.option, f".{name}")
+    place = Output(form.option, folder / f"segments{suffix}", form.kind)
+    with open_source(file) as source:
+        writer = runs.writer_of(
+            place, Asked(fit, run, file, source, level), {one.name: one.default for one in form.more}
+        )
+        writer.check()
+        writer.write(segmented)
+    return place.path
