@@ -45,7 +45,8 @@ ALIKE = 0.9
 NEAREST = 5
 """Segments elsewhere that are shown for one."""
 
-PICTURE_HEIGHT = 240
+PICTURE_HEIGHT, LONGEST = 240, 80
+"""Rows of a picture, and characters of a name."""
 
 UNCERTAIN = 20
 """Boundaries that are named as the most uncertain ones."""
@@ -484,10 +485,11 @@ class Session:
         return option
 
     def _text(self, command: Mapping[str, Any]) -> str:
-        name = command.get("text")
-        if not isinstance(name, str) or not name.strip() or name.strip() in self.document.names:
-            raise BadInput("a name is a text that no other option has")
-        return name.strip()
+        text = command.get("text")
+        name = text.strip() if isinstance(text, str) else ""
+        if not name or len(name) > LONGEST or not name.isprintable() or name in ("control", *self.document.names):
+            raise BadInput(f"a name is one line of at most {LONGEST} characters that no other option has")
+        return name
 
     def _name_options(self) -> None:
         """Give the run the names, where it has as many options."""
