@@ -1,5 +1,5 @@
 // The page: what the server says, what a person does, and the keys.
-import { Look, element, onScheme, within } from "./drawing.js";
+import { Look, element, onScheme, percent, within } from "./drawing.js";
 import { List, Options, Question, alike, optionName, readout, summary } from "./panels.js";
 import { Timeline } from "./timeline.js";
 
@@ -18,6 +18,7 @@ async function ask(path, body) {
 const say = (text, bad = false) => { $("said").textContent = text; $("said").classList.toggle("bad", bad); };
 const tried = async work => { try { return await work(); } catch (error) { say(error.message, true); return null; } };
 const option = number => optionName(state, number);
+const change = ({ expected_wrong: before }, { expected_wrong: after }) => before === null || after === null ? "" : `: expected wrong steps ${percent(before)} before, ${percent(after)} now`;
 const others = indices => indices.length ? `; ${indices.length} other${indices.length > 1 ? "s" : ""} changed` : "";
 
 const seek = step => {
@@ -35,7 +36,7 @@ async function neighbours() {
   history.replaceState(null, "", `#${index}/${cursor}`);
 }
 
-const timeline = new Timeline($("timeline"), { seek, split: step => edit({ do: "split", demo: demo.index, step }), drop, menu });
+const timeline = new Timeline($("timeline"), { seek, split: step => edit({ do: "split", demo: demo.index, step }), drop, menu: (x, y) => menu(x, y) });
 const look = new Look($("look"), 280, 190);
 const list = new List($("list"), $("find"), $("count"), index => open(index));
 const options = new Options($("options"), {
@@ -54,7 +55,6 @@ function render(keep = true) {
   $("question").hidden = !state.question; $("work").hidden = $("labels").hidden = Boolean(state.question);
   document.querySelector("[data-do=undo]").disabled = !state.can_undo;
   document.querySelector("[data-do=redo]").disabled = !state.can_redo;
-  if ($("export").length !== state.formats.length + 1) $("export").replaceChildren(element("option", { value: "", textContent: "Export …" }), ...state.formats.map(name => element("option", { textContent: name })));
   if (state.question) { tried(() => question.show(state)); return; }
   if (!demo) return;
   list.show(state, demo.index, keep);
@@ -81,7 +81,7 @@ async function refresh(index = demo?.index, step = undefined, keep = true) {  //
   if (index === undefined && !found.question) [index, step] = whereTo(found);
   const one = index === undefined || found.question ? null : await ask(`demo/${index}`);
   if (state && found.revision < state.revision) return;
-  if (state && state.refit.done < found.refit.done) say(`Refit ${found.refit.done} is done`);
+  if (state && state.refit.done < found.refit.done) say(`Refit ${found.refit.done} is done${change(state.summary, found.summary)}`);
   [state, silent] = [found, false];
   if (one) { demo = one; cursor = step ?? cursor; }
   render(keep && list.active === index);
@@ -158,15 +158,18 @@ function stop() {
   release(); seek(cursor);
 }
 
-function menu(x, y) {
+function popup(x, y, name, items) {  // a menu of [text, work]
   const box = $("menu"), close = () => { box.hidden = true; $("timeline").focus(); };
-  const item = (text, work) => { const made = element("button", { type: "button", role: "menuitem", textContent: text, tabIndex: -1, onclick: () => { close(); work(); } }); made.setAttribute("role", "menuitem"); return made; };
-  box.replaceChildren(...state.names.map((name, n) => item(`${n + 1}  ${name}`, () => act(n + 1))), item("New option …", () => options.added.focus()),
-    ...["split", "merge", "open", "accept"].map(name => item({ split: "Split here  S", merge: "Merge with the next  M", open: "Leave open  0", accept: "Accept all  Enter" }[name], commands[name])));
+  box.setAttribute("aria-label", name);
+  box.replaceChildren(...items.map(([text, work]) => {
+    const made = element("button", { type: "button", textContent: text, tabIndex: -1, onclick: () => { close(); work(); } });
+    made.setAttribute("role", "menuitem");
+    return made;
+  }));
   box.hidden = false;
   Object.assign(box.style, { left: `${Math.min(x, innerWidth - box.offsetWidth - 8)}px`, top: `${Math.max(8, Math.min(y, innerHeight - box.offsetHeight - 8))}px` });
-  const items = [...box.children], go = step => items[(items.indexOf(document.activeElement) + step + items.length) % items.length].focus();
-  items[0].focus();
+  const made = [...box.children], go = step => made[(made.indexOf(document.activeElement) + step + made.length) % made.length].focus();
+  made[0].focus();
   box.onkeydown = event => {
     event.stopPropagation();
     if (event.key === "ArrowDown") go(1); else if (event.key === "ArrowUp") go(-1);
@@ -174,13 +177,26 @@ function menu(x, y) {
     event.preventDefault();
   };
 }
+const menu = (x, y) => popup(x, y, "Segment", [
+  ...state.names.map((name, n) => [`${n + 1}  ${name}`, () => act(n + 1)]), ["New option …", () => options.added.focus()],
+  ["Split here  S", commands.split], ["Merge with the next  M", commands.merge], ["Leave open  0", commands.open], ["Accept all  Enter", commands.accept],
+]);
 addEventListener("pointerdown", event => { if (!$("menu").contains(event.target)) $("menu").hidden = true; });
+const download = format => tried(async () => {  // leaves the page where it is
+  const answer = await fetch(`export/${encodeURIComponent(format)}`);
+  if (!answer.ok) throw new Error((await answer.json()).error);
+  const name = answer.headers.get("content-disposition").match(/filename="?([^";]+)/)[1], url = URL.createObjectURL(await answer.blob());
+  element("a", { href: url, download: name }).click();
+  setTimeout(() => URL.revokeObjectURL(url), EVERY);
+  say(`${name} is downloaded`);
+});
 
 const here = name => () => edit({ do: name, demo: demo.index, step: cursor });
 const commands = {
   undo: () => edit({ do: "undo" }), redo: () => edit({ do: "redo" }), split: here("split"), merge: here("merge"), open: here("open"), accept, play, uncertain,
   refit: () => tried(async () => { await ask("refit", {}); await poll(); say("Refit begun"); }),
   save: () => tried(async () => { say((await ask("save", {})).message); status(Object.assign(state, { dirty: false })); }),
+  export: () => { const { left, bottom } = document.querySelector("[data-do=export]").getBoundingClientRect(); popup(left, bottom, "Export", state.formats.map(name => [name, () => download(name)])); },
   help: () => $("help").showModal(), find: () => $("find").focus(),
   closer: () => timeline.zoom(.5), wider: () => timeline.zoom(2), all: () => timeline.all(),
   next: () => seek(boundaries().find(step => step > cursor) ?? cursor), previous: () => seek(boundaries().reverse().find(step => step < cursor) ?? 0),
@@ -190,21 +206,8 @@ const KEYS = {
 };
 for (const button of document.querySelectorAll("[data-do]")) button.addEventListener("click", event => {
   commands[button.dataset.do]();
-  if (event.detail && demo && button.dataset.do !== "help") $("timeline").focus();  // a click leaves the keys to the time line
+  if (event.detail && demo && !["help", "export"].includes(button.dataset.do)) $("timeline").focus();  // a click leaves the keys to the time line
 });
-$("export").onchange = () => {  // a download leaves the page where it is
-  const format = $("export").value;
-  $("export").value = "";
-  tried(async () => {
-    const answer = await fetch(`export/${encodeURIComponent(format)}`);
-    if (!answer.ok) throw new Error((await answer.json()).error);
-    const name = answer.headers.get("content-disposition").match(/filename="?([^";]+)/)[1], url = URL.createObjectURL(await answer.blob());
-    element("a", { href: url, download: name }).click();
-    setTimeout(() => URL.revokeObjectURL(url), EVERY);
-    say(`${name} is downloaded`);
-  });
-};
-
 addEventListener("keydown", event => {
   const { target, key, code, shiftKey } = event, digit = code.match(/^(?:Digit|Numpad)(\d)$/)?.[1], typed = target.matches("input:not([type=range]), textarea, select");
   if (event.defaultPrevented || $("help").open || !state) return;
