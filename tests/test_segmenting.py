@@ -176,7 +176,7 @@ def test_the_page_shows_every_segment(toy_run, written):
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
-COLOURS = """<script>
+COLOURS = """<script type="module">
   dispatchEvent(new Event("beforeprint"));  // draws every demonstration, visible or not
   const canvas = document.querySelector(".lanes canvas"), context = canvas.getContext("2d");
   const { longest, tracks: [track] } = JSON.parse(document.querySelector(".timeline script").textContent);
@@ -343,7 +343,8 @@ def test_the_page_escapes_what_it_shows(toy_run, tmp_path, toy_spec):
     text = page.read_text()
     assert "&lt;script&gt;alert(1)&lt;%script&gt;" in text
     assert [lane["name"] for lane in embedded(text)["lanes"]] == ["option", "<b>phase"]
-    without_code = re.sub(r"<script>.*?</script>", "", text, flags=re.DOTALL)  # the page's own, without data
+    code = r'<script type="module">.*?</script>'  # the page's script, without data
+    without_code = re.sub(code, "", text, flags=re.DOTALL)
     assert without_code.count("<script") == 1
     assert not re.search("<img|<b>", without_code)
 
