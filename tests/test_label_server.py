@@ -99,8 +99,9 @@ def test_a_path_outside_the_table_is_not_there(session, path):
 
 
 def test_the_page_asks_for_nothing_outside_its_table_and_every_answer_is_guarded(client):
-    folder = Path(__file__).parent.parent / "ddco_pyro" / "labelling" / "static"
-    assert {file.name for file in folder.iterdir()} == {name for name, _ in PAGE.values()}
+    folder = Path(__file__).parent.parent / "ddco_pyro"
+    static = {f"labelling/static/{file.name}" for file in (folder / "labelling" / "static").iterdir()}
+    assert {name for name, _ in PAGE.values()} == {*static, "drawing/canvas.js"}
     for path, (name, kind) in PAGE.items():
         answer = client.get(f"/{TOKEN}/{path}")
         assert answer.content == (folder / name).read_bytes()

@@ -42,11 +42,15 @@ PATIENCE = 2
 """Seconds that requests under way have when the server stops."""
 
 PAGE = {
-    "": ("index.html", "text/html"),
-    "page.css": ("page.css", "text/css"),
-    **{name: (name, "text/javascript") for name in ("app.js", "drawing.js", "panels.js", "timeline.js")},
+    "": ("labelling/static/index.html", "text/html"),
+    "page.css": ("labelling/static/page.css", "text/css"),
+    "canvas.js": ("drawing/canvas.js", "text/javascript"),
+    **{
+        name: (f"labelling/static/{name}", "text/javascript")
+        for name in ("app.js", "drawing.js", "panels.js", "timeline.js")
+    },
 }
-"""The files of the page: the path in a request, the file and its type."""
+"""The files of the page: the path in a request, the file in the package and its type."""
 
 HEADERS = {
     "Cache-Control": "no-store",
@@ -204,7 +208,7 @@ class Guard:
 
 def _page() -> list[Route]:
     """The routes of the page's files, which are read once."""
-    folder = files("ddco_pyro.labelling") / "static"
+    folder = files("ddco_pyro")
 
     def route(path: str, name: str, kind: str) -> Route:
         content = (folder / name).read_bytes()

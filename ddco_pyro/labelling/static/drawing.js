@@ -1,16 +1,8 @@
-// What canvases share: colours of the page, segments, and a demonstration's picture or path at a step.
-export const FONT = "11px system-ui, sans-serif", CONTROL = "#9a9a9a";
-export const bytes = text => Uint8Array.from(atob(text), one => one.charCodeAt(0));
+// The look of the page's canvases: its colours, segments, and a demonstration's picture or path at a step.
+import { Numbers, Path, bright } from "./canvas.js";
+
+export const CONTROL = "#9a9a9a";
 export const percent = share => `${(100 * share).toFixed(1)} %`;
-export const last = (sorted, value) => {  // the place of the last entry that is at most value
-  let low = 0, high = sorted.length;
-  while (low < high) { const middle = (low + high) >> 1; if (sorted[middle] <= value) low = middle + 1; else high = middle; }
-  return low - 1;
-};
-export const bright = colour => {
-  const [r, g, b] = [1, 3, 5].map(place => parseInt(colour.slice(place, place + 2), 16));
-  return .299 * r + .587 * g + .114 * b > 140;
-};
 export const coloured = (colours, option) => option ? colours[option - 1] : CONTROL;
 export const within = (segments, step) => segments.find(one => one.start <= step && step < one.stop);
 
@@ -27,17 +19,6 @@ export function element(tag, properties = {}, ...children) {
   const made = Object.assign(document.createElement(tag), properties);
   made.append(...children);
   return made;
-}
-
-export function sharp(canvas, width, height) {
-  const ratio = devicePixelRatio || 1, context = canvas.getContext("2d");
-  if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio)) {
-    canvas.width = Math.round(width * ratio); canvas.height = Math.round(height * ratio);
-  }
-  context.setTransform(ratio, 0, 0, ratio, 0, 0);
-  context.clearRect(0, 0, width, height);
-  context.font = FONT; context.textBaseline = "middle";
-  return context;
 }
 
 function hatch(context, left, top, width, height) {
@@ -83,12 +64,6 @@ export function row(context, segments, { place, edge, top, height, colours, name
   }
 }
 
-export class Numbers {  // observed numbers, bytes of each over time
-  constructor(data, steps) { Object.assign(this, data); this.bytes = bytes(data.bytes); this.length = Math.ceil(steps / data.every); }
-  share(row, step) { return this.bytes[row * this.length + Math.min(Math.floor(step / this.every), this.length - 1)] / 255; }
-  value(row, step) { return this.low[row] + this.span[row] * this.share(row, step); }
-}
-
 export class Look {  // a demonstration at a step: its picture, and its path in the colours of the segments
   constructor(root, width, height) {
     Object.assign(this, { width, height, wanted: -1, shown: -1, step: 0 });
@@ -104,32 +79,14 @@ export class Look {  // a demonstration at a step: its picture, and its path in 
     this.picture.hidden = !demo.pictures; this.path.hidden = !(view && paths?.length);
     this.picture.alt = `Picture of ${demo.name} at the cursor`;
     if (!this.path.hidden) {
-      const values = numbers.decoded ?? new Numbers(numbers, demo.steps), ratio = devicePixelRatio || 1;
-      const point = (path, step) => view.map(weights => weights.reduce((sum, weight, axis) => sum + weight * values.value(path[axis], step), 0));
-      const every = Math.max(1, Math.floor(demo.steps / 1000)), canvas = new OffscreenCanvas(this.width * ratio, this.height * ratio), inside = canvas.getContext("2d");
-      const steps = Array.from({ length: Math.ceil(demo.steps / every) }, (_, n) => n * every), lines = paths.map(path => steps.map(step => point(path, step)));
-      let [x0, x1, y0, y1] = [Infinity, -Infinity, Infinity, -Infinity];
-      for (const [x, y] of lines.flat()) { x0 = Math.min(x0, x); x1 = Math.max(x1, x); y0 = Math.min(y0, y); y1 = Math.max(y1, y); }
-      const size = Math.min((this.width - 20) / (x1 - x0 || 1), (this.height - 20) / (y1 - y0 || 1));
-      const put = ([x, y]) => [this.width / 2 + (x - (x0 + x1) / 2) * size, this.height / 2 + (y - (y0 + y1) / 2) * size];
-      inside.scale(ratio, ratio); inside.lineWidth = 2.5; inside.lineJoin = "round";
-      for (const { start, stop, option, said } of segments) lines.forEach((points, n) => {
-        inside.strokeStyle = coloured(colours, said === "open" ? 0 : option); inside.setLineDash([[], [5, 2.5], [1.2, 2]][n % 3]); inside.beginPath();
-        for (let at = Math.floor(start / every); at <= Math.min(Math.floor(stop / every), points.length - 1); at++) inside.lineTo(...put(points[at]));
-        inside.stroke();
-      });
-      this.drawn = { canvas, put: (path, step) => put(point(path, step)) };
+      const runs = segments.map(({ start, stop, option, said }) => [start, stop, coloured(colours, said === "open" ? 0 : option)]);
+      this.drawn = new Path(numbers.decoded ?? new Numbers(numbers, demo.steps), demo, runs, this.width, this.height);
     }
     this.at(Math.min(this.step, demo.steps - 1));
   }
   at(step) {
     this.step = step;
-    if (this.drawn) {
-      const context = sharp(this.path, this.width, this.height);
-      context.drawImage(this.drawn.canvas, 0, 0, this.width, this.height);
-      context.lineWidth = 2; context.fillStyle = looks.paper; context.strokeStyle = looks.ink;
-      for (const path of this.demo.paths) { context.beginPath(); context.arc(...this.drawn.put(path, step), 5, 0, 7); context.fill(); context.stroke(); }
-    }
+    this.drawn?.draw(this.path, step, looks.paper, looks.ink);
     this.load();
   }
   load() {  // one picture at a time, so that playing shows as many as come

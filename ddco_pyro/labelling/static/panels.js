@@ -1,5 +1,6 @@
 // What stands beside the time line: the question, the list of demonstrations, options, the readout, and what is alike.
-import { Look, coloured, element, last, looks, percent, row, sharp, within } from "./drawing.js";
+import { last, sharp } from "./canvas.js";
+import { Look, coloured, element, looks, percent, row, within } from "./drawing.js";
 
 const swatch = colour => { const made = element("span", { className: "swatch" }); made.style.background = colour; return made; };
 const seconds = (steps, rate) => rate ? `${steps} steps (${+(steps / rate).toPrecision(2)} s)` : `${steps} steps`;

@@ -1,5 +1,6 @@
 // One demonstration over time: levels, boundaries, numbers; the cursor, and what is dragged or painted.
-import { Numbers, bytes, coloured, element, last, looks, row, sharp } from "./drawing.js";
+import { Numbers, axis, bytes, last, sharp } from "./canvas.js";
+import { coloured, element, looks, row } from "./drawing.js";
 
 const GUTTER = 108, AXIS = 16, LANE = 18, MAIN = 34, BAND = 14, PLOT = 24, LEAST = 10, NEAR = 6;
 
@@ -109,7 +110,8 @@ export class Timeline {
     const { demo, state } = this, width = this.root.clientWidth, context = sharp(this.canvas, width, this.height), place = step => this.x(step);
     place.least = GUTTER;
     const edge = Math.min(this.x(demo.steps), width), label = (text, y) => { context.fillStyle = looks.soft; context.fillText(text, 0, y, GUTTER - 8); };
-    this.axis(context, width);
+    context.fillStyle = looks.soft;
+    axis(context, this.from, this.to, place, state.frequency);
     let top = AXIS;
     for (const level of [...demo.upper].reverse()) {
       label(level.level, top + LANE / 2);
@@ -132,18 +134,6 @@ export class Timeline {
     }
     top += BAND + 4;
     this.rows.forEach((name, number) => this.plot(context, number, name, top + number * PLOT, width, label));
-  }
-  axis(context, width) {
-    const rough = (this.to - this.from) / Math.max(2, (width - GUTTER) / 100), power = 10 ** Math.floor(Math.log10(rough));
-    const tick = Math.max(1, [1, 2, 5, 10].find(one => one * power >= rough) * power), rate = this.state.frequency;
-    context.fillStyle = looks.soft;
-    for (let step = Math.ceil(this.from / tick) * tick; step < this.to; step += tick) {
-      const x = this.x(step);
-      context.fillRect(x, 11, 1, 4);
-      context.textAlign = x > width - 40 ? "right" : step ? "center" : "left";
-      context.fillText(rate ? `${step} (${+(step / rate).toFixed(2)} s)` : String(step), x, 5);
-    }
-    context.textAlign = "left"; context.fillText("step", 0, 6);
   }
   plot(context, number, name, top, width, label) {
     const { numbers, steps } = this.demo, values = numbers.decoded, wide = Math.min(width, this.x(steps)), pixel = Math.max(this.each, 1) / this.each;
