@@ -146,6 +146,15 @@ def test_the_first_demonstrations_in_training_have_labels_those_to_tune_with_las
             assert row == (given if seen == {1, 2} else [min(option, 1) for option in given])
 
 
+def test_demonstrations_that_train_and_tune_are_labelled_once():
+    """As with ``training.tune_fraction: 0``."""
+    demos = random_demonstrations()
+    labels = Labels.of(labelled(), demos, demos)
+    assert labels is not None
+    assert labels.demonstrations == demos.names
+    assert labels.train.tolist() == labels.tune.tolist() == [options(own) for own in LABELS]
+
+
 def test_labels_of_unequal_length_are_free_past_the_end():
     demos = random_demonstrations([[0, 4, -1], [4], [0, 0], [4, -3]])
     labels = Labels.of(labelled(), demos, demos.select(["demo_3"]))

@@ -50,7 +50,7 @@ class Labels:
         if labels is None or spec.hierarchy is None:
             return None
         number, level = next(item for item in enumerate(spec.hierarchy.levels, 1) if item[1].name == labels.level)
-        used = (*train, *tune)[: labels.count]
+        used = (*train, *(() if tune is train else tune))[: labels.count]
         values = _distinct(demo.labels[labels.source] for demo in used)
         if not _distinct(demo.labels[labels.source] for demo in used[: len(train)]):
             raise SpecError(
