@@ -19,7 +19,9 @@ from ddco_pyro.spec.yaml import read_yaml
 
 if TYPE_CHECKING:
     from ddco_pyro.data.inspection import Inspection
+    from ddco_pyro.data.sources import Source
     from ddco_pyro.data.starting import Decided
+    from ddco_pyro.segmenting.formats.reading import Labelled
 
 SourcePath = Annotated[
     Path, typer.Argument(metavar="FILE", help=f"Demonstrations: {', '.join(about.text for about in FORMATS.values())}.")
@@ -171,26 +173,56 @@ def import_(
         int | None, typer.Option(min=8, max=4096, help="Scale pictures to so many pixels in height and width.")
     ] = None,
     hz: Annotated[float | None, typer.Option(min=0.01, help="Steps a second: means over the source's frames.")] = None,
+    labels: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="PATH",
+            help="Segments that were made in ELAN, BORIS or Label Studio, as labels: a file, or a folder of files.",
+            show_default=False,
+        ),
+    ] = None,
+    fps: Annotated[
+        float | None,
+        typer.Option(min=0.001, help="Steps per second, for --labels; by default what FILE says.", show_default=False),
+    ] = None,
     skip_broken: Annotated[
         bool, typer.Option("--skip-broken", help="Leave out demonstrations that cannot be used, and list them.")
     ] = False,
     allow_external: AllowExternal = False,
 ) -> None:
-    """Write demonstrations of another format into this project's layout; an interrupted import is continued."""
+    """Write demonstrations of another format into this project's layout; an interrupted import is continued.
+
+    With --labels, FILE may have this layout already.
+    """
     from ddco_pyro.cli import console
     from ddco_pyro.data.importing import Choice, import_demonstrations
     from ddco_pyro.events import DemonstrationsDone
 
-    check_outputs([Output("--out", out, "file")], [source])
+    if fps and labels is None:
+        raise BadInput("--fps says how long the steps of --labels are; give both, or --hz for another rate")
+    check_outputs([Output("--out", out, "file")], [source, *([labels] if labels else [])])
     size = (image_size, image_size) if image_size else None
     choice = Choice(tuple(observations), mask, videos, size, hz, skip_broken, allow_external, tuple(actions))
+    given: list[Labelled] = []
+
+    def seen_as(source: Source) -> Source:
+        if labels is None:
+            return source
+        from ddco_pyro.segmenting.formats.reading import Labelled
+
+        given.append(Labelled(source, labels, fps))
+        return given[0]
+
     with console.Progress("importing") as progress:
-        imported = import_demonstrations(source, out, form, choice, lambda *done: progress(DemonstrationsDone(*done)))
+        imported = import_demonstrations(
+            source, out, form, choice, lambda *done: progress(DemonstrationsDone(*done)), seen_as
+        )
     for name, reason in imported.left_out.items():
         print(f"left out {name}: {reason}", file=sys.stderr)
-    for line in imported.unread:
+    for line in (*imported.unread, *(note for own in given for note in own.notes)):
         print(f"note: {line}", file=sys.stderr)
-    print(f"{out}: {len(imported.names)} demonstrations")
+    counts = "".join(f", labels/{name} in {number}" for own in given for name, number in own.counts.items())
+    print(f"{out}: {len(imported.names)} demonstrations{counts}")
 
 
 def encode(

@@ -71,15 +71,18 @@ def import_demonstrations(
     form: str | None = None,
     choice: Choice = Choice(),
     on_recording: OnRecording = lambda done, total: None,
+    seen_as: Callable[[Source], Source] = lambda source: source,
 ) -> Imported:
     """Write the demonstrations of a file or folder into ``out``, continuing an interrupted import.
 
     Memory holds one block of an array at a time.
 
+    :param seen_as: what is imported of the source, such as the source with further labels.
     :raises DemonstrationsError: the source cannot be read, or a demonstration cannot be used.
     :raises BadInput: ``out`` exists and is not this import, or another process is writing it.
     """
-    with open_source(source, form, choice.allow_external, choice.actions) as opened_source:
+    with open_source(source, form, choice.allow_external, choice.actions) as whole:
+        opened_source = seen_as(whole)
         identity = _identity(opened_source, choice)
         if out.exists():
             discard(out)
@@ -167,7 +170,9 @@ def _refused(source: Source, names: Sequence[str], choice: Choice, error: Demons
 def _identity(source: Source, choice: Choice) -> str:
     """What determines the contents of an import."""
     files = [(str(path.resolve()), path.stat().st_size, path.stat().st_mtime_ns) for path in source.files]
-    return json.dumps({"format": source.format, "files": files, "choice": asdict(choice)})
+    return json.dumps(
+        {"format": source.format, "files": files, "choice": asdict(choice), "frequency": source.frequency}
+    )
 
 
 def _digest(identity: str) -> str:
