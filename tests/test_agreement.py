@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections import Counter
 from itertools import groupby, permutations
 
 import numpy as np
 import pytest
+from command_line import call
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import maximum_bipartite_matching
-from sklearn.metrics import adjusted_rand_score, jaccard_score
+from sklearn.metrics import adjusted_rand_score, cohen_kappa_score, confusion_matrix, jaccard_score
 
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation import agreement as measures
-from ddco_pyro.evaluation.agreement import MATCHED, UNKNOWN, UNMATCHED
+from ddco_pyro.evaluation.agreement import MATCHED, UNKNOWN, UNMATCHED, boundary_distances
+from ddco_pyro.evaluation.annotators import compare_annotators
 
 WAYS = ("matched_globally", "matched_per_demonstration")
 
@@ -216,3 +221,69 @@ def test_every_measure_is_at_most_1_which_is_perfect_and_a_matching_for_each_is_
         perfect = agreement(truth, truth)
         assert [perfect[name] for name in UNMATCHED] == pytest.approx([1] * len(UNMATCHED))
         assert [perfect[way] for way in WAYS] == [dict.fromkeys(MATCHED, 1.0)] * 2
+
+
+# --- two annotators ---------------------------------------------------------------------------------------------------
+
+
+def test_distances_are_those_of_the_best_of_all_matchings():
+    """Most pairs, then the least sum, among all one-to-one matchings within the tolerance."""
+    rng = np.random.default_rng(0)
+    for _ in range(60):
+        ours, theirs = (np.sort(rng.choice(16, rng.integers(5), replace=False)) for _ in range(2))
+        short, long = sorted((ours, theirs), key=len)
+        found = boundary_distances(ours, theirs, 3)
+        each = [
+            [abs(a - b) for a, b in zip(short, chosen, strict=True) if abs(a - b) <= 3]
+            for chosen in permutations(long, len(short))
+        ]
+        best = min(each, key=lambda own: (-len(own), sum(own)))
+        assert (len(found), found.sum()) == (len(best), sum(best))
+
+
+def annotated(path, labels, names):
+    """A file of demonstrations with labels/skill, a word for each step; . is unknown."""
+    demos = (
+        Demonstration(
+            demo,
+            {"x": np.zeros((len(own), 1))},
+            np.zeros((len(own), 1)),
+            {"skill": np.array([names.index(word) if word != "." else -1 for word in own])},
+        )
+        for demo, own in labels.items()
+    )
+    Demonstrations(tuple(demos), attributes={"label_names": json.dumps({"skill": names})}).write(path)
+    return path
+
+
+def test_two_annotators(tmp_path):
+    """The same names under other numbers; what only one of them said counts nowhere."""
+    first = {"a": "rrrrggggpp..", "b": "rrrr", "c": "rr"}
+    second = {"a": "rrrggggpp.pp", "b": "rr.g", "d": "rrr"}
+    a = annotated(tmp_path / "a.hdf5", first, list("rgp"))
+    b = annotated(tmp_path / "b.hdf5", second, list("pgr"))
+    found = compare_annotators(a, b, 1)["skill"]
+    both = [(x, y) for demo in "ab" for x, y in zip(first[demo], second[demo], strict=True) if "." not in (x, y)]
+    assert (found.demonstrations, found.steps, found.both) == (2, 16, len(both))
+    assert found.same == sum(x == y for x, y in both) == 9
+    assert found.kappa == pytest.approx(cohen_kappa_score(*zip(*both, strict=True)))
+    assert found.names == ["r", "g", "p"]
+    assert found.counts == confusion_matrix(*zip(*both, strict=True), labels=found.names).tolist()
+    assert found.boundaries == (2, 2)  # at 4 and 8, and at 3 and 7; b's step 3 follows a step that is unknown
+    assert found.distances == [1, 1]
+    assert found.boundary_f1 == 1
+    assert compare_annotators(a, b, 0)["skill"].boundary_f1 == 0
+    shown = call("inspect", a, "--against", b, "--tolerance", 1)
+    assert shown.status == 0, shown.err
+    assert f"{found.kappa:.2f}" in shown.out
+    said = json.loads(call("inspect", a, "--against", b, "--json").out)["skill"]
+    assert said["counts"] == found.counts
+
+
+def test_annotators_of_other_demonstrations_are_refused(tmp_path):
+    a = annotated(tmp_path / "a.hdf5", {"a": "rrr"}, ["r"])
+    for labels, why in (({"b": "rrr"}, "has none of the demonstrations of"), ({"a": "rr"}, "a has 2 steps, and 3 in")):
+        with pytest.raises(BadInput, match=why):
+            compare_annotators(a, annotated(tmp_path / "b.hdf5", labels, ["r"]), 1)
+    alone = compare_annotators(a, annotated(tmp_path / "b.hdf5", {"a": "r.."}, ["r"]), 1)["skill"]
+    assert (alone.both, alone.kappa, alone.boundary_f1) == (1, None, 1.0)

@@ -41,6 +41,7 @@ from ddco_pyro.names import label_name, method, numbered_name, option_name
 
 if TYPE_CHECKING:
     from ddco_pyro.data.inspection import Field, Inspection
+    from ddco_pyro.evaluation.annotators import Annotators
     from ddco_pyro.fitting.fitted import Fit
     from ddco_pyro.fitting.merging import Pair
     from ddco_pyro.metrics import Metrics
@@ -357,6 +358,26 @@ def inspection(facts: Inspection) -> None:
     show(Table(["", "a step", "type", "range", "notes"], [list(map(printable, row)) for row in rows], range(5)))
     for line in (*facts.notes, *(f"problem: {problem}" for problem in facts.problems)):
         say(printable(line))
+
+
+def annotators(found: Mapping[str, Annotators], tolerance: int) -> None:
+    """How two annotators agree on each name of labels, and what the second one calls the first one's segments."""
+    head = ["labels", "demonstrations", "steps", "said by both", "same name", "Cohen's κ", "boundaries"]
+    rows = []
+    for name, own in found.items():
+        middle = float(np.median(own.distances)) if own.distances else None
+        same = own.same / own.both if own.both else None
+        said = [words.percent(own.both / own.steps), words.percent(same), words.number(own.kappa)]
+        matched = [" and ".join(map(str, own.boundaries)), words.number(own.boundary_f1), words.number(middle, 1)]
+        rows.append([name, str(own.demonstrations), str(own.steps), *said, *matched])
+    show(Table([*head, f"F1 ±{tolerance}", "median distance"], rows))
+    for name, own in found.items():
+        rows = [
+            [called, str(sum(counts)), *(words.percent(count / sum(counts)) if count else "" for count in counts)]
+            for called, counts in zip(own.names, own.counts, strict=True)
+            if any(counts)
+        ]
+        show(Table([name, "steps", *own.names], rows, title="Names of the first file (rows) in the second"))
 
 
 def _range(field: Field) -> str:

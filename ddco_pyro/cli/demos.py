@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Annotated
@@ -57,8 +58,18 @@ def inspect(
     file: SourcePath,
     form: FormatOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print all of it as JSON.")] = False,
+    against: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Compare labels with those of another annotator instead.", show_default=False
+        ),
+    ] = None,
+    tolerance: Annotated[int, typer.Option(min=0, help="Steps between boundaries that match, for --against.")] = 5,
 ) -> None:
     """Print the contents of a file: keys, shapes, lengths, ranges, NaN, constant dimensions, masks, a starting spec."""
+    if against is not None:
+        _compare_annotators(file, against, tolerance, as_json)
+        return
     from ddco_pyro.data.hdf5 import DemonstrationsError
     from ddco_pyro.data.inspection import inspect as look
     from ddco_pyro.data.starting import starting_spec
@@ -77,6 +88,19 @@ def inspect(
         print(f"\n{starting_spec(facts, file).text}\nnext: {command('init', file, '--out', f'{file.stem}.yaml')}")
     except DemonstrationsError as error:
         print(f"\nno spec to start with: {str(error).removeprefix(f'{file}: ')}")
+
+
+def _compare_annotators(first: Path, second: Path, tolerance: int, as_json: bool) -> None:
+    from ddco_pyro.cli import console
+    from ddco_pyro.evaluation.annotators import compare_annotators
+
+    found = compare_annotators(first, second, tolerance)
+    if as_json:
+        print(
+            json.dumps({name: asdict(own) | {"boundary_f1": own.boundary_f1} for name, own in found.items()}, indent=1)
+        )
+        return
+    console.annotators(found, tolerance)
 
 
 def init(

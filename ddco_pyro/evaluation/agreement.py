@@ -185,6 +185,20 @@ def _within(ours: np.ndarray, theirs: np.ndarray, tolerance: int) -> int:
     return pairs
 
 
+def boundary_distances(ours: np.ndarray, theirs: np.ndarray, tolerance: int) -> np.ndarray:
+    """Distances of sorted steps that are matched one to one within a tolerance: most pairs, and the closest of these.
+
+    >>> boundary_distances(np.array([10, 12]), np.array([12, 40]), 3).tolist()
+    [0]
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    apart = np.abs(ours[:, None] - theirs)
+    cost = np.where(apart <= tolerance, apart, LARGEST)
+    distances: np.ndarray = cost[linear_sum_assignment(cost)]
+    return distances[distances <= tolerance]
+
+
 def _overlap_f1(ours: Sequence[np.ndarray], truth: Sequence[np.ndarray], overlap: float) -> float:
     right = segments = 0
     for h, label in zip(ours, truth, strict=True):
