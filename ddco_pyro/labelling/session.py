@@ -23,6 +23,7 @@ from ddco_pyro.errors import BadInput, Failed
 from ddco_pyro.evaluation.inferred import runs
 from ddco_pyro.fitting.fit import fit as fit_to
 from ddco_pyro.fitting.fitted import Fit
+from ddco_pyro.fitting.names import checked
 from ddco_pyro.jobs import Workers, run_all
 from ddco_pyro.labelling.document import FREE, OPEN, Change, Document
 from ddco_pyro.labelling.journal import SUFFIX, Journal, version
@@ -381,7 +382,10 @@ class Session:
             return [("names", [*names, self._text(command)])]
         if do == "rename":
             option = self._option(command, 1)
-            return [("names", [*names[: option - 1], self._text(command), *names[option:]])]
+            renamed = [*names[: option - 1], self._text(command), *names[option:]]
+            if self._are_the_runs():
+                checked(self.run.spec, {self.level: renamed})
+            return [("names", renamed)]
         if name is None:
             raise BadInput(f"{do}: names no demonstration, or is no command")
         if do == "accept":
@@ -491,11 +495,13 @@ class Session:
             raise BadInput(f"a name is one line of at most {LONGEST} characters that no other option has")
         return name
 
+    def _are_the_runs(self) -> bool:
+        """Whether the options are as many as the run's, which then gets their names."""
+        return len(self.run.names[self.level]) == len(self.document.names) + 1
+
     def _name_options(self) -> None:
-        """Give the run the names, where it has as many options."""
-        names, run = self.document.names, self.run
-        if len(run.names[self.level]) == len(names) + 1 and run.names[self.level][1:] != names:
-            run.name_options(self.level, names)
+        if self._are_the_runs() and self.run.names[self.level][1:] != self.document.names:
+            self.run.name_options(self.level, self.document.names)
 
     # --- in the background --------------------------------------------------------------------------------------------
 
