@@ -4,7 +4,9 @@ import json
 import socket
 import subprocess
 import sys
+from io import BytesIO
 from pathlib import Path
+from zipfile import ZipFile
 
 import anyio
 import httpx2
@@ -168,6 +170,9 @@ def test_what_a_session_says_arrives(client, session, tmp_path, monkeypatch):
     assert post(client, "save", {}).json() == {"message": session.save()}
     sent = client.get(f"/{TOKEN}/export/csv")
     assert (sent.text, "segments.csv" in sent.headers["content-disposition"]) == ("6 demonstrations\n", True)
+    sent = client.get(f"/{TOKEN}/export/elan")
+    assert "segments.zip" in sent.headers["content-disposition"]
+    assert ZipFile(BytesIO(sent.content)).read("demo_0.eaf") == b"6 demonstrations\n"
     client.get(f"/{TOKEN}/export/floppy")
     assert not list(tmp_path.iterdir()), "an export leaves files behind"
 

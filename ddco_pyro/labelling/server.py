@@ -95,7 +95,7 @@ class Served(Protocol):
         """Write the labels; a line that says where."""
 
     def export(self, format: str, folder: Path) -> Path:
-        """Write one file of a format into a folder."""
+        """Write one file or folder of a format into a folder."""
 
     def close(self) -> None:
         """End what runs in the background."""

@@ -251,12 +251,15 @@ class StandIn:
         return f"labels/skill of {len(self.said)} demonstrations are in labelled.hdf5"
 
     def export(self, format: str, folder: Path) -> Path:
-        """A file with the number of demonstrations."""
+        """A file with the number of demonstrations, or a folder with one."""
         if format not in ("csv", "elan"):
             raise BadInput(f"{format}: no such format")
         path = folder / f"segments.{format}"
+        if format == "elan":
+            path = folder / "segments" / "demo_0.eaf"
+            path.parent.mkdir()
         path.write_text(f"{len(self.said)} demonstrations\n")
-        return path
+        return path if format == "csv" else path.parent
 
     def close(self) -> None:
         """Nothing runs in the background."""
