@@ -1,0 +1,491 @@
+"""A session of labelling: what is shown, changed and saved, against the fit, the planted truth, and files read back."""
+
+import csv
+import json
+import threading
+import time
+from dataclasses import replace
+from itertools import pairwise
+from xml.etree import ElementTree
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from time_lines import unpacked
+
+from ddco_pyro.cli.label import _exporters
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.planted import pick_and_place
+from ddco_pyro.errors import BadInput
+from ddco_pyro.fitting.fit import fit
+from ddco_pyro.labelling.document import FREE, OPEN
+from ddco_pyro.labelling.session import Session
+from ddco_pyro.spec import parse_spec
+
+COUNT, NAMES = 4, ("let go", "carry", "close", "come")
+
+
+@pytest.fixture(scope="module")
+def demos():
+    return pick_and_place(5)
+
+
+@pytest.fixture(scope="module")
+def run(demos):
+    keys = {"policy": {"network": "linear"}, "termination": {"network": "linear"}}
+    return fit(
+        parse_spec(
+            {
+                "demonstrations": {"path": "none.hdf5", "valid_fraction": 0},
+                "observations": [*demos.observation_shapes],
+                "control": {"std": {"learn": True, "floor": 0.01, "per_option": True}, "power": 0.1},
+                "hierarchy": {"levels": [{"name": "option", "count": COUNT, **keys}], "meta_policy": keys["policy"]},
+                "training": {"optimizer": {"name": "em"}, "tune_fraction": 0, "epochs": 5},
+                "compare_with": [],
+            }
+        ),
+        demos,
+    )
+
+
+@pytest.fixture
+def begin(run, demos, tmp_path, monkeypatch):
+    """Begins a session with the fit; refits are made by this process."""
+    monkeypatch.setattr(Session, "_away", lambda session, calls: {name: call() for name, call in calls.items()})
+    path = tmp_path / "demos.hdf5"
+    demos.write(path)
+    begun = []
+
+    def one(out="out.hdf5"):
+        exporters = _exporters(tmp_path / "run", path)
+        begun.append(Session(replace(run, named={}), path, tmp_path / out, exporters=exporters))
+        return begun[-1]
+
+    yield one
+    for session in begun:
+        refitted(session)
+        session.journal.close()
+
+
+@pytest.fixture(scope="module")
+def unchanged(run, demos, tmp_path_factory):
+    """A session in which nothing is done."""
+    path = tmp_path_factory.mktemp("unchanged") / "demos.hdf5"
+    demos.write(path)
+    session = Session(replace(run, named={}), path, path.with_name("out.hdf5"))
+    yield session
+    session.journal.close()
+
+
+@pytest.fixture
+def quiet(monkeypatch):
+    """No refit follows an accepted demonstration."""
+    monkeypatch.setattr(Session, "refit", lambda session: None)
+
+
+def refitted(session):
+    """The session's state once nothing is under way."""
+    while session.state()["refit"]["running"]:
+        time.sleep(0.01)
+    return session.state()["refit"]
+
+
+def shown(session):
+    """The option and who says so, of each step of every demonstration, and where segments begin."""
+    found = []
+    for own in session.state()["demos"]:
+        starts, options, said = zip(*own["strip"], strict=True)
+        steps = np.searchsorted(starts, np.arange(own["steps"]), side="right") - 1
+        found.append(([*starts], [(options[step], said[step]) for step in steps]))
+    return found
+
+
+def by_step(segments):
+    """The option and who says so, of each step."""
+    return [(own["option"], own["said"]) for own in segments for _ in range(own["start"], own["stop"])]
+
+
+# --- what is shown ----------------------------------------------------------------------------------------------------
+
+
+def test_before_any_label_the_fit_proposes(begin, run, demos):
+    session = begin()
+    state, (paths,), (u,) = session.state(), run.segment(demos), run.posterior(demos).u
+    wrong = []
+    for index, path in enumerate(paths):
+        found = session.demo(index)
+        assert by_step(found["segments"]) == [(option, "proposed") for option in path.tolist()]
+        probability = u[index].numpy()[np.arange(len(path)), path]
+        np.testing.assert_array_equal(unpacked(found["probability"]), np.rint(255 * np.minimum(probability, 1)))
+        wrong.append((1 - probability).sum())
+        assert [own["step"] for own in found["boundaries"]] == (np.flatnonzero(np.diff(path)) + 1).tolist()
+        assert all(own["low"] <= own["step"] <= own["high"] for own in found["boundaries"])
+    assert state["summary"]["expected_wrong"] == pytest.approx(sum(wrong) / sum(demos.lengths), abs=1e-9)
+    assert state["summary"]["one_more"] == pytest.approx(max(wrong) / sum(demos.lengths), abs=1e-9)
+    assert [own["steps"] for own in state["demos"]] == [*demos.lengths]
+    assert sorted(state["order"]) == [*range(len(demos))]
+    assert (state["can_undo"], state["can_redo"], state["dirty"]) == (False, False, False)
+
+
+def test_the_segments_that_are_nearest_are_of_the_same_skill(begin, demos):
+    session = begin()
+    for name, demo in zip(demos.names[:-1], demos, strict=False):
+        session.journal.edit([("paint", name, *own) for own in stretches(demo.labels["phase"])])
+    label(session, len(demos) - 1, demos[-1].labels["phase"])
+    for phase in range(COUNT):
+        found = session.nearest(0, int(np.flatnonzero(demos[0].labels["phase"] == phase)[0]))
+        (first, *_) = found
+        assert first["option"] == phase + 1
+        assert all(own["index"] != 0 and own["start"] < own["stop"] for own in found)
+
+
+# --- commands ---------------------------------------------------------------------------------------------------------
+
+paint = {"do": "paint", "demo": 0, "start": 10, "stop": 20, "option": 3}
+SAID = np.repeat([1, 3, 2, 4], [10, 10, 10, 18])
+
+
+@pytest.mark.parametrize(
+    ("commands", "labels"),
+    [
+        ([{**paint, "start": 12, "stop": 14, "option": 0}], {(12, 14): OPEN}),
+        ([{"do": "name", "demo": 0, "step": 15, "option": 1}], {(10, 20): 1}),
+        ([{"do": "open", "demo": 0, "step": 19}], {(10, 20): OPEN}),
+        ([{"do": "merge", "demo": 0, "step": 10}], {(10, 30): 3}),
+        ([{"do": "move", "demo": 0, "boundary": 20, "to": 25}], {(10, 25): 3}),
+        ([{"do": "move", "demo": 0, "boundary": 20, "to": 15}], {(15, 30): 2}),
+        ([{"do": "split", "demo": 0, "step": 15}, {"do": "name", "demo": 0, "step": 15, "option": 4}], {(15, 20): 4}),
+        ([{"do": "split", "demo": 0, "step": 15}, {"do": "merge", "demo": 0, "step": 12}], {}),
+        ([{"do": "open", "demo": 0, "step": 19}, {"do": "undo"}, {"do": "redo"}], {(10, 20): OPEN}),
+    ],
+    ids=lambda value: "-".join(own["do"] for own in value) if isinstance(value, list) else "",
+)
+def test_a_command_changes_these_labels(begin, commands, labels):
+    session = begin()
+    label(session, 0, SAID - 1)
+    for command in commands:
+        assert session.edit(command)["demo"] in (0, None)
+    expected = SAID.copy()
+    for (start, stop), option in labels.items():
+        expected[start:stop] = option
+    np.testing.assert_array_equal(session.document.labels["demo_0"], expected)
+    for (option, said), own in zip(shown(session)[0][1], expected, strict=True):
+        assert said == "open" if own == OPEN else (option, said) == (own, "said")
+
+
+def test_a_boundary_that_is_moved_is_pinned_on_both_sides(begin):
+    session = begin()
+    left, right = session.demo(0)["segments"][:2]
+    to = left["stop"] + 3
+    session.edit({"do": "move", "demo": 0, "boundary": left["stop"], "to": to})
+    labels = session.document.labels["demo_0"]
+    assert labels[left["stop"] - 1 : to + 1].tolist() == [left["option"]] * 4 + [right["option"]]
+    assert (labels > 0).sum() == 5
+    moved = session.demo(0)["segments"]
+    assert [(own["option"], own["stop"]) for own in moved[:2]] == [
+        (left["option"], to),
+        (right["option"], right["stop"]),
+    ]
+
+
+def test_everywhere_names_all_segments_of_an_option(begin):
+    session = begin()
+    before = [steps for _, steps in shown(session)]
+    option = before[0][0][0]
+    other = option % COUNT + 1
+    session.edit({"do": "everywhere", "demo": 0, "step": 0, "option": other})
+    for steps, (_, now) in zip(before, shown(session), strict=True):
+        assert all(now[step][0] == other for step, (own, _) in enumerate(steps) if own == option)
+    for steps, labels in zip(before, session.document.labels.values(), strict=True):
+        assert labels.tolist() == [other if own == option else FREE for own, _ in steps]
+    session.edit({"do": "undo"})
+    assert [steps for _, steps in shown(session)] == before
+
+
+@pytest.mark.usefixtures("quiet")
+def test_accepting_says_what_is_shown_except_what_is_open(begin):
+    session = begin()
+    session.edit({"do": "paint", "demo": 1, "start": 4, "stop": 8, "option": 0})
+    before = by_step(session.demo(1)["segments"])
+    session.edit({"do": "accept", "demo": 1})
+    labels, state = session.document.labels["demo_1"], session.state()
+    assert labels[4:8].tolist() == [OPEN] * 4
+    expected = [option for step, (option, _) in enumerate(before) if not 4 <= step < 8]
+    assert labels[[*range(4), *range(8, len(labels))]].tolist() == expected
+    assert (state["demos"][1]["accepted"], state["summary"]["labelled"], state["order"][-1]) == (True, 1, 1)
+
+
+whole = st.integers(-1, 48)
+index = st.integers(0, 1)
+commands = st.one_of(
+    st.fixed_dictionaries({"do": st.sampled_from(["open", "split", "merge"]), "demo": index, "step": whole}),
+    st.fixed_dictionaries(
+        {"do": st.sampled_from(["name", "everywhere"]), "demo": index, "step": whole, "option": st.integers(0, 5)}
+    ),
+    st.fixed_dictionaries(
+        {"do": st.just("paint"), "demo": index, "start": whole, "stop": whole, "option": st.integers(0, 5)}
+    ),
+    st.fixed_dictionaries({"do": st.just("move"), "demo": index, "boundary": whole, "to": whole}),
+    st.fixed_dictionaries({"do": st.just("accept"), "demo": index}),
+    st.fixed_dictionaries({"do": st.just("new"), "text": st.sampled_from(["lift", "push", ""])}),
+    st.fixed_dictionaries(
+        {"do": st.just("rename"), "option": st.integers(1, 5), "text": st.sampled_from(["go", "lift"])}
+    ),
+    st.fixed_dictionaries({"do": st.sampled_from(["undo", "redo"])}),
+)
+
+
+@pytest.mark.usefixtures("quiet")
+@settings(max_examples=3, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(commands, min_size=3, max_size=10), st.randoms(use_true_random=False))
+def test_any_commands_leave_whole_demonstrations_and_are_undone_and_read_again(begin, tmp_path, sequence, random):
+    out = f"{len([*tmp_path.iterdir()])}.hdf5"
+    session = begin(out)
+    first, done = shown(session), 0
+    for command in sequence:
+        if command["do"] == "move" and random.random() < 0.8:  # to a boundary that is there
+            here = session.demo(command["demo"])["segments"]
+            command = {**command, "boundary": random.choice(here)["start"]}
+        before = shown(session), session.journal.path.read_bytes()
+        try:
+            answer = session.edit(command)
+        except BadInput:
+            assert (shown(session), session.journal.path.read_bytes()) == before
+            continue
+        json.dumps([answer, session.state(), session.demo(0)])
+        assert session.journal.path.read_bytes().startswith(before[1])
+        for (_, steps), labels in zip(shown(session), session.document.labels.values(), strict=True):
+            for own, (option, said) in zip(labels, steps, strict=True):
+                assert own <= 0 or option == own
+                assert (said == "open") == (own == OPEN)
+                assert own != FREE or said == "proposed"
+    last = shown(session)
+    session.journal.close()
+    again = begin(out)
+    assert shown(again) == last
+    assert again.state()["names"] == session.state()["names"]
+    while again.state()["can_undo"]:
+        again.edit({"do": "undo"})
+        done += 1
+    assert shown(again) == first
+    for _ in range(done):
+        again.edit({"do": "redo"})
+    assert shown(again) == last
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        {},
+        {"do": "fly"},
+        {"do": "paint", "demo": 0},
+        {"do": "paint", "demo": 99, "start": 0, "stop": 5, "option": 1},
+        {"do": "paint", "demo": 0, "start": 5, "stop": 5, "option": 1},
+        {"do": "paint", "demo": 0, "start": 0, "stop": 10**9, "option": 1},
+        {"do": "paint", "demo": 0, "start": 0, "stop": 5, "option": 99},
+        {"do": "paint", "demo": True, "start": 0, "stop": 5, "option": 1},
+        {"do": "paint", "demo": 0, "start": 0.5, "stop": 5, "option": 1},
+        {"do": "name", "demo": "0", "step": 0, "option": 1},
+        {"do": "name", "demo": 0, "step": -1, "option": 1},
+        {"do": "merge", "demo": 0, "step": 47},
+        {"do": "split", "demo": 0, "step": 0},
+        {"do": "move", "demo": 0, "boundary": 1, "to": 2},
+        {"do": "new", "text": "two\nlines"},
+        {"do": "new", "text": 7},
+        {"do": "rename", "option": 1, "text": "option 2"},
+        {"do": "rename", "option": 1, "text": "control"},
+        {"do": "rename", "option": 1, "text": "two\nlines"},
+        {"do": ["undo"]},
+        {"do": "undo"},
+        {"do": "redo"},
+    ],
+    ids=json.dumps,
+)
+def test_a_command_that_cannot_be_done_is_one_line_and_changes_nothing(unchanged, command):
+    session = unchanged
+    before, content = shown(session), session.journal.path.read_bytes()
+    with pytest.raises(BadInput) as error:
+        session.edit(command)
+    assert "\n" not in str(error.value)
+    assert (shown(session), session.journal.path.read_bytes()) == (before, content)
+
+
+def test_edits_of_many_threads_come_one_after_another(begin):
+    session = begin()
+    orders = [{**paint, "start": start, "stop": start + 1, "option": 1 + start % COUNT} for start in range(8)]
+    threads = [threading.Thread(target=session.edit, args=(order,)) for order in orders]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert session.document.labels["demo_0"][:8].tolist() == [1 + start % COUNT for start in range(8)]
+    assert len(session.document.done) == 8
+
+
+# --- refits -----------------------------------------------------------------------------------------------------------
+
+
+def stretches(truth):
+    """Each stretch of equal labels as (first step, step after the last, option)."""
+    edges = [0, *(np.flatnonzero(np.diff(truth)) + 1).tolist(), len(truth)]
+    return [(start, stop, int(truth[start]) + 1) for start, stop in pairwise(edges)]
+
+
+def label(session, index, truth):
+    """Say the truth of a demonstration, the last segment at last."""
+    *first, (start, stop, option) = stretches(truth)
+    session.journal.edit([("paint", session.demos.names[index], *own) for own in first])
+    session.edit({"do": "paint", "demo": index, "start": start, "stop": stop, "option": option})
+
+
+def right(session, demos, rest):
+    """The share of right steps of these demonstrations, where options are labelled in the opposite order."""
+    pairs = [(shown(session)[index][1], demos[index].labels["phase"]) for index in rest]
+    return np.mean(
+        [option == COUNT - truth for steps, own in pairs for (option, _), truth in zip(steps, own, strict=True)]
+    )
+
+
+def test_two_labelled_demonstrations_label_the_others_and_exports_have_the_names(begin, demos, tmp_path):
+    session = begin()
+    before = right(session, demos, range(2, 5))
+    for index in (0, 1):
+        label(session, index, COUNT - 1 - demos[index].labels["phase"])
+    at_once = right(session, demos, range(2, 5))
+    for option, text in enumerate(NAMES, start=1):
+        session.edit({"do": "rename", "option": option, "text": text})
+    session.refit()
+    assert (refitted(session)["done"], refitted(session)["error"]) == (1, "")
+    assert before < at_once
+    assert right(session, demos, range(2, 5)) > 0.95
+    assert right(session, demos, (0, 1)) == 1
+    expected = [[NAMES[option - 1] for option, _ in steps] for _, steps in shown(session)]
+    assert set(expected[4]) == {*NAMES}
+    for name, read in (("csv", by_csv), ("elan", by_elan)):
+        (tmp_path / name).mkdir()
+        assert read(session.export(name, tmp_path / name), demos.names) == expected
+
+
+def by_csv(file, names):
+    """The name at each step of each demonstration, in a table."""
+    rows = list(csv.DictReader(file.read_text().splitlines()))
+    return [[row["option_name"] for row in rows if row["demonstration"] == name] for name in names]
+
+
+def by_elan(folder, names):
+    """The same in files of ELAN, where a step takes a second."""
+    found = []
+    for name in names:
+        root = ElementTree.parse(folder / f"{name}.eaf").getroot()
+        times = {slot.attrib["TIME_SLOT_ID"]: int(slot.attrib["TIME_VALUE"]) // 1000 for slot in root.iter("TIME_SLOT")}
+        found.append(
+            [
+                mark.findtext("ANNOTATION_VALUE")
+                for mark in root.iter("ALIGNABLE_ANNOTATION")
+                for _ in range(times[mark.attrib["TIME_SLOT_REF1"]], times[mark.attrib["TIME_SLOT_REF2"]])
+            ]
+        )
+    return found
+
+
+def test_a_new_option_is_proposed_after_a_refit(begin, demos):
+    session = begin()
+    session.edit({"do": "new", "text": "rest"})
+    for index in (0, 1):
+        truth = np.where(demos[index].labels["phase"] == 1, 4, demos[index].labels["phase"])
+        label(session, index, truth)  # option 2 has no steps
+    session.edit({"do": "accept", "demo": 0})
+    assert refitted(session)["error"] == ""
+    grasped = [
+        option == 5
+        for (_, steps), demo in zip(shown(session)[2:], demos[2:], strict=True)
+        for (option, _), phase in zip(steps, demo.labels["phase"], strict=True)
+        if phase == 1
+    ]
+    assert np.mean(grasped) > 0.8
+
+
+def test_without_labels_there_is_no_refit(begin):
+    with pytest.raises(BadInput, match="nothing is labelled"):
+        begin().refit()
+
+
+# --- files ------------------------------------------------------------------------------------------------------------
+
+
+def test_saved_labels_are_read_back_with_minus_one_where_nothing_is_said(begin, demos, tmp_path):
+    session, source = begin(), tmp_path / "demos.hdf5"
+    content = source.read_bytes()
+    session.edit(paint)
+    session.edit({**paint, "start": 12, "stop": 14, "option": 0})
+    session.edit({"do": "rename", "option": 3, "text": "carry"})
+    assert session.state()["dirty"]
+    session.save()
+    assert not session.state()["dirty"]
+    expected = np.full(len(demos[0]), -1)
+    expected[10:20], expected[12:14] = 3, -1
+    with h5py.File(tmp_path / "out.hdf5") as file:
+        np.testing.assert_array_equal(file["data/demo_0/labels/option"], expected)
+        assert file["data/demo_0/labels/option"].dtype.kind == "i"
+        assert (file["data/demo_1/labels/option"][:] == -1).all()
+        names = json.loads(file["data"].attrs.get("label_names", file.attrs.get("label_names")))
+        assert names["option"][3] == "carry"
+        assert names["phase"] == ["reach", "grasp", "carry", "release"]
+    read = Demonstrations.read(tmp_path / "out.hdf5")
+    np.testing.assert_array_equal(read[0].labels["option"], expected)
+    np.testing.assert_array_equal(read[0].labels["phase"], demos[0].labels["phase"])
+    assert source.read_bytes() == content
+    session.edit({"do": "undo"})
+    session.edit({"do": "undo"})
+    session.save()
+    expected[10:20] = 3
+    np.testing.assert_array_equal(Demonstrations.read(tmp_path / "out.hdf5")[0].labels["option"], expected)
+
+
+def test_labels_go_into_the_file_itself_again_and_again(begin, tmp_path):
+    session = begin("demos.hdf5")
+    for start in (0, 5):
+        session.edit({**paint, "start": start, "stop": start + 5, "option": 1})
+        session.save()
+        assert session.state()["warnings"] == []
+    labels = Demonstrations.read(tmp_path / "demos.hdf5")[0].labels["option"]
+    assert labels[:10].tolist() == [1] * 10
+    assert (labels[10:] == -1).all()
+
+
+def test_a_source_that_changed_underneath_is_said_and_nothing_is_saved(begin, demos, tmp_path):
+    session = begin()
+    session.edit(paint)
+    session.save()
+    content = (tmp_path / "out.hdf5").read_bytes()
+    session.edit({"do": "undo"})
+    Demonstrations(demos[:3]).write(tmp_path / "demos.hdf5")
+    (warning,) = session.state()["warnings"]
+    assert str(tmp_path / "demos.hdf5") in warning
+    with pytest.raises(BadInput, match="changed"):
+        session.save()
+    assert (tmp_path / "out.hdf5").read_bytes() == content
+
+
+def test_an_out_of_something_else_is_refused(begin, tmp_path):
+    (tmp_path / "other.hdf5").write_text("mine")
+    with pytest.raises(BadInput, match="not a labelled copy"):
+        begin("other.hdf5")
+    assert not list(tmp_path.glob("*.journal"))
+
+
+def test_what_is_closed_is_saved_and_left_to_others(begin, tmp_path):
+    session = begin()
+    session.edit(paint)
+    with pytest.raises(BadInput, match="is open in a process"):
+        begin()
+    session.close()
+    assert Demonstrations.read(tmp_path / "out.hdf5")[0].labels["option"][10] == 3
+    assert begin().state()["demos"][0]["labelled"] == 10
+
+
+def test_a_format_that_is_none_is_refused(begin, tmp_path):
+    with pytest.raises(BadInput, match="csv"):
+        begin().export("xls", tmp_path)
