@@ -75,7 +75,7 @@ def label(
 
 
 def _fitted(file: Path) -> Path:
-    """A run fitted to the file, without baselines; that of before where there is one."""
+    """A run fitted to the file, without baselines; a finished one is used again."""
     folder = Path("runs") / file.stem
     spec, run = folder / "spec.yaml", folder / "run"
     if not (run / "metrics.json").exists():
