@@ -612,6 +612,7 @@ class Session:
         with self.lock:
             self.granularity = way
             self.take(self.ways[way])
+            self.ways = {}
 
     # --- files --------------------------------------------------------------------------------------------------------
 
