@@ -26,10 +26,10 @@ from ddco_pyro.encoding import Encoding, encode
 from ddco_pyro.encoding.autoencoder import Convolutions
 from ddco_pyro.events import EpochEnded, Event
 from ddco_pyro.inference import log_likelihood
-from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.model import hierarchy as networks
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.spec import parse_spec
+from ddco_pyro.training.devices import one_thread
 from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.restarts import Trainer
 

@@ -45,7 +45,7 @@ from torch.func import functional_call
 from ddco_pyro import Demonstration, Demonstrations, EliminatedAHMM, fit
 from ddco_pyro.fitting.draws import matched
 from ddco_pyro.inference import log_likelihood, most_likely_path, posterior, sample_paths
-from ddco_pyro.inference.enumeration import known_controls
+from ddco_pyro.inference.engines import known_controls
 from ddco_pyro.inference.marginal import bayesian_ahmm
 from ddco_pyro.model.ahmm import Acting, ahmm, choose
 from ddco_pyro.model.batch import encode

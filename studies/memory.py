@@ -18,8 +18,7 @@ from study import RESULTS, ROOT
 from ddco_pyro.drawing.figures import FAINT, blank, save, style
 from ddco_pyro.study.declaration import Study
 from ddco_pyro.study.report import name_of
-from ddco_pyro.study.statistics import estimate
-from ddco_pyro.study.table import earlier, values
+from ddco_pyro.study.table import earlier, estimate, values
 
 COLOURS = {"mixture - flat": "#c08a30", "options - mixture": "#1f3f70"}
 NAMED = {

@@ -22,8 +22,7 @@ from ddco_pyro.errors import BadInput, Failed
 from ddco_pyro.jobs import Workers
 from ddco_pyro.study import cells
 from ddco_pyro.study.report import shown as mean_and_interval
-from ddco_pyro.study.statistics import estimate
-from ddco_pyro.study.table import COLUMNS, read_tidy
+from ddco_pyro.study.table import COLUMNS, estimate, read_tidy
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "docs" / "results"

@@ -9,6 +9,7 @@ import io
 import os
 import sys
 from pathlib import Path
+from unittest import mock
 
 import pytest
 import torch
@@ -20,6 +21,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from ddco_pyro import exporting
+from ddco_pyro.errors import Failed
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.spec import parse_spec
 
@@ -91,6 +93,12 @@ def watched():
 def toy_run(cache, tmp_path_factory, toy_spec, watched):
     """A fit of the toy task with both baselines beside it; nobody changes its folder."""
     return fit(toy_spec, out=tmp_path_factory.mktemp("runs") / "toy", on_event=watched)
+
+
+@pytest.fixture
+def undecided(monkeypatch):
+    """``init`` asks no small fits, as where they fail: they take most of its time."""
+    monkeypatch.setattr("ddco_pyro.selection.small.decide", mock.Mock(side_effect=Failed("no small fits")))
 
 
 @pytest.fixture

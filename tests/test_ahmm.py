@@ -13,7 +13,7 @@ from oracle import brute_force, paths, random_tables
 from pyro.infer.inspect import get_model_relations
 
 from ddco_pyro.inference import log_likelihood
-from ddco_pyro.inference.enumeration import known_controls
+from ddco_pyro.inference.engines import known_controls
 from ddco_pyro.model.ahmm import ahmm
 from ddco_pyro.model.tables import NEVER, Tables, complete
 

@@ -14,8 +14,8 @@ from oracle import brute_force
 from pyro.infer import Predictive
 from scipy import special, stats
 
-from ddco_pyro.inference import enumeration, log_likelihood
-from ddco_pyro.inference.engines import compare_engines
+from ddco_pyro.inference import log_likelihood
+from ddco_pyro.inference.engines import compare_engines, enumerated
 from ddco_pyro.model.ahmm import Acting, ahmm
 from ddco_pyro.model.emissions import Binary, Categorical, Clipped, Gaussian, Hurdle, Product
 from ddco_pyro.model.emissions.clipped import log_ndtr
@@ -88,8 +88,8 @@ def test_the_program_scores_what_the_tables_hold(counts):
     outputs, batch, _ = said(counts, ("options", "control") if counts else ("control",))
     outputs, actions = outputs.map(torch.Tensor.double), batch.actions.double()
     tables = outputs.tables(actions)
-    by_emissions = enumeration.log_likelihood(tables, batch.lengths, outputs.emissions, actions)
-    torch.testing.assert_close(by_emissions, enumeration.log_likelihood(tables, batch.lengths), rtol=1e-12, atol=0)
+    by_emissions = enumerated(tables, batch.lengths, outputs.emissions, actions)
+    torch.testing.assert_close(by_emissions, enumerated(tables, batch.lengths), rtol=1e-12, atol=0)
 
 
 def test_who_cannot_be_does_not_act():

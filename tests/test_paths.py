@@ -12,7 +12,7 @@ from oracle import paths, random_tables
 from pyro.infer import TraceEnum_ELBO, infer_discrete
 
 from ddco_pyro.inference import most_likely_path, posterior, sample_paths, segment
-from ddco_pyro.inference.enumeration import known_controls
+from ddco_pyro.inference.engines import known_controls
 from ddco_pyro.model.ahmm import ahmm
 from ddco_pyro.model.tables import NEVER, Tables, complete
 

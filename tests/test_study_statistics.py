@@ -9,8 +9,7 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from ddco_pyro.study.statistics import estimate, holm
-from ddco_pyro.study.table import COLUMNS, values
+from ddco_pyro.study.table import COLUMNS, estimate, holm, values
 
 ROOT = Path(__file__).parents[1]
 

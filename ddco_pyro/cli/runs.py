@@ -291,9 +291,9 @@ def segment(
         raise BadInput(f"{demos}: labels go into whole files only; first: {again}")
     from ddco_pyro.cli import console
     from ddco_pyro.data.sources import open_source
+    from ddco_pyro.evaluation.agreement import agreement_table, tolerances
     from ddco_pyro.fitting.fitted import load
     from ddco_pyro.segmenting import baseline_labels, beside_baselines, beside_others, segments
-    from ddco_pyro.segmenting.agreement import agreement_table, tolerances
     from ddco_pyro.segmenting.baselines import BASELINES, check_installed
     from ddco_pyro.segmenting.formats import Asked
     from ddco_pyro.selection.small import GRANULARITIES, cut

@@ -45,7 +45,7 @@ from ddco_pyro.encoding.fitted import FittedReader
 from ddco_pyro.encoding.pictures import Pictures, batches
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
-from ddco_pyro.inference.threads import one_thread
+from ddco_pyro.training.devices import one_thread
 
 MADE = "encoded"
 """Attribute of a file: the digest of everything that decides its contents."""

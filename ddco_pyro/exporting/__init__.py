@@ -18,8 +18,7 @@ import torch
 from ddco_pyro.data.files import whole_folder
 from ddco_pyro.errors import BadInput, Failed
 from ddco_pyro.exporting import runner
-from ddco_pyro.exporting.description import describe
-from ddco_pyro.exporting.program import StepProgram
+from ddco_pyro.exporting.description import StepProgram, describe
 from ddco_pyro.exporting.recording import MOST, record, tolerance
 from ddco_pyro.exporting.runner import TOLERANCE
 from ddco_pyro.fitting.fitted import Fit

@@ -11,7 +11,7 @@ import torch
 
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.exporting import runner
-from ddco_pyro.exporting.program import named
+from ddco_pyro.exporting.description import named
 from ddco_pyro.model.encoder import ObservationEncoder
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs, States

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Literal, NamedTuple
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, Literal, NamedTuple
 
+import pyro
 import torch
+from pyro.ops.contract import contract_tensor_tree
 from torch import Tensor
 
-from ddco_pyro.inference import enumeration, fused, logspace
+from ddco_pyro.inference import fused, logspace
+from ddco_pyro.model.ahmm import Scored, ahmm
+from ddco_pyro.model.emissions import Steps
 from ddco_pyro.model.outputs import Outputs
 from ddco_pyro.model.tables import Tables, complete
 
@@ -43,7 +49,7 @@ def log_likelihood(tables: Tables, lengths: Tensor, engine: Engine = "fused") ->
     tensor([16.0000], dtype=torch.float64)
     """
     if engine == "enumerate":
-        return enumeration.log_likelihood(tables, lengths)
+        return enumerated(tables, lengths)
     if lengths.device.type == "cpu":
         return fused.log_likelihood(tables, lengths)
     return logspace.log_likelihood(complete(tables, lengths))
@@ -70,7 +76,7 @@ def compare_engines(outputs: Outputs, actions: Tensor, lengths: Tensor) -> Engin
     controls = actions.double()
 
     def by_program(said: Outputs) -> Tensor:
-        return enumeration.log_likelihood(said.tables(controls), lengths, said.emissions, controls)
+        return enumerated(said.tables(controls), lengths, said.emissions, controls)
 
     truth, slopes = _with_gradient(outputs, by_program)
     value, gradient = _with_gradient(outputs, lambda said: log_likelihood(said.tables(controls), lengths))
@@ -91,3 +97,42 @@ def _with_gradient(outputs: Outputs, engine: Callable[[Outputs], Tensor]) -> tup
     value = engine(outputs.map(leaf)).sum()
     gradients = torch.autograd.grad(value, leaves, allow_unused=True, materialize_grads=True)
     return value.detach(), torch.cat([gradient.flatten() for gradient in gradients])
+
+
+# --- Pyro's enumeration -----------------------------------------------------------------------------------------------
+
+BATCH_DIMENSIONS = 1
+"""Dimensions of the program's plate; enumeration takes the dimensions to their left."""
+
+
+def enumerated(
+    tables: Tables, lengths: Tensor, emissions: Sequence[Steps | None] | None = None, actions: Tensor | None = None
+) -> Tensor:
+    """log p(ξ) of each trajectory, [N] float64, differentiable in the tables.
+
+    This is the elimination of ``TraceEnum_ELBO`` without its sum over the plate of demonstrations.
+
+    :param emissions: score the controls ``actions`` [N, T, A] in place of the tables' densities.
+    """
+    if emissions is None:
+        emissions, actions = known_controls(tables)
+    chain = complete(tables, lengths)
+    unused = ~chain.alive[..., None, None]  # may hold NaN
+    chain = replace(chain, selection=tuple(table.masked_fill(unused, 0.0) for table in chain.selection))
+    with pyro.poutine.enum(first_available_dim=-1 - BATCH_DIMENSIONS), pyro.poutine.trace() as traced:
+        ahmm(chain, emissions, actions)
+    trace = traced.trace
+    trace.compute_log_prob()
+    trace.pack_tensors()
+    factors: list[Any] = [
+        site["packed"]["log_prob"] for site in trace.nodes.values() if "log_prob" in site.get("packed", {})
+    ]
+    enumerated = set("".join(factor._pyro_dims for factor in factors)) - {*trace.plate_to_symbol.values()}
+    (parts,) = contract_tensor_tree(OrderedDict([(frozenset(), factors)]), enumerated).values()
+    total: Tensor = sum(parts)
+    return total.expand(len(lengths))
+
+
+def known_controls(tables: Tables) -> tuple[list[Scored], Tensor]:
+    """Emissions and controls for :func:`ddco_pyro.model.ahmm.ahmm` where tables hold the densities."""
+    return [Scored(table) for table in tables.control], torch.empty(*tables.control[-1].shape[:2], 0)

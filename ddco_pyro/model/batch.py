@@ -13,8 +13,8 @@ from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
 from ddco_pyro.data.pictures import Readers
 from ddco_pyro.model.controls import ControlScaling, refuse_impossible
 from ddco_pyro.model.encoder import ObservationEncoder, padded
-from ddco_pyro.model.frames import Frames
 from ddco_pyro.model.networks import Inputs
+from ddco_pyro.model.networks.inputs import Frames
 
 STEPS_AT_ONCE = 8192
 """Most steps of a piece of a batch; fewer where a step takes much memory

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from ddco_pyro.data.checks import reading, rounding
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.pictures import PICTURE_DIMENSIONS, Observed, Pictures, Transform, TransformError
-from ddco_pyro.model.frames import Frames
 from ddco_pyro.model.networks import Inputs, InputShape, ShapeError
+from ddco_pyro.model.networks.inputs import Frames
 from ddco_pyro.spec import STEP, AugmentSpec, ObservationSpec
 
 Shapes = Mapping[str, tuple[int, ...]]

@@ -8,12 +8,12 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.sources.recording import label_names
 from ddco_pyro.drawing.page import Block, Section, Table, Text, footnote, note
 from ddco_pyro.drawing.words import capital, number, percent
+from ddco_pyro.evaluation.agreement import EXPLAINED, agreement_table, tolerances
 from ddco_pyro.evaluation.effort import contributions, recogniser
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Confusion, Scores
 from ddco_pyro.names import label_name, option_name
 from ddco_pyro.report.options import quoted
-from ddco_pyro.segmenting.agreement import EXPLAINED, agreement_table, tolerances
 from ddco_pyro.segmenting.baselines import BASELINES, EQUAL, RECOGNISED
 
 

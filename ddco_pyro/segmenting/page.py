@@ -19,10 +19,10 @@ from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.drawing.page import Block, Cell, Page, Section, Table, Text, footnote, note
 from ddco_pyro.drawing.timeline import Lane, Runs, Timelines, Track, following
 from ddco_pyro.drawing.words import NAT, duration, number, percent
+from ddco_pyro.evaluation.agreement import EXPLAINED, agreement_table, tolerances
 from ddco_pyro.evaluation.options import on_paths
 from ddco_pyro.names import label_name, numbered_name, option_name
 from ddco_pyro.segmenting import Segmented, Segments
-from ddco_pyro.segmenting.agreement import EXPLAINED, agreement_table, tolerances
 from ddco_pyro.spec import PathSpec
 
 HOW = (

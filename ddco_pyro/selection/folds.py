@@ -14,9 +14,9 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import Damaged, json_text, write_text
 from ddco_pyro.errors import BadInput, Failed, reason
 from ddco_pyro.fitting.fitted import Fit
-from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.metrics import Record, read_record
 from ddco_pyro.selection.grid import Candidate
+from ddco_pyro.training.devices import one_thread
 from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.restarts import train_model
 

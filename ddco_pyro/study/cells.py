@@ -34,7 +34,6 @@ from ddco_pyro.fitting.digest import Digest, digest, recorded
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.inference import compile_all
-from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.jobs import Workers, processes, run_all
 from ddco_pyro.metrics import Record, read_record
 from ddco_pyro.simulation.collect import collect
@@ -44,6 +43,7 @@ from ddco_pyro.spec.yaml import read_yaml
 from ddco_pyro.study.declaration import NATS, Study
 from ddco_pyro.study.table import CELL, COLUMNS, earlier
 from ddco_pyro.training import data
+from ddco_pyro.training.devices import one_thread
 from ddco_pyro.training.networks import Dimensions, baseline_spec, named_baselines
 
 

@@ -18,12 +18,10 @@ from ddco_pyro.drawing import words
 from ddco_pyro.drawing.figures import Interval, Panel, interval_plot, save, style
 from ddco_pyro.drawing.page import Block, Page, Picture, Section, Table, Text, note
 from ddco_pyro.errors import BadInput, nearest
-from ddco_pyro.evaluation.agreement import MATCHED, UNMATCHED
-from ddco_pyro.segmenting.agreement import measure_names
+from ddco_pyro.evaluation.agreement import MATCHED, UNMATCHED, measure_names
 from ddco_pyro.study.cells import Folder, State
 from ddco_pyro.study.declaration import NATS, ContrastSpec, Study
-from ddco_pyro.study.statistics import LEVEL, Estimate, estimate, holm
-from ddco_pyro.study.table import earlier, read_tidy, values
+from ddco_pyro.study.table import LEVEL, Estimate, earlier, estimate, holm, read_tidy, values
 
 FILES = ("table.csv", "page.md", "page.html", "contrasts.png", "methods.png")
 """The files of a study's report."""

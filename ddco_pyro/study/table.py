@@ -1,14 +1,18 @@
-"""Tidy tables of results: a number in each row, which a task, a method and a training seed name."""
+"""Tidy tables of results, a number in each row, which a task, a method and a training seed name; estimates of means."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 
 from ddco_pyro.data.files import Damaged
 from ddco_pyro.errors import BadInput
+from ddco_pyro.statistics import CONFIDENCE, mean_interval, rate, t_quantile
 from ddco_pyro.study.declaration import Study
 
 COLUMNS = ["study", "task", "method", "demonstrations", "seed", "measure", "value"]
@@ -70,3 +74,81 @@ def values(
         found = (of(ours, demonstrations[0]) - of(theirs, demonstrations[-1])).dropna()
     seeds = found.index.get_level_values("seed")
     return found[(seeds != "") | (seeds == "").all()]  # a row without seed is the summary of the others
+
+
+# --- estimates --------------------------------------------------------------------------------------------------------
+
+LEVEL = (1 - CONFIDENCE) / 2
+"""One-sided level of the tests, which corresponds to two-sided 95 % intervals."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A mean over tasks of means over seeds.
+
+    :param error: the standard error; NaN, as the interval is, where the units have no spread or there is one.
+    :param interval: the 95 % t interval.
+    :param units: the means of the tasks, or the values of the seeds of a single task.
+    """
+
+    value: float
+    error: float
+    interval: tuple[float, float]
+    units: tuple[float, ...]
+
+    @property
+    def median(self) -> tuple[float, tuple[float, float]]:
+        """The median unit and its exact interval of at least 95 %, whatever the distribution; NaN below six units."""
+        from scipy.stats import quantile_test
+
+        middle = float(np.median(self.units))
+        ends = quantile_test(self.units, q=middle, p=0.5).confidence_interval(CONFIDENCE)
+        return middle, (float(ends.low), float(ends.high))
+
+    def p_value(self, bound: float) -> float:
+        """The one-sided p-value of the t test of "the mean is at most ``bound``"; NaN without a standard error.
+
+        Superiority by a margin has the bound +margin, non-inferiority −margin.
+        """
+        from scipy.stats import t
+
+        return float(t.sf((self.value - bound) / self.error, len(self.units) - 1))
+
+
+def estimate(values: pd.Series, trials: int = 0, lowest: float = -1.0) -> Estimate:
+    """The mean and its t interval.
+
+    >>> found = estimate(pd.Series({("push", 0): 1.0, ("push", 1): 2.0, ("push", 2): 3.0}))
+    >>> found.value, round(found.interval[0], 3)
+    (2.0, -0.484)
+
+    :param values: by task and training seed.
+    :param trials: of each fit, where the values are rates or their differences. Equal units have Wilson's interval of
+        all trials, a difference that of as many trials with different outcomes.
+    :param lowest: the least possible value of a rate: 0, or -1 of a difference.
+    """
+    means = np.array([of_task.to_numpy().mean() for _, of_task in values.groupby(level=0, sort=False)])
+    units = means if len(means) > 1 else values.to_numpy()
+    value, error, interval = float(means.mean()), math.nan, (math.nan, math.nan)
+    if len(units) > 1 and not np.allclose(units, units[0], rtol=1e-9, atol=1e-12):
+        error, interval = float(units.std(ddof=1) / math.sqrt(len(units))), mean_interval(units)
+    elif len(units) > 1 and trials:
+        number = trials * len(values)
+        count = round(abs(value) * number)
+        low, high = rate(count, number)["interval"]
+        least, most = sorted((math.copysign(low, value), math.copysign(high, value)))
+        interval = (least, most) if count else (max(lowest, -high), high)
+        error = (interval[1] - interval[0]) / 2 / t_quantile(math.inf)
+    return Estimate(value, error, interval, tuple(map(float, units)))
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Holm's adjusted p-values, in the given order; a NaN counts as 1.
+
+    >>> [round(p, 6) for p in holm([0.01, 0.04, 0.03])]
+    [0.03, 0.06, 0.06]
+    """
+    known = np.nan_to_num(np.array(p_values, float), nan=1.0)
+    order = np.argsort(known)
+    known[order] = np.minimum(np.maximum.accumulate(known[order] * np.arange(len(known), 0, -1)), 1.0)
+    return known.tolist()

@@ -1,4 +1,4 @@
-"""The device of the networks (``training.device``), and bit-for-bit repeatable work on it."""
+"""The device of the networks (``training.device``), and what makes work on it bit-for-bit repeatable."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch
+from threadpoolctl import threadpool_limits
 
 from ddco_pyro.model.seeding import HOST
 from ddco_pyro.spec import SpecError, TrainingSpec
@@ -54,3 +55,18 @@ def repeatable(device: torch.device) -> Iterator[None]:
             yield
     finally:
         torch.use_deterministic_algorithms(before)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Run torch, numpy and scikit-learn on one thread inside.
+
+    Small networks run faster so, and results are the same in any process.
+    """
+    before = torch.get_num_threads()
+    with threadpool_limits(1):
+        torch.set_num_threads(1)
+        try:
+            yield
+        finally:
+            torch.set_num_threads(before)

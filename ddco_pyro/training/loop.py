@@ -25,14 +25,13 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from ddco_pyro.data.pictures import Readers
 from ddco_pyro.events import EpochEnded, OnEvent, ignore
-from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.seeding import seed as seed_generators
 from ddco_pyro.model.seeding import seeded
 from ddco_pyro.model.tables import Tables
 from ddco_pyro.training.checkpoint import Restart, State, TrainingData, copy_of
-from ddco_pyro.training.devices import device_of, repeatable
+from ddco_pyro.training.devices import device_of, one_thread, repeatable
 from ddco_pyro.training.em import Expectation
 from ddco_pyro.training.objective import Diverged, Objective, read_ahead
 from ddco_pyro.training.optimizers import (

@@ -14,8 +14,8 @@ from ddco_pyro.data.pictures import Job
 from ddco_pyro.errors import Failed
 from ddco_pyro.inference.engines import log_likelihood
 from ddco_pyro.model.batch import Batch
-from ddco_pyro.model.frames import Frames
 from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.networks.inputs import Frames
 from ddco_pyro.model.tables import Tables, always_ends
 from ddco_pyro.spec import DurationSpec
 from ddco_pyro.training.checkpoint import Progress, State, TrainingData

@@ -32,7 +32,6 @@ from ddco_pyro.events import (
 )
 from ddco_pyro.inference.engines import STEPS, TRAJECTORIES, EngineCheck, compare_engines
 from ddco_pyro.inference.paths import segment
-from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.jobs import Workers, processes, run_all
 from ddco_pyro.model.batch import encode, refuse_unusable
 from ddco_pyro.model.hierarchy import Hierarchy
@@ -40,7 +39,7 @@ from ddco_pyro.model.seeding import seeded
 from ddco_pyro.spec import Spec, with_overrides
 from ddco_pyro.training.checkpoint import Progress, Restart, TrainingData
 from ddco_pyro.training.data import tuning_split
-from ddco_pyro.training.devices import described, device_of
+from ddco_pyro.training.devices import described, device_of, one_thread
 from ddco_pyro.training.labels import Labels
 from ddco_pyro.training.loop import train
 from ddco_pyro.training.networks import Dimensions, build_hierarchy, model_name
