@@ -143,7 +143,7 @@ def an_array(shape: tuple[int, ...], dtype: str, random: np.random.Generator) ->
     dtype=st.sampled_from(TYPES),
     alone=st.booleans(),
 )
-@settings(max_examples=12, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=5, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @example(shape=(4, 6, 8, 3), dtype="u1", alone=True)
 @example(shape=(4, 6, 8, 3), dtype="u1", alone=False)
 @example(shape=(6, 8, 3), dtype="u1", alone=True)
