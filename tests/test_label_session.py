@@ -1,7 +1,9 @@
 """A session of labelling: what is shown, changed and saved, against the fit, the planted truth, and files read back."""
 
+import contextlib
 import csv
 import json
+import subprocess
 import threading
 import time
 from dataclasses import replace
@@ -9,8 +11,10 @@ from itertools import pairwise
 from xml.etree import ElementTree
 
 import h5py
+import httpx2
 import numpy as np
 import pytest
+from command_line import COMMAND
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from time_lines import unpacked
@@ -22,7 +26,7 @@ from ddco_pyro.errors import BadInput
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.labelling.document import FREE, OPEN
 from ddco_pyro.labelling.session import Session
-from ddco_pyro.spec import parse_spec
+from ddco_pyro.spec import parse_spec, with_overrides
 
 COUNT, NAMES = 4, ("let go", "carry", "close", "come")
 
@@ -489,3 +493,47 @@ def test_what_is_closed_is_saved_and_left_to_others(begin, tmp_path):
 def test_a_format_that_is_none_is_refused(begin, tmp_path):
     with pytest.raises(BadInput, match="csv"):
         begin().export("xls", tmp_path)
+
+
+@pytest.mark.slow
+def test_a_killed_command_loses_at_most_the_edit_in_flight_and_goes_on(demos, run, tmp_path):
+    """As people call it: killed by -9 while edits come, called again, terminated, and its labels read."""
+    file, out = tmp_path / "demos.hdf5", tmp_path / "out.hdf5"
+    demos.write(file)
+    fit(with_overrides(run.spec, {"demonstrations.path": str(file)}), out=tmp_path / "run")
+    command = [COMMAND, "label", tmp_path / "run", file, "--out", out, "--no-browser"]
+
+    def begin():
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        assert process.stdout is not None
+        address = process.stdout.readline().strip()
+        assert address.startswith("http://127.0.0.1:"), process.communicate()
+        return process, httpx2.Client(base_url=address, trust_env=False, timeout=60)
+
+    process, client = begin()
+    refused = subprocess.run(command, capture_output=True, text=True)
+    assert refused.returncode == 2
+    assert str(client.base_url).rstrip("/") in refused.stderr
+    said = 0
+    killer = threading.Timer(1.5, process.kill)
+    killer.start()
+    with contextlib.suppress(httpx2.HTTPError):
+        while True:
+            start = said % 40
+            order = {**paint, "start": start, "stop": start + 1, "option": 1 + said // 40 % COUNT}
+            assert client.post("edit", json=order).status_code == 200
+            said += 1
+    process.communicate()
+    assert said
+    process, client = begin()
+    undone = 0
+    while client.get("state").json()["can_undo"]:
+        assert client.post("edit", json={"do": "undo"}).status_code == 200
+        undone += 1
+    assert undone - said in (0, 1)
+    assert client.post("edit", json=paint).status_code == 200
+    process.terminate()
+    process.communicate()
+    assert process.returncode == 0
+    labels = Demonstrations.read(out)[0].labels["option"]
+    assert labels.tolist() == [3 if 10 <= step < 20 else -1 for step in range(len(labels))]
