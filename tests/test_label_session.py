@@ -416,6 +416,35 @@ def test_without_labels_there_is_no_refit(begin):
         begin().refit()
 
 
+def test_a_refit_that_fails_unexpectedly_is_said_and_can_be_asked_for_again(begin, demos, monkeypatch):
+    session = begin()
+    label(session, 0, demos[0].labels["phase"])
+    with monkeypatch.context() as patch:
+        patch.setattr(Session, "_away", lambda session, calls: {}[0])
+        session.refit()
+        assert refitted(session)["error"] == "unexpected KeyError: 0"
+    session.refit()
+    assert (refitted(session)["error"], refitted(session)["done"]) == ("", 1)
+
+
+def test_labels_that_are_undone_while_a_refit_runs_need_no_other_refit(begin, monkeypatch):
+    session, begun, go_on, away = begin(), threading.Event(), threading.Event(), Session._away
+
+    def waiting(session, calls):
+        begun.set()
+        go_on.wait()
+        return away(session, calls)
+
+    monkeypatch.setattr(Session, "_away", waiting)
+    session.edit(paint)
+    session.refit()
+    begun.wait()
+    session.refit()  # once more, as soon as the first has come to its end
+    session.edit({"do": "undo"})
+    go_on.set()
+    assert (refitted(session)["error"], refitted(session)["done"]) == ("", 1)
+
+
 # --- files ------------------------------------------------------------------------------------------------------------
 
 

@@ -19,7 +19,7 @@ from ddco_pyro.data.sources.recording import label_names
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.drawing.shown import frames, jpeg, paths_of, stored_pictures
 from ddco_pyro.drawing.timeline import following, text
-from ddco_pyro.errors import BadInput, Failed
+from ddco_pyro.errors import BadInput, reason
 from ddco_pyro.evaluation.inferred import runs
 from ddco_pyro.fitting.fit import fit as fit_to
 from ddco_pyro.fitting.fitted import Fit
@@ -508,11 +508,14 @@ class Session:
     def refit(self) -> None:
         """Fit again in another process, with the labels and a recogniser of them; what comes of it is shown then."""
         with self.lock:
-            if not any(self.document.said(name).any() for name in self.demos.names):
+            if not self._is_labelled():
                 raise BadInput("refit: nothing is labelled yet")
             self.again = self.running
             if not self.running:
                 self._start(self._refit, "fitting the labels")
+
+    def _is_labelled(self) -> bool:
+        return any(bool(self.document.said(name).any()) for name in self.demos.names)
 
     def _start(self, work: Callable[[], None], message: str) -> None:
         self.running, self.message, self.error = True, message, ""
@@ -520,11 +523,11 @@ class Session:
         def do() -> None:
             try:
                 work()
-            except (BadInput, Failed) as error:
-                self.error = str(error)
+            except Exception as error:  # the page says what has failed, and labelling goes on
+                self.error = reason(error)
             finally:
                 with self.lock:
-                    self.running, self.message, again = False, "", self.again
+                    self.running, self.message, again = False, "", self.again and self._is_labelled()
                     self.again = False
                     self.revision += 1
                     if again:
