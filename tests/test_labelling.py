@@ -10,6 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from ddco_pyro.data.files import Damaged
 from ddco_pyro.errors import BadInput
 from ddco_pyro.labelling.document import FREE, OPEN, Document
 from ddco_pyro.labelling.journal import Journal
@@ -186,3 +187,51 @@ def test_an_edit_is_on_disk_when_the_call_returns(tmp_path):
     journal.edit([("accept", "demo_1", True, 0.5, 1)])
     assert json.loads(path.read_bytes().splitlines()[-1]) == [["accept", "demo_1", True, 0.5, 1]]
     journal.close()
+
+
+@pytest.mark.parametrize(
+    ("content", "line"),
+    [
+        (b"mine", 1),
+        (b"mine\nand more", 1),
+        (b'{"labels":7', None),
+        (b"HEADER{\n", 2),
+        (b'HEADER[["paint","demo_9",0,1,1]]\n', 2),
+        (b'HEADER[["accept","demo_0",true,0.0,0]]\n"undo"\n"undo"\n["torn', 4),
+    ],
+)
+def test_a_file_that_is_no_journal_stays_as_it_is(tmp_path, content, line):
+    path = tmp_path / "labels.journal"
+    Journal(path, empty(), "option").close()
+    content = content.replace(b"HEADER", path.read_bytes())
+    path.write_bytes(content)
+    if line is None:  # torn
+        Journal(path, empty(), "option").close()
+        return
+    with pytest.raises(Damaged, match=f"line {line} is none of a journal of labels; move it away"):
+        Journal(path, empty(), "option")
+    assert path.read_bytes() == content
+
+
+def test_an_edit_that_a_full_disk_cuts_is_not_made(tmp_path):
+    """With a limit of the size of files; Python ignores the signal of it."""
+    code = """
+import resource, sys
+exec(sys.argv[2])
+size = journal.path.stat().st_size
+resource.setrlimit(resource.RLIMIT_FSIZE, (size + 20, resource.RLIM_INFINITY))
+try:
+    journal.edit([("paint", "demo_0", 0, 6, 2)])
+except OSError as error:
+    print(error.strerror, journal.path.stat().st_size - size, journal.document.labels["demo_0"].max())
+resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY,) * 2)
+journal.edit([("paint", "demo_0", 0, 6, 1)])
+"""
+    begun = WRITER.partition("journal.at")[0]
+    path = tmp_path / "labels.journal"
+    ended = subprocess.run([sys.executable, "-c", code, path, begun], capture_output=True, text=True)
+    assert (ended.stdout, ended.stderr) == ("No space left on device 0 -1\n", "")
+    document = empty()
+    Journal(path, document, "option").close()
+    assert document.labels["demo_0"].tolist() == [1] * 6
+    assert len(document.done) == 1

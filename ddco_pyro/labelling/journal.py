@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import getpass
 import hashlib
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ddco_pyro.data.files import Damaged
 from ddco_pyro.errors import BadInput
 from ddco_pyro.labelling.document import Change, Document
 
@@ -18,6 +20,9 @@ SUFFIX = ".journal"
 """Of the file of edits, beside the file of labels."""
 
 UNDO, REDO = "undo", "redo"
+
+HEADER = b'{"labels":'
+"""What a journal begins with."""
 
 
 def version(path: Path) -> list[int]:
@@ -36,35 +41,58 @@ class Journal:
 
     :param path: of the file; it is made where it is missing.
     :param document: gets the edits of the file. Its lengths and ``level`` must be those of the file.
-    :param names: of the options where the file is new.
     :raises BadInput: another process has the file, or it is of other demonstrations.
+    :raises Damaged: a line is none of a journal, which stays as it is.
     """
 
     def __init__(self, path: Path, document: Document, level: str) -> None:
         self.path, self.document = path, document
         path.parent.mkdir(parents=True, exist_ok=True)
-        self.file = open(path, "a+b")  # noqa: SIM115  (open as long as this object)
+        self.file = open(path, "a+b", buffering=0)  # noqa: SIM115  (open as long as this object)
         try:
             fcntl.flock(self.file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             self.file.close()
             raise BadInput(f"{path}: is open in {self._holder()}; end it, or give another --out") from None
-        self.file.seek(0)
-        lines = self.file.read().split(b"\n")
-        whole = sum(len(line) + 1 for line in lines[:-1])
-        self.file.truncate(whole)  # a torn last line was never acknowledged
         header = {"labels": digest(dict(document.lengths), level), "names": list(document.names)}
-        if whole:
-            known = json.loads(lines[0])
-            if known.get("labels") != header["labels"]:
-                self.close()
-                raise BadInput(f"{path}: has edits of other demonstrations or of another level; give another --out")
-            document.names = tuple(known["names"])
-            for line in lines[1:-1]:
-                self._apply(json.loads(line))
-        else:
+        try:
+            whole = self._read(header)
+        except BadInput:
+            self.close()
+            raise
+        self.file.truncate(whole)  # a torn last line was never acknowledged
+        if not whole:
             self._append(header)
         self._held_by(f"a process of {getpass.getuser()}, {os.getpid()}")
+
+    def _read(self, header: Mapping[str, Any]) -> int:
+        """Make the edits of the file.
+
+        :returns: the bytes of whole lines.
+        """
+        self.file.seek(0)
+        content = self.file.read()
+        *lines, _ = content.split(b"\n")
+        number = 1
+        try:
+            if not HEADER.startswith(content[: len(HEADER)]):
+                raise ValueError
+            if lines:
+                known = json.loads(lines[0])
+                if known["labels"] != header["labels"]:
+                    raise BadInput(
+                        f"{self.path}: has edits of other demonstrations or of another level; give another --out"
+                    )
+                self.document.names = tuple(known["names"])
+            for line in lines[1:]:
+                number += 1
+                self._apply(json.loads(line))
+        except BadInput:
+            raise
+        except (ValueError, TypeError, LookupError):
+            remedy = "move it away to begin anew, or give another --out"
+            raise Damaged(self.path, f"line {number} is none of a journal of labels", remedy) from None
+        return sum(len(line) + 1 for line in lines)
 
     def edit(self, changes: Sequence[Change]) -> None:
         """Make an edit of the document, once it is on disk."""
@@ -102,9 +130,15 @@ class Journal:
         self._apply(entry)
 
     def _append(self, entry: Any) -> None:
-        self.file.write(json.dumps(entry, separators=(",", ":")).encode() + b"\n")
-        self.file.flush()
-        os.fsync(self.file.fileno())
+        line = json.dumps(entry, separators=(",", ":")).encode() + b"\n"
+        before = os.fstat(self.file.fileno()).st_size
+        try:
+            if self.file.write(line) < len(line):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.path))
+            os.fsync(self.file.fileno())
+        except OSError:
+            self.file.truncate(before)  # no part of an edit that is not made
+            raise
 
     def _apply(self, entry: Any) -> None:
         if entry == UNDO:
