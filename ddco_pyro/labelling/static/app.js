@@ -73,7 +73,7 @@ function status({ refit, warnings, dirty }) {
   $("fitting").querySelector("span").textContent = refit.message;
   document.querySelector("[data-do=refit]").disabled = refit.running;
   const lines = [...warnings, ...(refit.error ? [`the refit failed: ${refit.error}`] : []), ...(silent ? ["the server does not answer; start it again and open the address it prints"] : [])];
-  if ($("warnings").textContent !== lines.join("")) $("warnings").replaceChildren(...lines.map(text => element("li", { textContent: text })));
+  if ($("warnings").textContent !== lines.join("")) $("warnings").replaceChildren(...lines.map(text => element("p", { textContent: text })));
   document.querySelector("[data-do=save]").textContent = dirty ? "Save •" : "Save";
 }
 async function refresh(index = demo?.index, step = undefined, keep = true) {  // what the server shows, whole: no answer is mixed with an older one

@@ -51,6 +51,7 @@ export function row(context, segments, { place, edge, top, height, colours, name
         context.lineTo(right, bottom); context.fill();
       }
     }
+    if (heights && said === "said") { context.fillStyle = looks.ink; context.fillRect(left, top + height - 3, right - left, 3); }
     if (right - left > 6) { context.fillStyle = looks.paper; context.fillRect(right - 1, top, 1, height); }
     if (!names || right - left < 14) continue;
     const name = said === "open" ? "open" : names(option), wide = context.measureText(name).width, short = wide < right - left - 6 ? name : String(option);

@@ -170,7 +170,8 @@ export function readout(root, state, demo, cursor) {
     lines.push([level.level, option ? level.names[option - 1] : "control", coloured(level.colours, option)]);
   }
   const numbers = (demo.numbers?.names ?? []).map((name, row) => [name, demo.numbers.decoded.value(row, cursor).toPrecision(3)]);
-  root.replaceChildren(...[lines, numbers].map(of => element("dl", {}, ...of.flatMap(([name, value, colour]) => [element("dt", { textContent: name }), element("dd", {}, ...(colour ? [swatch(colour)] : []), value)]))));
+  const term = ([name, value, colour]) => element("div", {}, element("dt", { textContent: name }), element("dd", {}, ...(colour ? [swatch(colour)] : []), value));
+  root.replaceChildren(element("dl", {}, ...lines.map(term)), element("dl", { className: "numbers" }, ...numbers.map(term)));
 }
 
 export function summary(root, { summary, demos }) {

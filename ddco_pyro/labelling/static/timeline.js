@@ -124,12 +124,12 @@ export class Timeline {
     top += MAIN;
     label("boundaries", top + BAND / 2 + 2);
     for (const { step, low, high, said } of demo.boundaries) {
-      const x = this.x(step), left = Math.max(this.x(low), GUTTER), right = Math.min(this.x(high + 1), width);
+      const x = this.x(step), left = Math.min(this.x(low), x - 3), right = Math.max(this.x(high), x + 3);
       if (right < GUTTER || left > width) continue;
       context.fillStyle = said ? looks.ink : looks.accent;
       context.beginPath();
       if (said) { context.moveTo(x - 4, top + 9); context.lineTo(x, top + 2); context.lineTo(x + 4, top + 9); }
-      else { context.moveTo(Math.min(left, x - 1), top + BAND); context.lineTo(Math.min(Math.max(x, left), right), top + 1); context.lineTo(Math.max(right, x + 1), top + BAND); }
+      else { context.moveTo(Math.max(left, GUTTER), top + BAND); context.lineTo(Math.max(x, GUTTER), top + 1); context.lineTo(right, top + BAND); }
       context.fill();
     }
     top += BAND + 4;
