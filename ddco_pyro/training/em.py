@@ -322,7 +322,7 @@ class Expectation:
             choices = each.shape[1] if caller is None else caller.sizes[0]
             each[:, choices:] = _penalties(weight[..., choices:], self._ridge.policy)
             for group in sums[name].groups.values():
-                if group.std and group.columns.stop > group.columns.start:
+                if group.std and group.of_numbers:
                     std, places = self._stds[name], list(group.std)
                     sigma = std.value[:, places]
                     each[:, group.columns] = _penalties(weight[..., group.columns], self._ridge.policy) / sigma.square()
@@ -339,7 +339,10 @@ class Expectation:
     def _expect(self, batch: Batch) -> tuple[float, dict[str, Sums]]:
         """The E-step: the score, and the sums that the M-step solves for each network that is trained."""
         total, sums = 0.0, {name: Sums() for name, network in self._networks.items() if network.trained}
-        self._pieces = self._pieces or [(*piece, {}) for piece in batch.pieces(self.model.steps_at_once)]
+        if not self._pieces:  # those that are as long together, with little padding
+            order = batch.lengths.argsort(stable=True)
+            pieces = batch.select(order).pieces(self.model.steps_at_once)
+            self._pieces = [(order[rows], piece, {}) for rows, piece in pieces]
         for piece in self._pieces:
             total += self._expect_piece(*piece, sums)
         return total, sums
@@ -406,8 +409,13 @@ class Expectation:
                 weight = end.sum(-1, keepdim=True) * ending * (1 - ending) * slope.square()
                 sums[name].add_gradient(xs[self._networks[name].reads].x, of[name], None)
                 learned[name] = [Information(slice(0, 1), weight)]
+        every_group = [(name, group) for name, groups in learned.items() for group in groups]
+        for name, group in every_group:
+            if not group.of_numbers:  # the parameter is its one feature
+                sums[name].add_information(group, group.weight.sum((0, 1)).reshape(-1, 1, 1))
         for reads, x in xs.items():
-            its = [(name, group) for name in learned if self._networks[name].reads == reads for group in learned[name]]
+            its = [(name, group) for name, group in every_group if group.of_numbers]
+            its = [(name, group) for name, group in its if self._networks[name].reads == reads]
             if its:
                 weights = [group.weight.flatten(0, 1).flatten(1) for _, group in its]
                 moments = x.moments(torch.cat(weights, dim=1)).split([each.shape[1] for each in weights])
@@ -427,7 +435,7 @@ class Expectation:
             for place, information in own.information.items():
                 group, columns = own.groups[place], own.groups[place].columns
                 gradient, weight = own.gradient[..., columns], network.weight[..., columns]
-                if group.std and not gradient.shape[-1]:
+                if not group.of_numbers:
                     assert std is not None
                     assert value is not None
                     assert isinstance(own.std, Tensor)

@@ -62,6 +62,11 @@ class Information:
     std: tuple[int, ...] = ()
     count: Tensor | None = None
 
+    @property
+    def of_numbers(self) -> bool:
+        """Whether it is of numbers of a network, and not of a parameter alone."""
+        return self.columns.stop > self.columns.start
+
     def moved(self, numbers: int, parameters: int) -> Information:
         """The same information where so many numbers and parameters come before."""
         columns = slice(self.columns.start + numbers, self.columns.stop + numbers)

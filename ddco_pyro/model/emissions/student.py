@@ -89,7 +89,10 @@ class Student(Gaussian):
 
     def log_density(self, actions: Tensor) -> Tensor:
         """log t_ν(a; μ, σ²), float64 [..., K]."""
-        return self.by_dimension(actions).sum(-1)
+        size, nu = self.mean.shape[-1], self.freedom.double().squeeze(-1)
+        tail = 0.5 * (nu + size) * (self._residuals(actions).square().sum(-1) / nu).log1p()
+        constant = torch.lgamma((nu + size) / 2) - torch.lgamma(nu / 2) - 0.5 * size * (nu * math.pi).log()
+        return constant - tail - (self.std.double().log() + self.log_scale).sum(-1)
 
     def by_dimension(self, actions: Tensor) -> Tensor:
         """The log-density of each dimension given those before it, float64 [..., K, A]."""
