@@ -211,13 +211,15 @@ def test_after_another_process_is_killed_one_process_goes_on_to_the_same_bits(wh
     assert_same_run(tmp_path / "run", run)
 
 
+LABELS = {"level": "level-1", "from": "phase", "count": 3, "recogniser": {"cross_validated": True, "windows": [1, 2]}}
 MOMENTUM = {"optimizer": {"name": "momentum"}, "clip_gradient": 0.1, "average": 0.9, "duration": {"mean": 4}}
 
 
 @pytest.mark.slow  # the two processes above stand for torchrun's
-@pytest.mark.parametrize(("number", "training"), [(2, {}), (3, MOMENTUM)])
+@pytest.mark.parametrize(("number", "training"), [(2, {}), (3, MOMENTUM), (2, {"labels": LABELS})])
 def test_processes_of_torchrun_give_the_bits_of_one(demos, tmp_path, number, training):
-    demos.write(tmp_path / "demos.hdf5")
+    phases = (replace(demo, labels={"phase": np.arange(len(demo)) * 2 // len(demo)}) for demo in demos)
+    replace(demos, demonstrations=tuple(phases)).write(tmp_path / "demos.hdf5")
     short = make_spec(tmp_path / "demos.hdf5", patience=None, epochs=4, restarts=1, **training)
     (tmp_path / "spec.yaml").write_text(dump_spec(short))
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(number)]
