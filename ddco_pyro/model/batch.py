@@ -49,6 +49,11 @@ class Batch:
         """Steps of all demonstrations, without padding."""
         return int(self.lengths.sum())
 
+    @property
+    def by_length(self) -> Tensor:
+        """The demonstrations, the shortest first: pieces of them in this order have little padding, [N]."""
+        return self.lengths.argsort(stable=True)
+
     def pieces(self, steps: int = STEPS_AT_ONCE) -> Iterator[tuple[Tensor, Batch]]:
         """Parts of at most ``steps`` steps, padding included, or of a single demonstration, each with its rows."""
         longest = int(self.lengths.max())

@@ -339,8 +339,8 @@ class Expectation:
     def _expect(self, batch: Batch) -> tuple[float, dict[str, Sums]]:
         """The E-step: the score, and the sums that the M-step solves for each network that is trained."""
         total, sums = 0.0, {name: Sums() for name, network in self._networks.items() if network.trained}
-        if not self._pieces:  # those that are as long together, with little padding
-            order = batch.lengths.argsort(stable=True)
+        if not self._pieces:
+            order = batch.by_length
             pieces = batch.select(order).pieces(self.model.steps_at_once)
             self._pieces = [(order[rows], piece, {}) for rows, piece in pieces]
         for piece in self._pieces:

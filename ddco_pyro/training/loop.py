@@ -190,7 +190,7 @@ class StageTraining:
         return self.objective.values(self.objective.clamped(tables, rows), piece.lengths).sum()
 
     def _backward_whole(self, model: Hierarchy, batch: Batch) -> float:
-        return backward(self.objective, model, batch, torch.arange(len(batch)))
+        return backward(self.objective, model, batch, batch.by_length)
 
     def _gradient_steps(self, place: tuple[int, int, int]) -> float:
         """A gradient step on each minibatch; the log-likelihood on the way, nats.
