@@ -12,7 +12,7 @@ import pytest
 import torch
 from command_line import call
 from oracle import brute_force, paths
-from planted import CONTROL, make_spec, make_trainer, make_truth, plant, small_spec, tabulated
+from planted import CONTROL, LINEAR, make_spec, make_trainer, make_truth, plant, small_spec, tabulated
 from random_demonstrations import numbered
 from sklearn.metrics import normalized_mutual_info_score
 
@@ -363,6 +363,36 @@ def test_a_recogniser_places_what_labels_alone_do_not(tmp_path):
     assert f"<td>labels alone</td><td>{said['labels alone'][0]:.2f}</td>" in page
     row = again.metrics.agreement.recogniser["train"]
     assert f"<td>recogniser alone, training</td><td>{row.nmi:.2f}</td>" in page
+
+
+def test_a_recogniser_reads_pictures():
+    """Planted: the half of a noisy picture that is brighter says which option is active; two demonstrations tell it."""
+    random = np.random.default_rng(5)
+
+    def one(number):
+        phase = np.repeat([0, 1, 0], random.integers(6, 10, 3))
+        side = np.arange(16) // 8 == phase[:, None, None, None]
+        camera = random.integers(0, 128, (len(phase), 8, 16, 1)) + 60 * side.transpose(0, 1, 3, 2)
+        seen = {"state": random.normal(size=(len(phase), 2)), "camera": camera.astype(np.uint8)}
+        known = phase if number < 2 else np.full_like(phase, -1)
+        return seen, random.normal(size=(len(phase), 2)), {"phase": known, "truth": phase}
+
+    demos = numbered(one(number) for number in range(6))
+    conv = {"network": "conv", "filters": 2, "kernel": 3, "hidden": [3]}
+    labels = {"level": "level-1", "from": "phase", "recogniser": RECOGNISER}
+    seen = ["state", "camera"]
+    level = {"name": "level-1", "count": 2, "policy": conv, "termination": {**LINEAR, "inputs": ["state"]}}
+    hierarchy = {"levels": [level], "meta_policy": {**LINEAR, "inputs": ["state"]}}
+    spec = small_spec((2,), observations=seen, hierarchy=hierarchy, training={"labels": labels})
+    model = Trainer(spec, Dimensions.of(demos), demos, demos).hierarchy
+    batch, reads = encode(demos, model.encoder, model.scaling), model.recogniser.around
+    features = reads.features(batch.inputs, batch.actions, batch.lengths)
+    found = model.recogniser.options(batch)
+    for demo, rows, options in zip(demos, features.numpy(), found.numpy(), strict=True):
+        brightness = demo.observations["camera"].reshape(len(demo), 8, 8, 2).mean(-1).reshape(len(demo), 64) / 255
+        np.testing.assert_allclose(rows[: len(demo), 2:66], brightness, atol=1e-6)
+        np.testing.assert_allclose(rows[: len(demo), 70:134], window(brightness, 1), atol=1e-6)
+        assert (options[: len(demo)] == demo.labels["truth"] + 1).mean() > 0.9
 
 
 def test_the_pair_is_chosen_by_its_mean_over_ridges():
