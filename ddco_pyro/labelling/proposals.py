@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,9 @@ from torch import Tensor
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.evaluation.inferred import Inferred, runs
 from ddco_pyro.fitting.fitted import Fit
+from ddco_pyro.inference import posterior
 from ddco_pyro.model.recogniser import Windows
+from ddco_pyro.model.tables import NEVER
 from ddco_pyro.spec import Spec, with_overrides
 from ddco_pyro.training.recognition import SHARES, learn
 
@@ -51,21 +54,36 @@ class Shown:
 class Proposals:
     """The exact posterior of a level, with the named steps clamped and a recogniser's evidence of the others.
 
+    The model's options are numbered anew, as a person's: so that the model by itself agrees with the named steps, and
+    elsewhere with what was shown before.
+
     :param level: 1 is the lowest.
     :param count: the options that a person can name.
+    :param before: the person's option of each step [T] as it was shown before; empty for the model's own numbers.
     :ivar options: of the person, for each option 0 to k of the model.
     """
 
-    def __init__(self, fit: Fit, demos: Demonstrations, level: int, count: int) -> None:
+    def __init__(
+        self,
+        fit: Fit,
+        demos: Demonstrations,
+        level: int,
+        count: int,
+        before: Mapping[str, np.ndarray] = MappingProxyType({}),
+    ) -> None:
         self.fit, self.level = fit, level
         levels = fit.spec.hierarchy.levels if fit.spec.hierarchy else ()
         self.lasts, self.size = [own.lasts for own in levels], levels[level - 1].count
         self.pieces = list(fit.infer(demos))
-        self.options = np.arange(max(count, self.size) + 1)[: self.size + 1]
+        self.options = np.arange(self.size + 1)
         self.place = {name: (piece, row) for piece, own in enumerate(self.pieces) for row, name in enumerate(own.names)}
         with torch.no_grad():
             self.alone = [piece.outputs.tables(piece.batch.actions) for piece in self.pieces]
         model = fit.hierarchy
+        self.alone_u = [
+            posterior(tables, piece.batch.lengths).u[level - 1]
+            for tables, piece in zip(self.alone, self.pieces, strict=True)
+        ]
         self.windows = Windows(self.size, model.input_shape, len(model.scaling.varying), past=False)
         every_run = [run for name in demos.names for run in self.runs(name)]
         self.occurring = {option for option, _, _ in every_run} - {0}
@@ -74,6 +92,11 @@ class Proposals:
         self.features = [
             self.windows.features(piece.batch.inputs, piece.batch.actions, piece.batch.lengths) for piece in self.pieces
         ]
+        self.usual = np.eye(self.size, count)
+        if before:
+            self.usual = self._common(before, count)
+            self.usual /= self.usual.sum(1, keepdims=True).clip(min=1)
+        self.usual *= typical / 2
         every = torch.cat([self.features[piece][row, : len(demos[n])] for n, (piece, row) in self._places(demos)])
         self.middle, self.spread = every.mean(0), every.std(0).clamp(min=1e-9)
 
@@ -88,31 +111,50 @@ class Proposals:
         :param labels: an option of the person for each step, [T]; below 1 where the model proposes. An option that the
             model does not have yet clamps nothing.
         """
-        known = [self._known(piece, labels) for piece in self.pieces]
-        named = torch.cat([rows[own > 0] for rows, own in zip(self.features, known, strict=True)])
-        options = torch.cat([own[own > 0] for own in known])
+        self.options = self._aligned(labels)
+        allowed = [self._allowed(piece, labels) for piece in self.pieces]
+        chosen = [torch.where(own.sum(-1) == 1, own.int().argmax(-1), -1) for own in allowed]
+        named = torch.cat([rows[own > 0] for rows, own in zip(self.features, chosen, strict=True)])
+        options = torch.cat([own[own > 0] for own in chosen])
         evident = self.occurring <= {*options.tolist()} and len(self.occurring) > 1
         if evident:
             learn(self.windows, named, options, RIDGE)
         gamma, again = weight(float(self.fit.hierarchy.power)), []
-        for piece, tables, rows, own in zip(self.pieces, self.alone, self.features, known, strict=True):
-            own = own[:, : tables.steps]
+        for piece, tables, rows, own in zip(self.pieces, self.alone, self.features, allowed, strict=True):
             if evident:
-                ratio = gamma * self.windows.log_ratio(rows[:, : tables.steps])
-                tables = tables.with_evidence(self.level, torch.where((own > 0).unsqueeze(-1), 0.0, ratio))
-            again.append(Inferred(piece.names, piece.batch, piece.hierarchy, tables.clamp(self.level, own)))
+                tables = tables.with_evidence(self.level, gamma * self.windows.log_ratio(rows))
+            tables = tables.with_evidence(self.level, torch.where(own, 0.0, NEVER))
+            again.append(Inferred(piece.names, piece.batch, piece.hierarchy, tables))
         self.pieces = again
 
-    def _known(self, piece: Inferred, labels: Mapping[str, np.ndarray]) -> Tensor:
-        """The model's options of named steps, [N, T]; -1 of others."""
-        models = np.full(int(max(self.options.max(), max(own.max() for own in labels.values()))) + 1, -1)
-        models[self.options] = np.arange(self.size + 1)
-        models[0] = -1
-        known = torch.full(piece.batch.actions.shape[:2], -1)
+    def _aligned(self, labels: Mapping[str, np.ndarray]) -> np.ndarray:
+        """The person's option for each option 0 to k of the model, another one for each where there are enough.
+
+        An option that is newer than the model is none of them.
+        Options keep their numbers unless named steps are against it by more than half a segment of each.
+        """
+        common = self.usual + self._common(labels, self.usual.shape[1])
+        best = common.argmax(1)
+        ours, theirs = linear_sum_assignment(-common)
+        best[ours] = theirs
+        return np.array([0, *(best + 1)])
+
+    def _common(self, labels: Mapping[str, np.ndarray], count: int) -> np.ndarray:
+        """The steps that the model by itself expects to have in common with labels 1 to count, [its options, count]."""
+        common = np.zeros((count, self.size))
+        for piece, u in zip(self.pieces, self.alone_u, strict=True):
+            for row, name in enumerate(piece.names):
+                said = np.flatnonzero((labels[name] > 0) & (labels[name] <= count))
+                np.add.at(common, labels[name][said] - 1, u[row, said, 1:].numpy())
+        return common.T
+
+    def _allowed(self, piece: Inferred, labels: Mapping[str, np.ndarray]) -> Tensor:
+        """The model's choices that a person allows at each step, bool [N, T, 1 + k]."""
+        every, ours = torch.full(piece.batch.actions.shape[:2], -1), torch.as_tensor(self.options)
         for row, name in enumerate(piece.names):
             own = labels[name]
-            known[row, : len(own)] = torch.as_tensor(np.where(own > 0, models[np.maximum(own, 0)], -1))
-        return known
+            every[row, : len(own)] = torch.as_tensor(np.where(np.isin(own, self.options[1:]), own, -1))
+        return (every.unsqueeze(-1) == ours) | (every < 1).unsqueeze(-1)
 
     def shown(self, name: str, labels: np.ndarray | None = None) -> Shown:
         """The most likely options of a demonstration where its labels say nothing."""
@@ -154,22 +196,6 @@ class Proposals:
         rows = self.features[piece][row, start:stop]
         centre: np.ndarray = ((rows - self.middle) / self.spread).mean(0).numpy()
         return centre
-
-
-def as_before(new: Sequence[np.ndarray], old: Sequence[np.ndarray], given: Mapping[int, int], size: int) -> np.ndarray:
-    """The person's options of a new model's options 0 to k: those that its labels say, others by most common steps.
-
-    :param given: the person's options of the new model's options that have labels.
-    """
-    taken = [0, *(given.get(option, 0) for option in range(1, size + 1))]
-    free = [option for option in range(1, size + 1) if option not in given]
-    left = [option for option in range(1, size + 1) if option not in given.values()]
-    theirs, ours = np.concatenate(new), np.concatenate(old)
-    common = np.array([[np.sum((theirs == one) & (ours == other)) for other in left] for one in free])
-    if free:
-        for one, other in zip(*linear_sum_assignment(-common), strict=True):
-            taken[free[one]] = left[other]
-    return np.array(taken)
 
 
 def refit_spec(fit: Fit, level: str, count: int) -> Spec:

@@ -27,7 +27,7 @@ from ddco_pyro.fitting.names import checked
 from ddco_pyro.jobs import Workers, run_all
 from ddco_pyro.labelling.document import FREE, OPEN, Change, Document
 from ddco_pyro.labelling.journal import SUFFIX, Journal, version
-from ddco_pyro.labelling.proposals import Proposals, Shown, as_before, labelled, refit_spec
+from ddco_pyro.labelling.proposals import Proposals, Shown, labelled, refit_spec
 from ddco_pyro.names import choice_names
 from ddco_pyro.segmenting import LevelLabels, Segmented, Segments, segments
 from ddco_pyro.segmenting.formats.labels import check_copy, check_labels, write_labels
@@ -103,7 +103,7 @@ class Session:
         self.lock, self.revision, self.edits, self.saved, self.changed = threading.RLock(), 0, 0, 0, set[int]()
         self.granularity, self.ways, self.message, self.error = "medium", dict[str, Fit](), "", ""
         self.refits, self.running, self.again = 0, False, False
-        self.first: dict[str, Shown] = {}
+        self.first, self.shown = dict[str, Shown](), dict[str, Shown]()
         self.take(fit)
 
     # --- the model ----------------------------------------------------------------------------------------------------
@@ -113,21 +113,14 @@ class Session:
         """The level's number, 1 for the lowest."""
         return [*self.fit.names].index(self.level) + 1
 
-    def take(self, fit: Fit, given: Mapping[int, int] | None = None) -> None:
-        """Show another model's proposals.
-
-        :param given: the person's options of those options of the model that labels have; None for the same numbers.
-        """
-        proposals = Proposals(fit, self.demos, [*fit.names].index(self.level) + 1, len(self.document.names))
-        proposals.update(self.document.labels)
+    def take(self, fit: Fit) -> None:
+        """Show another model's proposals; its options have the numbers that named steps and what is shown give them."""
         with self.lock:
-            if given is not None:
-                names = self.demos.names
-                new = [proposals.shown(name).options for name in names]
-                old = [self.shown[name].options for name in names]
-                proposals.options = as_before(new, old, given, proposals.size)
+            before, count = self._shown_now(), len(self.document.names)
+        proposals = Proposals(fit, self.demos, [*fit.names].index(self.level) + 1, count, before)
+        with self.lock:
             self.fit, self.proposals = fit, proposals
-            self._update(self._shown_now() if hasattr(self, "shown") else {})
+            self._update(before)
 
     def _shown_now(self) -> dict[str, np.ndarray]:
         return {name: shown.options for name, shown in self.shown.items()}
@@ -136,7 +129,7 @@ class Session:
         """Infer again what is shown, and mark demonstrations in which it differs from what was shown before."""
         self.proposals.update(self.document.labels)
         labels = self.document.labels
-        self.shown: dict[str, Shown] = {name: self.proposals.shown(name, labels[name]) for name in self.demos.names}
+        self.shown = {name: self.proposals.shown(name, labels[name]) for name in self.demos.names}
         self.first |= {name: self.shown[name] for name, own in labels.items() if (own == FREE).all()}
         self.changed = {
             place
@@ -539,7 +532,6 @@ class Session:
         with self.lock:
             labels = {name: self.document.in_file(name) for name in self.demos.names}
             spec = refit_spec(self.fit, self.level, len(self.document.names))
-        values = sorted({int(value) for own in labels.values() for value in np.unique(own) if value > 0})
         keys = self.fit.spec.trained_with
         demos = Demonstrations(
             tuple(replace(demo, observations={key: demo.observations[key] for key in keys}) for demo in self.demos),
@@ -548,7 +540,7 @@ class Session:
         found = self._away({"refit": partial(fit_to, spec, labelled(demos, labels))})["refit"]
         with self.lock:
             self.refits += 1
-            self.take(found, dict(enumerate(values, start=1)))
+            self.take(found)
 
     def _away(self, calls: Mapping[str, Callable[..., Fit]]) -> dict[str, Fit]:
         """The results of fits in another process, one after another."""

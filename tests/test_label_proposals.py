@@ -1,0 +1,154 @@
+"""Proposals given what a person has said: against every path, one after another, and against planted options."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from oracle import paths
+from planted import make_spec, make_truth, plant
+
+import ddco_pyro
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.fitting.fitted import Fit
+from ddco_pyro.labelling.proposals import Proposals, labelled, refit_spec, weight
+from ddco_pyro.model.recogniser import Windows
+
+COUNTS = (3,)
+LEVEL = "level-1"
+
+
+def planted(number, steps, counts=COUNTS, seed=0, ending=-1.7):
+    """A fit that is the truth, its demonstrations, and the true option of each step of the lowest level."""
+    spec = make_spec(counts)
+    truth = make_truth(spec, ending)
+    demos, choices = plant(truth, number, steps, seed)
+    options = {demo.name: rows[:, 0].numpy() for demo, rows in zip(demos, choices, strict=True)}
+    return Fit(spec, truth), demos, options
+
+
+def free(demos):
+    return {demo.name: np.full(len(demo), -1) for demo in demos}
+
+
+# --- the posterior ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("counts", "level"), [((3,), 1), ((2, 2), 1), ((2, 2), 2)])
+def test_it_is_the_sum_over_the_paths_that_have_the_labels_with_a_regression_of_named_steps(counts, level):
+    fit, demos, _ = planted(3, 4, counts)
+    labels = free(demos)
+    labels["demo_0"][:] = [1, -1, 2, counts[level - 1]]
+    labels["demo_1"][3] = 1
+    proposals = Proposals(fit, demos, level, counts[level - 1])
+    proposals.update(labels)
+    proposals.update(labels)  # nothing is counted twice
+    (piece,), (tables,) = proposals.pieces, proposals.alone
+    ratio = weight(1.0) * proposals.windows.log_ratio(proposals.features[0])
+    assert ratio[:, :, 1:3].abs().max() > 0.1  # it says something
+    sizes = [1 + count for count in counts]
+    for n, demo in enumerate(demos):
+        known = labels[demo.name]
+        expected, best, whole = np.zeros((4, sizes[level - 1])), (0.0, ()), 0.0
+        for path, _, probability in paths(tables, n, 4, sizes):
+            own = np.array(path)[:, level - 1]
+            if not all(label < 0 or proposals.options[h] == label for h, label in zip(own, known, strict=True)):
+                continue
+            p = probability * float(ratio[n, torch.arange(4), torch.as_tensor(own)].sum().exp())
+            expected[np.arange(4), own] += p
+            whole += p
+            best = max(best, (p, tuple(own)))
+        np.testing.assert_allclose(piece.posterior.u[level - 1][n, :4].numpy(), expected / whole, atol=1e-6)
+        shown = proposals.shown(demo.name, labels[demo.name])
+        assert all(label < 0 or option == label for option, label in zip(shown.options, known, strict=True))
+        np.testing.assert_array_equal(shown.probability[known > 0], 1.0)
+        if len(counts) == 1:  # of several levels the path is of all of them
+            np.testing.assert_array_equal(shown.options, proposals.options[list(best[1])])
+
+
+def test_without_labels_it_is_the_fits_own_segments():
+    fit, demos, _ = planted(5, 30)
+    proposals = Proposals(fit, demos, 1, 3)
+    proposals.update(free(demos))
+    (segments,) = fit.segment(demos)
+    for own, name in zip(segments, demos.names, strict=True):
+        np.testing.assert_array_equal(proposals.shown(name).options, own)
+
+
+# --- whose numbers ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("order", [*itertools.permutations((1, 2, 3))])
+def test_one_named_demonstration_numbers_the_options_of_the_others(order):
+    fit, demos, truth = planted(8, 40)
+    mine = {name: np.array([0, *order])[own] for name, own in truth.items()}
+    named = next(name for name in demos.names if len(np.unique(mine[name])) == 3)
+    labels = free(demos) | {named: mine[named]}
+    proposals = Proposals(fit, demos, 1, 3)
+    proposals.update(labels)
+    others = [name for name in demos.names if name != named]
+    right = np.concatenate([proposals.shown(name).options == mine[name] for name in others])
+    assert right.mean() > 0.95
+    proposals.update(free(demos))  # undone
+    assert proposals.options.tolist() == [0, 1, 2, 3]
+
+
+def test_a_short_correction_numbers_nothing_anew():
+    fit, demos, truth = planted(8, 40)
+    proposals = Proposals(fit, demos, 1, 3)
+    labels = free(demos)
+    typical = np.median([stop - start for name in demos.names for _, start, stop in proposals.runs(name)])
+    labels["demo_0"][: int(typical / 2) - 1] = truth["demo_0"][0] % 3 + 1
+    proposals.update(labels)
+    assert proposals.options.tolist() == [0, 1, 2, 3]
+
+
+def test_another_model_keeps_the_numbers_that_were_shown():
+    fit, demos, truth = planted(8, 40)
+    before = {name: np.array([0, 3, 1, 2])[own] for name, own in truth.items()}
+    proposals = Proposals(fit, demos, 1, 3, before)
+    proposals.update(free(demos))
+    assert proposals.options.tolist() == [0, 3, 1, 2]
+
+
+def test_an_option_that_the_model_lacks_clamps_nothing():
+    fit, demos, _ = planted(4, 20)
+    proposals = Proposals(fit, demos, 1, 3)
+    labels = free(demos)
+    labels["demo_1"][4:9] = 4  # it was new after the proposals were made
+    proposals.update(labels)
+    shown = proposals.shown("demo_1", labels["demo_1"])
+    assert (shown.options[4:9] == 4).all()
+    assert not (shown.options[9:] == 4).any()
+    (segments,) = fit.segment(demos)
+    np.testing.assert_array_equal(proposals.shown("demo_0").options, segments[0])
+
+
+# --- a refit ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_refit_with_one_more_option_places_it_in_other_demonstrations():
+    """The first fit takes two of three options for one."""
+    _, demos, truth = planted(8, 30, seed=1)
+    joined = make_spec((2,), optimizer={"name": "em"}, restarts=1, tune_fraction=0.0)
+    begun = ddco_pyro.fit(joined, demos)
+    said = {name: truth[name] if number < 3 else np.full(30, -1) for number, name in enumerate(demos.names)}
+    spec = refit_spec(begun, LEVEL, 3)
+    again = ddco_pyro.fit(spec, labelled(demos, said))
+    assert again.spec.compare_with == ()
+    assert len(again.demonstrations) == len(demos)
+    proposals = Proposals(again, demos, 1, 3)
+    proposals.update(said)
+    right = [proposals.shown(name).options == truth[name] for name in demos.names[3:]]
+    assert np.mean(right) > 0.9
+    assert isinstance(again.hierarchy.recogniser.around, Windows)
+
+
+def test_demonstrations_for_a_refit_have_a_persons_labels_alone_and_hold_nothing_out():
+    _, demos, _ = planted(3, 5)
+    masked = Demonstrations(demos.demonstrations, {"valid": ("demo_1",)})
+    found = labelled(masked, free(demos))
+    assert not found.masks
+    assert [sorted(demo.labels) for demo in found] == [["said"]] * 3
