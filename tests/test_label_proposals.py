@@ -13,8 +13,8 @@ from planted import make_spec, make_truth, plant
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.fitting.fitted import Fit
-from ddco_pyro.labelling.proposals import Proposals, labelled, refit_spec, weight
-from ddco_pyro.model.recogniser import Windows
+from ddco_pyro.labelling.proposals import Proposals, weight
+from ddco_pyro.labelling.refitting import labelled, refit
 
 COUNTS = (3,)
 LEVEL = "level-1"
@@ -129,21 +129,85 @@ def test_an_option_that_the_model_lacks_clamps_nothing():
 # --- a refit ----------------------------------------------------------------------------------------------------------
 
 
+def begun(demos, count, **training):
+    """A first fit by EM, whose options have numbers of their own."""
+    training = {"optimizer": {"name": "em"}, "initialize": "vq_controls", "tune_fraction": 0.0, **training}
+    return ddco_pyro.fit(make_spec((count,), epochs=30, **training), demos)
+
+
+def after(fit, demos, said, count):
+    """The proposals before and after a refit."""
+    both = [Proposals(fit, demos, 1, count)]
+    both[0].update(said)
+    shown = {name: both[0].shown(name, said[name]).options for name in demos.names}
+    kept = {name: np.where(np.isin(own, both[0].waiting), own, -1) for name, own in shown.items()}
+    again = refit(fit, LEVEL, count, labelled(demos, said), kept)
+    both.append(Proposals(again, demos, 1, count, shown))
+    both[1].update(said)
+    return both
+
+
+def right(proposals, truth, said):
+    """The share of right steps in demonstrations without labels."""
+    others = [name for name in truth if said[name].max() < 0]
+    return np.mean([proposals.shown(name).options == truth[name] for name in others])
+
+
 def test_a_refit_with_one_more_option_places_it_in_other_demonstrations():
     """The first fit takes two of three options for one."""
     _, demos, truth = planted(8, 30, seed=1)
-    joined = make_spec((2,), optimizer={"name": "em"}, restarts=1, tune_fraction=0.0)
-    begun = ddco_pyro.fit(joined, demos)
     said = {name: truth[name] if number < 3 else np.full(30, -1) for number, name in enumerate(demos.names)}
-    spec = refit_spec(begun, LEVEL, 3)
-    again = ddco_pyro.fit(spec, labelled(demos, said))
-    assert again.spec.compare_with == ()
-    assert len(again.demonstrations) == len(demos)
-    proposals = Proposals(again, demos, 1, 3)
+    before, again = after(begun(demos, 2), demos, said, 3)
+    assert right(before, truth, said) < 0.8
+    assert right(again, truth, said) > 0.95
+    assert again.fit.names == {LEVEL: ("control", "option 1", "option 2", "option 3")}
+    spec = again.fit.spec
+    assert (spec.compare_with, spec.demonstrations.validates) == ((), False)
+
+
+def test_an_option_without_labels_yet_keeps_its_steps():
+    """One demonstration that lacks an option is named, and no other one."""
+    _, demos, truth = planted(12, 30)
+    named = next(name for name in demos.names if len(np.unique(truth[name])) == 2)
+    said = free(demos) | {named: truth[named]}
+    missing = ({1, 2, 3} - set(truth[named])).pop()
+    _, again = after(begun(demos, 3, restarts=3), demos, said, 3)
+    steps = np.concatenate([again.shown(name).options for name in demos.names if name != named])
+    wanted = np.concatenate([truth[name] for name in demos.names if name != named])
+    assert np.mean(steps[wanted == missing] == missing) > 0.9
+
+
+def test_labels_of_a_refit_stand_for_the_options_of_their_numbers():
+    """Option 1 has no step at all."""
+    _, demos, truth = planted(8, 30)
+    mine = {name: np.array([0, 4, 2, 3])[own] for name, own in truth.items()}
+    said = {name: mine[name] if number < 3 else np.full(30, -1) for number, name in enumerate(demos.names)}
+    _, again = after(begun(demos, 3), demos, said, 4)
+    assert again.options.tolist() == [0, 1, 2, 3, 4]
+    assert right(again, mine, said) > 0.95
+
+
+def test_an_option_that_is_named_anew_wherever_it_would_occur_is_not_waited_for():
+    _, demos, truth = planted(8, 30)
+    mine = {name: np.array([0, 1, 2, 4])[own] for name, own in truth.items()}
+    said = {name: mine[name] if number < 3 else np.full(30, -1) for number, name in enumerate(demos.names)}
+    before = Proposals(begun(demos, 3), demos, 1, 3)  # option 4 was new after that
+    before.update(said)
+    assert not before.waiting.size
+    again = refit(before.fit, LEVEL, 4, labelled(demos, said), free(demos))
+    proposals = Proposals(again, demos, 1, 4)
     proposals.update(said)
-    right = [proposals.shown(name).options == truth[name] for name in demos.names[3:]]
-    assert np.mean(right) > 0.9
-    assert isinstance(again.hierarchy.recogniser.around, Windows)
+    assert right(proposals, mine, said) > 0.95
+
+
+def test_a_model_of_several_levels_is_fitted_as_its_spec_says():
+    spec = make_spec((2, 2), optimizer={"name": "em"}, tune_fraction=0.0, epochs=8)
+    _, demos, truth = planted(6, 12, (2, 2))
+    trained = ddco_pyro.fit(spec, demos)
+    said = {name: truth[name] if number < 3 else np.full(12, -1) for number, name in enumerate(demos.names)}
+    again = refit(trained, LEVEL, 2, labelled(demos, said), free(demos))
+    assert again.hierarchy.depth == 2
+    assert again.metrics.trained_labels.level == LEVEL
 
 
 def test_demonstrations_for_a_refit_have_a_persons_labels_alone_and_hold_nothing_out():

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 import torch
@@ -18,17 +17,10 @@ from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.inference import posterior
 from ddco_pyro.model.recogniser import Windows
 from ddco_pyro.model.tables import NEVER
-from ddco_pyro.spec import Spec, with_overrides
 from ddco_pyro.training.recognition import SHARES, learn
-
-SAID = "said"
-"""The labels of the demonstrations of a refit."""
 
 RIDGE = 50.0
 """Of the recogniser of the steps that a person has named."""
-
-EPOCHS = 40
-"""EM steps of a refit, of all stages together; it begins from the labels and what a recogniser says of other steps."""
 
 
 def weight(power: float) -> float:
@@ -61,6 +53,8 @@ class Proposals:
     :param count: the options that a person can name.
     :param before: the person's option of each step [T] as it was shown before; empty for the model's own numbers.
     :ivar options: of the person, for each option 0 to k of the model.
+    :ivar waiting: the person's options that occur, and that no named step tells of: it has none, and the named ones are
+        not those that the model by itself gives to it.
     """
 
     def __init__(
@@ -88,6 +82,7 @@ class Proposals:
         every_run = [run for name in demos.names for run in self.runs(name)]
         self.occurring = {option for option, _, _ in every_run} - {0}
         typical = float(np.median([stop - start for _, start, stop in every_run]))
+        self.half, self.waiting = typical / 2, np.array([], int)
         self.windows.widths.copy_(torch.tensor([max(1, round(share * typical)) for share in SHARES]))
         self.features = [
             self.windows.features(piece.batch.inputs, piece.batch.actions, piece.batch.lengths) for piece in self.pieces
@@ -96,7 +91,7 @@ class Proposals:
         if before:
             self.usual = self._common(before, count)
             self.usual /= self.usual.sum(1, keepdims=True).clip(min=1)
-        self.usual *= typical / 2
+        self.usual *= self.half
         every = torch.cat([self.features[piece][row, : len(demos[n])] for n, (piece, row) in self._places(demos)])
         self.middle, self.spread = every.mean(0), every.std(0).clamp(min=1e-9)
 
@@ -106,7 +101,8 @@ class Proposals:
     def update(self, labels: Mapping[str, np.ndarray]) -> None:
         """Learn the recogniser of the named steps, clamp these, and infer everything else again.
 
-        The recogniser waits until every option that occurs has named steps, or it would speak against the others.
+        The recogniser says nothing of steps that the model by itself gives to an option of :attr:`waiting`: it does not
+        know that option, and would speak against it.
 
         :param labels: an option of the person for each step, [T]; below 1 where the model proposes. An option that the
             model does not have yet clamps nothing.
@@ -116,13 +112,19 @@ class Proposals:
         chosen = [torch.where(own.sum(-1) == 1, own.int().argmax(-1), -1) for own in allowed]
         named = torch.cat([rows[own > 0] for rows, own in zip(self.features, chosen, strict=True)])
         options = torch.cat([own[own > 0] for own in chosen])
-        evident = self.occurring <= {*options.tolist()} and len(self.occurring) > 1
+        seen = 1 + np.flatnonzero(self._common(labels, max(own.max() for own in labels.values())).sum(1) > self.half)
+        unknown = torch.tensor(sorted(self.occurring - {*options.tolist(), *seen.tolist()}))
+        self.waiting = self.options[unknown.int().numpy()]
+        evident = len(options.unique()) > 1
         if evident:
             learn(self.windows, named, options, RIDGE)
         gamma, again = weight(float(self.fit.hierarchy.power)), []
-        for piece, tables, rows, own in zip(self.pieces, self.alone, self.features, allowed, strict=True):
+        every = zip(self.pieces, self.alone, self.alone_u, self.features, allowed, strict=True)
+        for piece, tables, u, rows, own in every:
             if evident:
-                tables = tables.with_evidence(self.level, gamma * self.windows.log_ratio(rows))
+                silent = torch.isin(u.argmax(-1), unknown).unsqueeze(-1)
+                ratio = gamma * self.windows.log_ratio(rows)
+                tables = tables.with_evidence(self.level, torch.where(silent, 0.0, ratio))
             tables = tables.with_evidence(self.level, torch.where(own, 0.0, NEVER))
             again.append(Inferred(piece.names, piece.batch, piece.hierarchy, tables))
         self.pieces = again
@@ -141,7 +143,7 @@ class Proposals:
 
     def _common(self, labels: Mapping[str, np.ndarray], count: int) -> np.ndarray:
         """The steps that the model by itself expects to have in common with labels 1 to count, [its options, count]."""
-        common = np.zeros((count, self.size))
+        common = np.zeros((max(count, 0), self.size))
         for piece, u in zip(self.pieces, self.alone_u, strict=True):
             for row, name in enumerate(piece.names):
                 said = np.flatnonzero((labels[name] > 0) & (labels[name] <= count))
@@ -196,28 +198,3 @@ class Proposals:
         rows = self.features[piece][row, start:stop]
         centre: np.ndarray = ((rows - self.middle) / self.spread).mean(0).numpy()
         return centre
-
-
-def refit_spec(fit: Fit, level: str, count: int) -> Spec:
-    """The spec of a quick fit with the labels :data:`SAID`: the model alone, and a recogniser of the named steps."""
-    assert fit.spec.hierarchy is not None
-    place = [own.name for own in fit.spec.hierarchy.levels].index(level)
-    recogniser = {"weight": weight(float(fit.hierarchy.power)), "ridge": RIDGE}
-    changes: dict[str, Any] = {
-        "compare_with": [],
-        "demonstrations.labels": None,
-        "demonstrations.leave_one_out": False,
-        "demonstrations.valid_fraction": 0.0,
-        "demonstrations.exclude": [],
-        "training.restarts": 1,
-        "training.epochs": EPOCHS,
-        "training.labels": {"level": level, "from": SAID, "recogniser": recogniser},
-        f"hierarchy.levels.{place}.count": count,
-    }
-    return with_overrides(fit.spec, changes)
-
-
-def labelled(demos: Demonstrations, labels: Mapping[str, np.ndarray]) -> Demonstrations:
-    """The demonstrations with a person's labels alone, all to train with."""
-    each = tuple(replace(demo, labels={SAID: labels[demo.name]}) for demo in demos)
-    return replace(demos, demonstrations=each, masks={})

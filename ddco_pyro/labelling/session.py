@@ -27,7 +27,8 @@ from ddco_pyro.fitting.names import checked
 from ddco_pyro.jobs import Workers, run_all
 from ddco_pyro.labelling.document import FREE, OPEN, Change, Document
 from ddco_pyro.labelling.journal import SUFFIX, Journal, version
-from ddco_pyro.labelling.proposals import Proposals, Shown, labelled, refit_spec
+from ddco_pyro.labelling.proposals import Proposals, Shown
+from ddco_pyro.labelling.refitting import labelled, refit
 from ddco_pyro.names import choice_names
 from ddco_pyro.segmenting import LevelLabels, Segmented, Segments, segments
 from ddco_pyro.segmenting.formats.labels import check_copy, check_labels, write_labels
@@ -531,13 +532,16 @@ class Session:
     def _refit(self) -> None:
         with self.lock:
             labels = {name: self.document.in_file(name) for name in self.demos.names}
-            spec = refit_spec(self.fit, self.level, len(self.document.names))
-        keys = self.fit.spec.trained_with
+            waiting = self.proposals.waiting
+            kept = {name: np.where(np.isin(own, waiting), own, FREE) for name, own in self._shown_now().items()}
+            trained, count = replace(self.fit, given=None), len(self.document.names)
+        keys = trained.spec.trained_with
         demos = Demonstrations(
             tuple(replace(demo, observations={key: demo.observations[key] for key in keys}) for demo in self.demos),
             attributes=self.demos.attributes,
         )
-        found = self._away({"refit": partial(fit_to, spec, labelled(demos, labels))})["refit"]
+        again = partial(refit, trained, self.level, count, labelled(demos, labels), kept)
+        found = self._away({"refit": again})["refit"]
         with self.lock:
             self.refits += 1
             self.take(found)

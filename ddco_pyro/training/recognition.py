@@ -237,7 +237,7 @@ def _begun(data: TrainingData, batch: Batch, starts: Tensor, known: Tensor, name
     assert data.labels is not None
     model = data.hierarchy(0)
     if optimizer_of(data.spec.training.optimizer, model) == "em":
-        return _by_em(data, model, batch, replace(data.labels, train=starts, tune=starts))
+        return by_em(data, model, batch, replace(data.labels, train=starts, tune=starts))
     (rows,) = torch.where((known > 0).any(1))
     part, known = batch.select(rows), known[rows, : int(batch.lengths[rows].max())]
     labels = replace(data.labels, train=known, tune=known)
@@ -263,10 +263,11 @@ def _continued(
         return model
     evidence = torch.where((known > 0).unsqueeze(-1), 0.0, evidence)
     labels = replace(data.labels, train=known, tune=known, evidence=(evidence, evidence))
-    return _by_em(data, model, batch, labels)
+    return by_em(data, model, batch, labels)
 
 
-def _by_em(data: TrainingData, model: Hierarchy, batch: Batch, labels: Labels) -> Hierarchy:
+def by_em(data: TrainingData, model: Hierarchy, batch: Batch, labels: Labels, number: int = EM_STEPS) -> Hierarchy:
+    """The model after so many EM steps of all its networks, with these labels in place of the data's."""
     stage = plan(data.spec, model.depth)[-1]
     objective = Objective(replace(data, train=batch, tune=batch, labels=labels), Progress(0), stage)
 
@@ -274,6 +275,6 @@ def _by_em(data: TrainingData, model: Hierarchy, batch: Batch, labels: Labels) -
         return objective.values(objective.clamped(tables, rows), piece.lengths).sum()
 
     steps = Expectation(model, stage.trained, score, data.spec.training.optimizer.ridge)
-    for _ in range(EM_STEPS):
+    for _ in range(number):
         steps.step(batch)
     return model

@@ -1,0 +1,111 @@
+"""Fitting a model again with what a person has said, in seconds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.fitting.fit import fit as fit_to
+from ddco_pyro.fitting.fitted import Fit
+from ddco_pyro.inference.threads import one_thread
+from ddco_pyro.labelling.proposals import RIDGE, weight
+from ddco_pyro.model.batch import encode
+from ddco_pyro.spec import Spec, with_overrides
+from ddco_pyro.training.checkpoint import TrainingData
+from ddco_pyro.training.labels import Labels
+from ddco_pyro.training.networks import Dimensions
+from ddco_pyro.training.optimizers import optimizer_of
+from ddco_pyro.training.recognition import by_em, recognise
+
+SAID = "said"
+"""The labels of the demonstrations of a refit."""
+
+EPOCHS = 40
+"""EM steps of a refit of several levels, all stages together."""
+
+STEPS = 8
+"""EM steps of a refit, after those in which its options begin."""
+
+
+def refit(trained: Fit, level: str, count: int, demos: Demonstrations, kept: Mapping[str, np.ndarray]) -> Fit:
+    """The model with so many options at a level, fitted to all demonstrations and to the labels :data:`SAID`.
+
+    Option h stands for label h. A level that EM trains, under a meta-policy alone, takes a few steps from the options
+    that a recogniser of the labelled steps finds. Other models are fitted as their spec says.
+
+    :param demos: as :func:`labelled` gives them.
+    :param kept: the option that each step begins with whatever the recogniser finds, [T], by demonstration; below 1 for
+        none.
+    """
+    spec, before = refit_spec(trained, level, count), trained.hierarchy
+    with one_thread():
+        if before.depth > 1 or not _by_em(trained):
+            return fit_to(spec, demos)
+        scaling, names = before.scaling, demos.names
+        others = sorted({*range(scaling.size)} - {*scaling.varying.tolist()})
+        constant = dict(zip(others, scaling.constant.tolist(), strict=True))
+        size = Dimensions(before.encoder.shapes, scaling.size, max(demos.lengths), constant, parts=scaling.parts)
+        batch = encode(demos, before.encoder, scaling, fitted=True)
+        known = _padded([demo.labels[SAID] for demo in demos])
+        known = torch.where(known > 0, known, -1)
+        fitted = before.encoder.state_dict(), scaling.state_dict()
+        labels = Labels(1, True, tuple(range(1, count + 1)), names, known, known)
+        data = TrainingData(spec, size, batch, batch, names, *fitted, labels)
+        model = data.hierarchy(0)
+        data, _ = recognise(model, data, demos)
+        taught = data.labels
+        assert taught is not None
+        assert taught.starts is not None
+        assert taught.evidence is not None
+        own = _padded([kept[name] for name in names])
+        silent, alive = own > 0, torch.arange(known.shape[1]) < batch.lengths[:, None]
+        evidence = torch.where(silent.unsqueeze(-1), 0.0, taught.evidence[0])
+        starts = torch.where(silent, own, taught.starts[0])
+        starts = torch.where(alive, torch.where(known > 0, known, starts), -1)
+        by_em(data, model, batch, replace(labels, train=starts, tune=starts))
+        by_em(data, model, batch, replace(labels, evidence=(evidence, evidence)), STEPS)
+    return Fit(spec, model.eval(), trained.metrics.model_copy(update={"agreement": None}))
+
+
+def _padded(rows: list[np.ndarray]) -> Tensor:
+    return torch.nn.utils.rnn.pad_sequence(
+        [torch.as_tensor(row).long() for row in rows], batch_first=True, padding_value=-1
+    )
+
+
+def refit_spec(trained: Fit, level: str, count: int) -> Spec:
+    """The spec of a quick fit with the labels :data:`SAID`: the model alone, and a recogniser of the named steps."""
+    assert trained.spec.hierarchy is not None
+    place = [own.name for own in trained.spec.hierarchy.levels].index(level)
+    recogniser = {"weight": weight(float(trained.hierarchy.power)), "ridge": RIDGE}
+    changes: dict[str, Any] = {
+        "compare_with": [],
+        "demonstrations.labels": None,
+        "demonstrations.leave_one_out": False,
+        "demonstrations.valid_fraction": 0.0,
+        "demonstrations.exclude": [],
+        "training.restarts": 1,
+        "training.labels": {"level": level, "from": SAID, "recogniser": recogniser},
+        f"hierarchy.levels.{place}.count": count,
+    }
+    if _by_em(trained):
+        ridge = trained.metrics.training.raised_ridge or trained.spec.training.optimizer.ridge.policy
+        known = {"policy": ridge, "cross_validated": False}
+        changes |= {"training.epochs": EPOCHS} | {f"training.optimizer.ridge.{key}": own for key, own in known.items()}
+    return with_overrides(trained.spec, changes)
+
+
+def _by_em(trained: Fit) -> bool:
+    return optimizer_of(trained.spec.training.optimizer, trained.hierarchy) == "em"
+
+
+def labelled(demos: Demonstrations, labels: Mapping[str, np.ndarray]) -> Demonstrations:
+    """The demonstrations with a person's labels alone, all to train with."""
+    each = tuple(replace(demo, labels={SAID: labels[demo.name]}) for demo in demos)
+    return replace(demos, demonstrations=each, masks={})
