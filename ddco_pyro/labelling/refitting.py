@@ -97,6 +97,7 @@ def refit_spec(trained: Fit, level: str, count: int) -> Spec:
     if _by_em(trained):
         ridge = trained.metrics.training.raised_ridge or trained.spec.training.optimizer.ridge.policy
         known = {"policy": ridge, "cross_validated": False}
+        changes["training.tune_fraction"] = 0.0  # the few labelled demonstrations are to be trained with
         changes |= {"training.epochs": EPOCHS} | {f"training.optimizer.ridge.{key}": own for key, own in known.items()}
     return with_overrides(trained.spec, changes)
 
