@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ddco_pyro.cli import AllowCode, Level, demos, fits, going_on, out_file, runs, written
+from ddco_pyro.cli.starting import refuse_other
 from ddco_pyro.data.files import Output, check_outputs
 from ddco_pyro.errors import BadInput
 
@@ -78,6 +79,8 @@ def _fitted(file: Path) -> Path:
     """A run fitted to the file, without baselines; a finished one is used again."""
     folder = Path("runs") / file.stem
     spec, run = folder / "spec.yaml", folder / "run"
+    if spec.exists():
+        refuse_other(spec, file, "name the run to label with, or copy the file under another name")
     if not (run / "metrics.json").exists():
         folder.mkdir(parents=True, exist_ok=True)
         with going_on():

@@ -41,9 +41,7 @@ def new(
     _say("inspect", file)
     console.inspection(inspect(file))
     if spec.exists():
-        fitted_to = load_spec(spec).demonstrations.path
-        if fitted_to is None or Path(fitted_to).resolve() != file.resolve():
-            raise BadInput(f"{spec}: is for {fitted_to}; choose another --out")
+        refuse_other(spec, file, "choose another --out")
     else:
         _say("init", file, "--out", spec)
         folder.mkdir(parents=True, exist_ok=True)
@@ -56,6 +54,16 @@ def new(
     runs.segment(run=run, demos=file, html=page)
     if show and sys.stdout.isatty() and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         webbrowser.open(page.resolve().as_uri())
+
+
+def refuse_other(spec: Path, file: Path, remedy: str) -> None:
+    """Refuse a spec that is for another file of demonstrations.
+
+    :raises BadInput: it is.
+    """
+    fitted_to = load_spec(spec).demonstrations.path
+    if fitted_to is None or Path(fitted_to).resolve() != file.resolve():
+        raise BadInput(f"{spec}: is for {fitted_to}; {remedy}")
 
 
 TASK = "needle"
