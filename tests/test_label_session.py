@@ -28,10 +28,7 @@ from ddco_pyro.labelling.document import FREE, OPEN
 from ddco_pyro.labelling.refitting import labelled, refit_spec
 from ddco_pyro.labelling.session import Session
 from ddco_pyro.spec import parse_spec, with_overrides
-<<<<<<< HEAD
-=======
 from ddco_pyro.training.labels import used
->>>>>>> f8aa39d4 (Labelling: a refit trains on every labelled demonstration)
 
 COUNT, NAMES = 4, ("let go", "carry", "close", "come")
 
@@ -529,7 +526,6 @@ def test_a_format_that_is_none_is_refused(begin, tmp_path):
         begin().export("xls", tmp_path)
 
 
-<<<<<<< HEAD
 @pytest.mark.slow
 def test_a_killed_command_loses_at_most_the_edit_in_flight_and_goes_on(demos, run, tmp_path):
     """As people call it: killed by -9 while edits come, called again, terminated, and its labels read."""
@@ -572,7 +568,8 @@ def test_a_killed_command_loses_at_most_the_edit_in_flight_and_goes_on(demos, ru
     assert process.returncode == 0
     labels = Demonstrations.read(out)[0].labels["option"]
     assert labels.tolist() == [3 if 10 <= step < 20 else -1 for step in range(len(labels))]
-=======
+
+
 def test_a_refit_trains_on_the_labels_of_whichever_demonstration_has_them(run, demos):
     """Also of one that the run's own training would have kept aside to tune by."""
     own = replace(run, spec=with_overrides(run.spec, {"training.tune_fraction": 0.4}))
@@ -582,4 +579,3 @@ def test_a_refit_trains_on_the_labels_of_whichever_demonstration_has_them(run, d
         labels = used(spec, given)
         assert labels is not None
         assert int((labels.train > 0).sum()) == len(chosen)
->>>>>>> f8aa39d4 (Labelling: a refit trains on every labelled demonstration)

@@ -13,11 +13,11 @@ from torch import Tensor
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.fitting.fit import fit as fit_to
 from ddco_pyro.fitting.fitted import Fit
-from ddco_pyro.inference.threads import one_thread
 from ddco_pyro.labelling.proposals import RIDGE, weight
 from ddco_pyro.model.batch import encode
 from ddco_pyro.spec import Spec, with_overrides
 from ddco_pyro.training.checkpoint import TrainingData
+from ddco_pyro.training.devices import one_thread
 from ddco_pyro.training.labels import Labels
 from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.optimizers import optimizer_of
