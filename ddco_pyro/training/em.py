@@ -81,15 +81,17 @@ class Features:
         self.x = torch.cat([*vectors, torch.ones(*inputs.batch, 1, dtype=torch.float64)], dim=-1)
 
     def moments(self, weights: Tensor) -> Tensor:
-        """Σ_t h_t x_t x_t^T for each column of weights [N·T, W]: [W, F, F]."""
+        """Σ_t h_t x_t x_t^T for each column of weights [N·T, W], none below 0: [W, F, F]."""
+        from scipy.linalg.blas import dsyrk  # half of a product that is symmetric
+
         every, features = self.x.flatten(0, 1), self.x.shape[-1]
         found = every.new_zeros(weights.shape[1], features, features)
-        counted = weights > NEGLIGIBLE * weights.mean(0)
-        for total, own, which in zip(found, weights.T, counted.T, strict=True):
+        counted = weights > NEGLIGIBLE * weights.mean(0).clamp(min=0)
+        for total, own, which in zip(found.numpy(), weights.T, counted.T, strict=True):
             for some in which.nonzero().squeeze(1).split(max(1, BLOCK // features)):
-                rows = every[some]
-                total.addmm_((rows * own[some].unsqueeze(1)).T, rows)
-        return found
+                rows = every[some] * own[some].sqrt().unsqueeze(1)
+                dsyrk(1.0, rows.numpy().T, beta=1.0, c=total.T, overwrite_c=True)
+        return found.tril() + found.tril(-1).mT
 
 
 @dataclass
