@@ -530,6 +530,13 @@ class Session:
         threading.Thread(target=do, daemon=True).start()
 
     def _refit(self) -> None:
+        found = self._away({"refit": self.refitting()})["refit"]
+        with self.lock:
+            self.refits += 1
+            self.take(found)
+
+    def refitting(self) -> Callable[[], Fit]:
+        """The call that fits to what is said so far, for any process; :meth:`take` shows its result."""
         with self.lock:
             labels = {name: self.document.in_file(name) for name in self.demos.names}
             waiting = self.proposals.waiting
@@ -540,11 +547,7 @@ class Session:
             tuple(replace(demo, observations={key: demo.observations[key] for key in keys}) for demo in self.demos),
             attributes=self.demos.attributes,
         )
-        again = partial(refit, trained, self.level, count, labelled(demos, labels), kept)
-        found = self._away({"refit": again})["refit"]
-        with self.lock:
-            self.refits += 1
-            self.take(found)
+        return partial(refit, trained, self.level, count, labelled(demos, labels), kept)
 
     def _away(self, calls: Mapping[str, Callable[..., Fit]]) -> dict[str, Fit]:
         """The results of fits in another process, one after another."""
