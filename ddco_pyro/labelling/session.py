@@ -208,14 +208,15 @@ class Session:
     def summary(self) -> dict[str, Any]:
         """The expected share of wrong steps, how much of it one more demonstration saves, and labelled ones.
 
-        What posteriors expect is multiplied by the ratio of wrong to expected steps of accepted demonstrations.
+        What posteriors expect is multiplied by the ratio of wrong to expected steps of accepted demonstrations. Both
+        shares are None before there are any.
         """
-        steps = sum(self.document.lengths.values())
+        steps, labelled = sum(self.document.lengths.values()), len(self.document.accepted)
         left = [self.wrong[name] for name in self.demos.names if name not in self.document.accepted]
         return {
-            "expected_wrong": sum(self.wrong.values()) / steps,
-            "one_more": max(left, default=0.0) / steps,
-            "labelled": len(self.document.accepted),
+            "expected_wrong": sum(self.wrong.values()) / steps if labelled else None,
+            "one_more": max(left, default=0.0) / steps if labelled else None,
+            "labelled": labelled,
         }
 
     def warnings(self) -> list[str]:
