@@ -15,6 +15,7 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.labelling.proposals import Proposals, weight
 from ddco_pyro.labelling.refitting import labelled, refit
+from ddco_pyro.labelling.session import Session
 
 COUNTS = (3,)
 LEVEL = "level-1"
@@ -111,6 +112,29 @@ def test_another_model_keeps_the_numbers_that_were_shown():
     proposals = Proposals(fit, demos, 1, 3, before)
     proposals.update(free(demos))
     assert proposals.options.tolist() == [0, 3, 1, 2]
+
+
+def test_the_runs_options_get_the_names_of_those_that_they_stand_for(tmp_path):
+    _, demos, truth = planted(8, 40)
+    path = tmp_path / "demos.hdf5"
+    demos.write(path)
+    fit = begun(demos, 3, restarts=3)
+    named = next(name for name in demos.names if len(np.unique(truth[name])) == 3)
+    session = Session(fit, path, tmp_path / "out.hdf5")
+    for option, text in ((1, "here"), (3, "there")):
+        session.edit({"do": "rename", "option": option, "text": text})
+    (segments,) = fit.segment(demos)
+    own, true = np.concatenate([*segments]), np.concatenate([*truth.values()])
+    stands = [np.bincount(true[own == option]).argmax() for option in (1, 2, 3)]
+    mine = np.array([0, *np.roll(stands, 1)])  # numbers that the fit does not have
+    assert fit.names[LEVEL][1:] == ("here", "option 2", "there")
+    for start in range(40):
+        option = int(np.flatnonzero(mine == truth[named][start])[0])
+        session.edit(
+            {"do": "paint", "demo": demos.names.index(named), "start": start, "stop": start + 1, "option": option}
+        )
+    assert fit.names[LEVEL][1:] == ("option 1", "there", "here")
+    session.journal.close()
 
 
 def test_an_option_that_the_model_lacks_clamps_nothing():

@@ -107,7 +107,7 @@ class Proposals:
         :param labels: an option of the person for each step, [T]; below 1 where the model proposes. An option that the
             model does not have yet clamps nothing.
         """
-        self.options = self._aligned(labels)
+        self.options = self.aligned(labels)
         allowed = [self._allowed(piece, labels) for piece in self.pieces]
         chosen = [torch.where(own.sum(-1) == 1, own.int().argmax(-1), -1) for own in allowed]
         named = torch.cat([rows[own > 0] for rows, own in zip(self.features, chosen, strict=True)])
@@ -129,7 +129,7 @@ class Proposals:
             again.append(Inferred(piece.names, piece.batch, piece.hierarchy, tables))
         self.pieces = again
 
-    def _aligned(self, labels: Mapping[str, np.ndarray]) -> np.ndarray:
+    def aligned(self, labels: Mapping[str, np.ndarray]) -> np.ndarray:
         """The person's option for each option 0 to k of the model, another one for each where there are enough.
 
         An option that is newer than the model is none of them.

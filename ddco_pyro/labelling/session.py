@@ -23,13 +23,12 @@ from ddco_pyro.errors import BadInput, reason
 from ddco_pyro.evaluation.inferred import runs
 from ddco_pyro.fitting.fit import fit as fit_to
 from ddco_pyro.fitting.fitted import Fit
-from ddco_pyro.fitting.names import checked
 from ddco_pyro.jobs import Workers, run_all
 from ddco_pyro.labelling.document import FREE, OPEN, Change, Document
 from ddco_pyro.labelling.journal import SUFFIX, Journal, version
 from ddco_pyro.labelling.proposals import Proposals, Shown
 from ddco_pyro.labelling.refitting import labelled, refit
-from ddco_pyro.names import choice_names
+from ddco_pyro.names import choice_names, option_name
 from ddco_pyro.segmenting import LevelLabels, Segmented, Segments, segments
 from ddco_pyro.segmenting.formats.labels import check_copy, check_labels, write_labels
 from ddco_pyro.selection.small import GRANULARITIES, cut
@@ -106,6 +105,8 @@ class Session:
         self.refits, self.running, self.again = 0, False, False
         self.first, self.shown = dict[str, Shown](), dict[str, Shown]()
         self.take(fit)
+        self.proposed = self.proposals
+        """By the run."""
 
     # --- the model ----------------------------------------------------------------------------------------------------
 
@@ -377,10 +378,7 @@ class Session:
             return [("names", [*names, self._text(command)])]
         if do == "rename":
             option = self._option(command, 1)
-            renamed = [*names[: option - 1], self._text(command), *names[option:]]
-            if self._are_the_runs():
-                checked(self.run.spec, {self.level: renamed})
-            return [("names", renamed)]
+            return [("names", [*names[: option - 1], self._text(command), *names[option:]])]
         if name is None:
             raise BadInput(f"{do}: names no demonstration, or is no command")
         if do == "accept":
@@ -490,13 +488,16 @@ class Session:
             raise BadInput(f"a name is one line of at most {LONGEST} characters that no other option has")
         return name
 
-    def _are_the_runs(self) -> bool:
-        """Whether the options are as many as the run's, which then gets their names."""
-        return len(self.run.names[self.level]) == len(self.document.names) + 1
-
     def _name_options(self) -> None:
-        if self._are_the_runs() and self.run.names[self.level][1:] != self.document.names:
-            self.run.name_options(self.level, self.document.names)
+        """Give the run's options the names of the options that they stand for."""
+        ours, known = self.document.names, self.run.names[self.level][1:]
+        stand = self.proposed.aligned(self.document.labels)[1:]
+        names = tuple(
+            option_name(own) if ours[other - 1] == option_name(other) else ours[other - 1]
+            for own, other in enumerate(stand.tolist(), start=1)
+        )
+        if names != known and len({*names}) == len(names):
+            self.run.name_options(self.level, names)
 
     # --- in the background --------------------------------------------------------------------------------------------
 
