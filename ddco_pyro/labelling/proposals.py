@@ -51,7 +51,7 @@ class Proposals:
 
     :param level: 1 is the lowest.
     :param count: the options that a person can name.
-    :param before: the person's option of each step [T] as it was shown before; empty for the model's own numbers.
+    :param before: the person's option of each step [T] shown before; empty for the model's own numbers.
     :ivar options: of the person, for each option 0 to k of the model.
     :ivar waiting: the person's options that occur, and that no named step tells of: it has none, and the named ones are
         not those that the model by itself gives to it.
