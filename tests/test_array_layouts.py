@@ -138,6 +138,7 @@ def an_array(shape: tuple[int, ...], dtype: str, random: np.random.Generator) ->
     return values.astype(f"V{dtype[1:]}" if dtype[0] == "V" else dtype)
 
 
+@pytest.mark.usefixtures("undecided")
 @given(
     shape=st.lists(st.sampled_from((0, 1, 2, 3, 5, 6)), max_size=5).map(tuple),
     dtype=st.sampled_from(TYPES),

@@ -381,6 +381,7 @@ def test_scaling_keeps_exactly_the_value_apart(rested):
 
 
 @pytest.mark.parametrize("row", ROWS)
+@pytest.mark.usefixtures("undecided")
 def test_files_with_such_values_are_begun_and_fitted(row, tmp_path):
     path = ROWS[row].make(tmp_path)
     assert call("init", path, "--out", tmp_path / "spec.yaml").status == 0

@@ -183,6 +183,11 @@ def test_the_columns_of_a_frame_have_to_be_those_of_the_fit() -> None:
         model.predict(X, listed(U, lambda rows: rows[["b", "a"]]))
 
 
+@pytest.fixture(scope="module")
+def plain() -> OptionSegmenter:
+    return OptionSegmenter(2, settings={"control.std.floor": 0.01, **QUICK}).fit(*two_options())
+
+
 @pytest.mark.parametrize(
     "given",
     [
@@ -192,9 +197,8 @@ def test_the_columns_of_a_frame_have_to_be_those_of_the_fit() -> None:
         {"differences": np.bool_(True), "control": np.str_("auto")},
     ],
 )
-def test_settings_may_be_numpys(given: dict[str, Any]) -> None:
+def test_settings_may_be_numpys(given: dict[str, Any], plain: OptionSegmenter) -> None:
     X, U = two_options()
-    plain = OptionSegmenter(2, settings={"control.std.floor": 0.01, **QUICK}).fit(X, U)
     settings = {"control.std.floor": 0.01, **QUICK, **given.get("settings", {})}
     model = OptionSegmenter(**{"n_options": 2, **given, "settings": settings}).fit(X, U)
     assert model.score(X, U) == plain.score(X, U)

@@ -341,6 +341,7 @@ ODD: dict[str, tuple[Spoil, str]] = {
 
 @pytest.mark.parametrize("spoilt", [(3,), (3, 11)], ids=["one", "two"])
 @pytest.mark.parametrize("name", ODD)
+@pytest.mark.usefixtures("undecided")
 def test_an_odd_demonstration_is_named_and_left_out(name: str, spoilt: tuple[int, ...], tmp_path: Path) -> None:
     spoil, why = ODD[name]
     path = recorded(tmp_path / "demos.hdf5", spoil, spoilt)

@@ -171,6 +171,7 @@ def test_names_are_shown_wherever_options_are(files):
     assert about["names"] == {"skill": ["control", "<go>", "pick & place", "on"]}
 
 
+@pytest.mark.usefixtures("undecided")
 def test_a_file_with_labels_keeps_the_names_of_options_and_of_labels(files, tmp_path):
     run, out, phases = files / "run", tmp_path / "labelled.hdf5", ["reach", "grasp", "lift"]
     for names in (["go", "hold", "up"], ["go", "hold", "raise"], ["option 1", "option 2", "option 3"]):

@@ -81,6 +81,7 @@ ALIKE = {
         for name in ROWS
     ],
 )
+@pytest.mark.usefixtures("undecided")  # but once, in ``warm``
 def test_an_odd_file(name: str, tmp_path: Path, warm: Path) -> None:
     row: Row = ROWS[name]
     folder, out = tmp_path / "odd", tmp_path / "out"

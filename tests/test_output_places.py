@@ -244,6 +244,7 @@ def test_a_rollout_asks_for_what_its_report_needs_first(toy_run, tmp_path: Path,
     assert not played
 
 
+@pytest.mark.usefixtures("undecided")
 def test_commands_are_printed_as_a_shell_takes_them(tmp_path: Path, monkeypatch) -> None:
     """Each is called again as it was printed, from a folder with an odd name."""
     folder = tmp_path / "it's $(odd)"
@@ -259,6 +260,7 @@ def test_commands_are_printed_as_a_shell_takes_them(tmp_path: Path, monkeypatch)
 
 
 @pytest.mark.parametrize("row", places_rows.ROWS.values(), ids=places_rows.ROWS)
+@pytest.mark.usefixtures("undecided")
 def test_an_odd_name_is_one_like_others(tmp_path: Path, row) -> None:
     file = row.make(tmp_path)
     assert call("inspect", file).status == 0

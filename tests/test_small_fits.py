@@ -90,7 +90,7 @@ def test_init_writes_what_it_found(tmp_path: Path):
 
 def test_segments_are_coarser_or_finer_as_asked(tmp_path: Path):
     file, spec, run = tmp_path / "demos.hdf5", tmp_path / "spec.yaml", tmp_path / "run"
-    skills_within_which_speed_varies().write(file)
+    skills_within_which_speed_varies(4, 100).write(file)
     spec.write_text(
         SPEC.replace("FILE", str(file)).replace("fraction: 0", "fraction: 0.2")
         + "compare_with: [{kind: flat, policy: {network: linear}}]\n"

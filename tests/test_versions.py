@@ -136,6 +136,7 @@ def test_moved_pictures_are_encoded_as_pictures_are(few_dots: Path, tmp_path: Pa
         np.testing.assert_array_equal(demo.observations["camera_features"], other.observations["camera_features"])
 
 
+@pytest.mark.usefixtures("undecided")
 def test_from_pictures_to_a_policy_by_commands(few_dots: Path, tmp_path: Path) -> None:
     """``init`` finds the versions, a fit trains with them, and pictures without versions are segmented."""
     out, bare, spec, run = (tmp_path / name for name in ("moved.hdf5", "bare.hdf5", "spec.yaml", "run"))

@@ -286,6 +286,7 @@ class _Quoting:
 
     folders: dict[str, Path]
     tables: dict[str, tuple[Study | None, pd.DataFrame]] = field(default_factory=dict)
+    estimates: dict[Any, Estimate | None] = field(default_factory=dict)
     families: dict[Any, dict[Any, Estimate]] = field(default_factory=lambda: defaultdict(dict))
     verdicts: dict[Any, str] = field(default_factory=dict)
 
@@ -344,12 +345,16 @@ class _Quoting:
         """
         (study, table), (what, measure, count, task) = self._table(source), key
         taken = tuple((column, settings[column]) for column in ("study", "without", "seed") if column in settings)
-        for column, value in taken:
-            first, _, last = value.partition("-")
-            several = column == "seed" and first.isdecimal() and last.isdecimal()
-            values_taken = [*map(str, range(int(first), int(last) + 1))] if several else [value]
-            table = table[table.task != value] if column == "without" else table[table[column].isin(values_taken)]
-        known = _estimate(study, table, what, measure, count, task, float(settings.get("times", 1)))
+        found = source, taken, key, settings.get("times")
+        if found not in self.estimates:  # families are known once all numbers are
+            for column, value in taken:
+                first, _, last = value.partition("-")
+                several = column == "seed" and first.isdecimal() and last.isdecimal()
+                values_taken = [*map(str, range(int(first), int(last) + 1))] if several else [value]
+                table = table[table.task != value] if column == "without" else table[table[column].isin(values_taken)]
+            times = float(settings.get("times", 1))
+            self.estimates[found] = _estimate(study, table, what, measure, count, task, times)
+        known = self.estimates[found]
         if known is None:
             return ""
         difference, verdict = " - " in what, self.verdicts.get((source, taken, key), NOT_TESTED)

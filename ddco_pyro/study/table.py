@@ -62,7 +62,8 @@ def values(
 
     :param demonstrations: of a method; a second number is that of ``theirs``.
     """
-    table = table[(table.measure == measure) & table.task.isin(table.task if task is None else [task])]
+    table = table[table.measure == measure]
+    table = table if task is None else table[table.task == task]
 
     def of(method: str, count: str | int) -> pd.Series:
         rows = table[(table.method == method.strip()) & (table.demonstrations == str(count))]
