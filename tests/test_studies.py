@@ -29,7 +29,8 @@ from ddco_pyro.fitting.fitted import load
 from ddco_pyro.selection import Workers
 from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.spec import SpecError
-from ddco_pyro.study import cells, declaration, report, table
+from ddco_pyro.study import cells, declaration, report
+from ddco_pyro.study import table as tidy
 from ddco_pyro.study.cells import Folder
 from ddco_pyro.study.declaration import Study
 from ddco_pyro.study.report import render, write
@@ -139,7 +140,7 @@ def test_a_declaration_that_cannot_be_meant_is_refused_in_words(made, changes, s
 
 def test_the_examples_of_the_docstrings_run(done, monkeypatch):
     monkeypatch.chdir(done.study.path.parent)
-    for module in (declaration, table, sawyer):
+    for module in (declaration, tidy, sawyer):
         found = doctest.testmod(module)
         assert (found.failed, found.attempted > 0) == (0, True)
 
@@ -551,7 +552,7 @@ def test_a_page_has_the_bold_words_that_holm_leaves(tmp_path):
 )
 def test_both_sides_of_a_verdict_have_holms_correction(values, said):
     family = [
-        (table.estimate(pd.Series({("", str(seed)): float(value) for seed, value in enumerate(own)})), 0.0)
+        (tidy.estimate(pd.Series({("", str(seed)): float(value) for seed, value in enumerate(own)})), 0.0)
         for own in values.values()
     ]
     assert [verdict for verdict, _ in report.verdicts(family)] == said
