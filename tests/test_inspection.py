@@ -339,8 +339,7 @@ ODD: dict[str, tuple[Spoil, str]] = {
 }
 
 
-@pytest.mark.parametrize("spoilt", [(3,), (3, 11)], ids=["one", "two"])
-@pytest.mark.parametrize("name", ODD)
+@pytest.mark.parametrize(("name", "spoilt"), [("dead", (3,)), *((name, (3, 11)) for name in ODD)])
 @pytest.mark.usefixtures("undecided")
 def test_an_odd_demonstration_is_named_and_left_out(name: str, spoilt: tuple[int, ...], tmp_path: Path) -> None:
     spoil, why = ODD[name]

@@ -8,8 +8,17 @@ import torch
 from torch import Tensor, nn
 
 from ddco_pyro.model.networks.inputs import Inputs, InputShape, ShapeError
-from ddco_pyro.model.networks.numpy_form import NumpyForm, arrays_of, joined, vectors
-from ddco_pyro.model.networks.perceptrons import ACTIVATIONS, Network, Perceptrons, State, options_last
+from ddco_pyro.model.networks.perceptrons import (
+    ACTIVATIONS,
+    Network,
+    NumpyForm,
+    Perceptrons,
+    State,
+    arrays_of,
+    joined,
+    options_last,
+    vectors,
+)
 from ddco_pyro.spec import Activation, ConvolutionLayer, Pool
 
 SHARPNESS = 10.0

@@ -11,15 +11,16 @@ import torch
 from torch import Tensor, nn
 
 from ddco_pyro.model.networks.inputs import Inputs, InputShape
-from ddco_pyro.model.networks.numpy_form import NumpyForm, over_layers
 from ddco_pyro.model.networks.perceptrons import (
     Linear,
     Network,
+    NumpyForm,
     Perceptrons,
     StackedLinear,
     State,
     options_first,
     options_last,
+    over_layers,
 )
 
 
