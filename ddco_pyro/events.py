@@ -6,8 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 
+class Event:
+    """The base of all events."""
+
+
 @dataclass(frozen=True)
-class DemonstrationsDone:
+class DemonstrationsDone(Event):
     """``done`` of ``total`` demonstrations are collected, imported, segmented or encoded."""
 
     done: int
@@ -15,7 +19,7 @@ class DemonstrationsDone:
 
 
 @dataclass(frozen=True)
-class BaselineSegmented:
+class BaselineSegmented(Event):
     """One of ``total`` baselines has segmented the demonstrations."""
 
     baseline: str
@@ -23,7 +27,7 @@ class BaselineSegmented:
 
 
 @dataclass(frozen=True)
-class TrainingBegan:
+class TrainingBegan(Event):
     """Training of a model begins, with a budget of epochs; None for no limit."""
 
     model: str
@@ -31,7 +35,7 @@ class TrainingBegan:
 
 
 @dataclass(frozen=True)
-class EpochEnded:
+class EpochEnded(Event):
     """A row of the history: log-likelihood per step of training and tuning demonstrations, nats."""
 
     restart: int
@@ -42,7 +46,7 @@ class EpochEnded:
 
 
 @dataclass(frozen=True)
-class UpdatesDone:
+class UpdatesDone(Event):
     """``done`` gradient steps are done; ``loss`` is the mean over the latest steps."""
 
     done: int
@@ -50,7 +54,7 @@ class UpdatesDone:
 
 
 @dataclass(frozen=True)
-class RestartStopped:
+class RestartStopped(Event):
     """Successive halving stopped a restart after ``epochs`` epochs of its last stage."""
 
     restart: int
@@ -58,7 +62,7 @@ class RestartStopped:
 
 
 @dataclass(frozen=True)
-class RestartDiverged:
+class RestartDiverged(Event):
     """A restart ended with a log-likelihood that is NaN or infinite; ``why`` has the place and the remedy."""
 
     restart: int
@@ -66,14 +70,14 @@ class RestartDiverged:
 
 
 @dataclass(frozen=True)
-class TrainingEnded:
+class TrainingEnded(Event):
     """Training of a model ended."""
 
     model: str
 
 
 @dataclass(frozen=True)
-class OptionsCompared:
+class OptionsCompared(Event):
     """``done`` of ``total`` options are compared with the others of their level."""
 
     done: int
@@ -81,7 +85,7 @@ class OptionsCompared:
 
 
 @dataclass(frozen=True)
-class LengthTried:
+class LengthTried(Event):
     """A power of the control's log-density, and gates that are constant or not, gave this median segment, steps."""
 
     power: float
@@ -90,7 +94,7 @@ class LengthTried:
 
 
 @dataclass(frozen=True)
-class CellsBegan:
+class CellsBegan(Event):
     """A ``study`` or a ``cross-validation`` of ``total`` cells begins; ``kept`` of them are done already."""
 
     work: str
@@ -99,7 +103,7 @@ class CellsBegan:
 
 
 @dataclass(frozen=True)
-class CellDone:
+class CellDone(Event):
     """A cell is done, or failed for the reason ``failed``: of a cross-validation, a fold of a candidate."""
 
     cell: str
@@ -107,7 +111,7 @@ class CellDone:
 
 
 @dataclass(frozen=True)
-class CandidateGivenUp:
+class CandidateGivenUp(Event):
     """A candidate is given up; ``folds`` of its folds are not scored."""
 
     candidate: str
@@ -115,37 +119,20 @@ class CandidateGivenUp:
 
 
 @dataclass(frozen=True)
-class SeedFitted:
+class SeedFitted(Event):
     """The model and its baselines are fitted with another of ``total`` training seeds."""
 
     total: int
 
 
 @dataclass(frozen=True)
-class EpisodeEnded:
+class EpisodeEnded(Event):
     """One of ``total`` episodes of a method ended."""
 
     method: str
     total: int
 
 
-Event = (
-    DemonstrationsDone
-    | BaselineSegmented
-    | TrainingBegan
-    | EpochEnded
-    | UpdatesDone
-    | RestartStopped
-    | RestartDiverged
-    | TrainingEnded
-    | OptionsCompared
-    | LengthTried
-    | CellsBegan
-    | CellDone
-    | CandidateGivenUp
-    | SeedFitted
-    | EpisodeEnded
-)
 OnEvent = Callable[[Event], None]
 
 
