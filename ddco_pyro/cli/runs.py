@@ -382,9 +382,10 @@ def export(
 
     Every form is loaded again and acts in three synthetic episodes, by the
     loop of runner.py. It must choose the options of the run's controller,
-    with probabilities within 1e-4. Controls must be within 1e-4 of the
-    largest of 1, their spread, and their distance from their mean.
-    Otherwise nothing is written.
+    with probabilities within 1e-6. Controls must be within 1e-6 of the
+    largest of 1, their spread, and their distance from their mean, or
+    within four times the error of float32 in the run's networks where that
+    is more. Otherwise nothing is written.
     """
     from ddco_pyro.exporting import export as write
     from ddco_pyro.fitting.fitted import load
