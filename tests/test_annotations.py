@@ -211,7 +211,7 @@ STEPS = [series("reach", 0, 3), series("grasp", 3, 5), series("", 6, 6)]
 )  # fmt: skip
 @pytest.mark.parametrize("data", [{"demonstration": "demo_1"}, {"csv": "/data/upload/2/3f6a11c0-demo_1.csv?d=a"}])
 def test_label_studio(tmp_path, result, said, data):
-    """Steps, seconds, frames of a video from 1 on, and audio; a task that nobody annotated says nothing."""
+    """Steps, seconds, frames of a video from 1 on, and audio; a task without an annotation says nothing."""
     skipped = exported([series("reach", 0, 1)], data={"demonstration": "demo_0"})
     skipped["annotations"][0]["was_cancelled"] = True
     (tmp_path / "export.json").write_text(json.dumps([exported(result, data=data), skipped]))

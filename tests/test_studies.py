@@ -12,6 +12,7 @@ import signal
 from pathlib import Path
 
 import arena_playing
+import labelling
 import numpy as np
 import pandas as pd
 import pytest
@@ -34,7 +35,7 @@ from ddco_pyro.study import table as tidy
 from ddco_pyro.study.cells import Folder
 from ddco_pyro.study.declaration import Study
 from ddco_pyro.study.report import render, write
-from ddco_pyro.study.table import read_tidy, values
+from ddco_pyro.study.table import estimate, read_tidy, values
 
 ROOT = Path(__file__).parents[1]
 SPEC = {
@@ -552,7 +553,7 @@ def test_a_page_has_the_bold_words_that_holm_leaves(tmp_path):
 )
 def test_both_sides_of_a_verdict_have_holms_correction(values, said):
     family = [
-        (tidy.estimate(pd.Series({("", str(seed)): float(value) for seed, value in enumerate(own)})), 0.0)
+        (estimate(pd.Series({("", str(seed)): float(value) for seed, value in enumerate(own)})), 0.0)
         for own in values.values()
     ]
     assert [verdict for verdict, _ in report.verdicts(family)] == said
@@ -577,6 +578,65 @@ def test_chunks_of_actions_are_averaged_over_what_was_given_for_a_step():
         chunks.reset(0)
         acted = [float(chunks.act({})[0]) for _ in given]
         assert acted == pytest.approx([np.average(one, weights=weights[: len(one)]) for one in given])
+
+
+def edited(shown, command):
+    """By hand, what a page shows after a command, without a model."""
+    at = command.get("boundary", command.get("step"))
+    place = next(n for n, (_, start, stop) in enumerate(shown) if start <= at < stop)
+    option, start, stop = shown[place]
+    if command["do"] == "name":
+        return [*shown[:place], (command["option"], start, stop), *shown[place + 1 :]]
+    if command["do"] == "split":
+        assert start < command["step"] < stop
+        return [*shown[:place], (option, start, at), (option, at, stop), *shown[place + 1 :]]
+    before, begun, _ = shown[place - 1]
+    assert at == start
+    assert begun < command["to"] < stop
+    return [*shown[: place - 1], (before, begun, command["to"]), (option, command["to"], stop), *shown[place + 1 :]]
+
+
+def test_a_simulated_person_makes_every_segment_right_with_the_planned_number_of_commands():
+    """One after another, each the first of a new plan; boundaries may be off by the slack."""
+    rng = np.random.default_rng(0)
+    for slack in (0, 1):
+        for _ in range(200):
+            shown, wanted = (labelling.runs_of(rng.integers(1, 4, 12)[np.sort(rng.integers(0, 12, 12))]) for _ in "ab")
+            number, left = len(labelling.plan(shown, wanted, slack)), labelling.plan(shown, wanted, slack)
+            while left:
+                shown, number = edited(shown, left[0]), number - 1
+                left = labelling.plan(shown, wanted, slack)
+                assert len(left) <= number
+            truth = np.concatenate([[option] * (stop - start) for option, start, stop in wanted])
+            found = np.concatenate([[option] * (stop - start) for option, start, stop in shown])
+            off = np.flatnonzero(found != truth)
+            edges = np.array([start for _, start, _ in wanted[1:]])
+            assert all(np.min(np.abs(edges - step - 0.5)) <= slack for step in off)
+
+
+@pytest.mark.parametrize(
+    ("shown", "wanted", "commands"),
+    [
+        ([(1, 0, 5), (2, 5, 9)], [(1, 0, 6), (2, 6, 9)], []),  # within the slack
+        ([(1, 0, 5), (2, 5, 9)], [(1, 0, 7), (2, 7, 9)], [{"do": "move", "boundary": 5, "to": 7}]),
+        ([(1, 0, 5), (2, 5, 9)], [(1, 0, 9)], [{"do": "name", "option": 1, "step": 5}]),
+        ([(1, 0, 9)], [(1, 0, 4), (2, 4, 9)], [{"do": "split", "step": 4}, {"do": "name", "option": 2, "step": 4}]),
+        ([(1, 0, 9)], [(labelling.OPEN, 0, 9)], [{"do": "open", "step": 0}]),
+    ],
+)
+def test_a_simulated_person_counts_as_by_hand(shown, wanted, commands):
+    assert labelling.plan(shown, wanted, 1) == commands
+
+
+def test_a_target_is_reached_where_it_stays_reached():
+    curve = [{"edits": edits, "right": right} for edits, right in ((0, 0.0), (9, 0.96), (12, 0.7), (16, 0.95), (17, 1))]
+    assert (labelling.reached(curve, 0.95), labelling.reached(curve[:3], 0.95)) == (16, None)
+    truth = [np.array([-1, 0, 0, 1, 1, -1]), np.array([0, 0, 1, 1])]
+    scratch = [{"edits": 0, "right": 0}, {"edits": 7, "right": 0.5}, {"edits": 10, "right": 1}]
+    assert labelling.from_scratch(truth) == scratch  # three boundaries, two names, two new labels; then one and two
+    halves = labelling.from_equal_parts(truth[1:] * 2, 0)  # a boundary, two names, two new labels; and two acceptances
+    assert [values["edits"] for values in halves] == [0, 6, 7]
+    assert [values["right"] for values in halves] == [0, 1, 1]
 
 
 RESULTS = ROOT / "docs" / "results"
