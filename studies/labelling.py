@@ -113,12 +113,12 @@ class LabellingCell(Cell):
         return {"curve": curve, "edits": mean, "scratch": scratch, **spread}
 
     def _label(self, person: Person, most: int, seed: int) -> None:
-        """Label demonstrations in order until the target is reached and so many are labelled."""
+        """Label so many demonstrations in order, and more until the target is reached; not of the control."""
         longest = np.argsort([-len(own) for own in person.truth], kind="stable").tolist()
         random = np.random.default_rng(seed).permutation(len(longest)).tolist()
         given = {"longest": longest, "random": random}.get(self.order)
         for number in range(len(person.truth)):
-            if number >= most and person.curve[-1]["right"] >= self.target:
+            if number >= most and (self.order == "recogniser" or person.curve[-1]["right"] >= self.target):
                 break
             person.label(person.session.state()["order"][0] if given is None else given[number])
             person.session.refitted()
