@@ -285,5 +285,8 @@ def test_annotators_of_other_demonstrations_are_refused(tmp_path):
     for labels, why in (({"b": "rrr"}, "has none of the demonstrations of"), ({"a": "rr"}, "a has 2 steps, and 3 in")):
         with pytest.raises(BadInput, match=why):
             compare_annotators(a, annotated(tmp_path / "b.hdf5", labels, ["r"]), 1)
+    for missing in ((a, tmp_path / "no.hdf5"), (tmp_path / "no.hdf5", a)):
+        with pytest.raises(BadInput, match=r"^[^:]*no\.hdf5: there is no such file"):
+            compare_annotators(*missing, 1)
     alone = compare_annotators(a, annotated(tmp_path / "b.hdf5", {"a": "r.."}, ["r"]), 1)["skill"]
     assert (alone.both, alone.kappa, alone.boundary_f1) == (1, None, 1.0)

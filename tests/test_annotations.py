@@ -314,3 +314,10 @@ def test_steps_without_a_frequency_are_seconds(demos, tmp_path):
         "without --fps a step is one second\n"
     )
     assert call("import", demos, "--fps", 10, "--out", tmp_path / "out.hdf5").status == 2
+
+
+def test_a_missing_file_of_segments_is_the_one_that_is_named(demos, tmp_path):
+    for name in ("no.eaf", "no.txt"):
+        ended = call("import", demos, "--labels", tmp_path / name, "--out", tmp_path / "out.hdf5")
+        assert (ended.status, ended.err.count("\n")) == (2, 1)
+        assert ended.err.startswith(f"ddco-pyro: --labels {tmp_path / name}: is missing")

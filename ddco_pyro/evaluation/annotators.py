@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ddco_pyro.data.sources import Source, open_source
+from ddco_pyro.data.sources import open_source
 from ddco_pyro.data.sources.recording import BOUNDARY, UNKNOWN, label_names
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.agreement import boundary_distances
@@ -52,23 +52,21 @@ def compare_annotators(first: str | Path, second: str | Path, tolerance: int) ->
     :param tolerance: the largest distance of matched boundaries, in steps.
     :raises BadInput: the files share no demonstration or no labels, or a demonstration has different lengths.
     """
-    with open_source(first) as ours, open_source(second) as theirs:
-        shared = [name for name in ours.names if name in set(theirs.names)]
-        if not shared:
-            raise BadInput(
-                f"{second}: has none of the demonstrations of {first}; name a file with other labels of them"
-            )
-        labels: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
-        for demo in shared:
-            a, b = (_labels(source, demo) for source in (ours, theirs))
-            for name in a.keys() & b.keys():
-                if len(a[name]) != len(b[name]):
-                    lengths = f"{len(b[name])} steps, and {len(a[name])} in {first}"
-                    raise BadInput(f"{second}: {demo} has {lengths}; name files of the same demonstrations")
-                labels.setdefault(name, []).append((a[name], b[name]))
-        if not labels:
-            raise BadInput(f"{second}: has no labels that {first} has, too; labels of the same name are compared")
-        known = [label_names(source.attributes) for source in (ours, theirs)]
+    (ours, our_names), (theirs, their_names) = (_read(path) for path in (first, second))
+    known = [our_names, their_names]
+    shared = [name for name in ours if name in theirs]
+    if not shared:
+        raise BadInput(f"{second}: has none of the demonstrations of {first}; name a file with other labels of them")
+    labels: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
+    for demo in shared:
+        a, b = ours[demo], theirs[demo]
+        for name in a.keys() & b.keys():
+            if len(a[name]) != len(b[name]):
+                lengths = f"{len(b[name])} steps, and {len(a[name])} in {first}"
+                raise BadInput(f"{second}: {demo} has {lengths}; name files of the same demonstrations")
+            labels.setdefault(name, []).append((a[name], b[name]))
+    if not labels:
+        raise BadInput(f"{second}: has no labels that {first} has, too; labels of the same name are compared")
     return {
         name: _compared(
             name, pairs, [own.get(name) or known[1 - n].get(name, []) for n, own in enumerate(known)], tolerance
@@ -77,11 +75,19 @@ def compare_annotators(first: str | Path, second: str | Path, tolerance: int) ->
     }
 
 
-def _labels(source: Source, demo: str) -> dict[str, np.ndarray]:
-    columns = source.recording(demo).labels.items()
-    return {
-        name: column.array() for name, column in columns if not name.endswith(BOUNDARY) and column.dtype.kind in "iub"
-    }
+def _read(path: str | Path) -> tuple[dict[str, dict[str, np.ndarray]], dict[str, list[str]]]:
+    """The labels of each demonstration of a file, and the names of labels 0, 1, ...."""
+    with open_source(path) as source:
+        columns = {demo: source.recording(demo).labels for demo in source.names}
+        labels = {
+            demo: {
+                name: column.array()
+                for name, column in own.items()
+                if not name.endswith(BOUNDARY) and column.dtype.kind in "iub"
+            }
+            for demo, own in columns.items()
+        }
+        return labels, label_names(source.attributes)
 
 
 def _compared(

@@ -104,7 +104,7 @@ class Task:
             registered, or a space has another type.
         """
         try:
-            from ddco_pyro.simulation.environments import GymnasiumEnvironment
+            from ddco_pyro.simulation.gymnasium_environment import GymnasiumEnvironment
         except ModuleNotFoundError as error:
             raise BadInput(f"{id}: needs {error.name}; install it with: pip install 'ddco-pyro[gymnasium]'") from error
         example = GymnasiumEnvironment(id, 0, options)

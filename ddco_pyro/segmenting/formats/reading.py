@@ -74,7 +74,10 @@ def read(path: Path, demos: Collection[str], rate: float) -> tuple[Annotations, 
 
     :raises BadInput: it is no such file, or is damaged.
     """
-    inside = sorted(one for one in path.iterdir() if one.is_file()) if path.is_dir() else [path]
+    if path.is_dir():
+        inside = sorted(one for one in path.iterdir() if one.is_file())
+    else:
+        inside = [path] if path.exists() else []
     for reader in READERS.values():
         files = [one for one in inside if one.suffix.lower() in reader.files]
         if files:
