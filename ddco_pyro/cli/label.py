@@ -77,11 +77,14 @@ def label(
 
 def _fitted(file: Path) -> Path:
     """A run fitted to the file, without baselines; a finished one is used again."""
+    from ddco_pyro.data.sources import refuse_foreign
+
     folder = Path("runs") / file.stem
     spec, run = folder / "spec.yaml", folder / "run"
     if spec.exists():
         refuse_other(spec, file, "name the run to label with, or copy the file under another name")
     if not (run / "metrics.json").exists():
+        refuse_foreign(file)
         folder.mkdir(parents=True, exist_ok=True)
         with going_on():
             if not spec.exists():

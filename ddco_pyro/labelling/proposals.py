@@ -26,7 +26,7 @@ RIDGE = 50.0
 def weight(power: float) -> float:
     """γ of the recogniser's evidence beside controls that count β times: 3 β, at most 1.
 
-    Cross-validation on surgeons' demonstrations chooses about this ratio at every β.
+    It is about the ratio of the pairs that cross-validation tries (:data:`~ddco_pyro.training.recognition.PAIRS`).
     """
     return min(1.0, 3 * power)
 
@@ -92,11 +92,9 @@ class Proposals:
             self.usual = self._common(before, count)
             self.usual /= self.usual.sum(1, keepdims=True).clip(min=1)
         self.usual *= self.half
-        every = torch.cat([self.features[piece][row, : len(demos[n])] for n, (piece, row) in self._places(demos)])
+        places = zip(demos, (self.place[name] for name in demos.names), strict=True)
+        every = torch.cat([self.features[piece][row, : len(demo)] for demo, (piece, row) in places])
         self.middle, self.spread = every.mean(0), every.std(0).clamp(min=1e-9)
-
-    def _places(self, demos: Demonstrations) -> list[tuple[int, tuple[int, int]]]:
-        return [(n, self.place[name]) for n, name in enumerate(demos.names)]
 
     def update(self, labels: Mapping[str, np.ndarray]) -> None:
         """Learn the recogniser of the named steps, clamp these, and infer everything else again.
@@ -173,12 +171,7 @@ class Proposals:
     def runs(self, name: str) -> list[tuple[int, int, int]]:
         """The segments of the most likely path: (option of the model, first step, step after the last)."""
         piece, row = self.place[name]
-        options, starts = self.pieces[piece].segmented(row, self.lasts)[self.level - 1]
-        return (
-            runs(options, np.diff(options, prepend=-1) != 0)
-            if not self.lasts[self.level - 1]
-            else runs(options, starts)
-        )
+        return runs(*self.pieces[piece].segmented(row, self.lasts)[self.level - 1])
 
     def intervals(self, name: str) -> dict[int, tuple[int, int]]:
         """The 90 % interval of each boundary of the most likely path, by its step."""

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ from ddco_pyro.names import choice_names, option_name
 from ddco_pyro.segmenting import LevelLabels, Segmented, Segments, segments
 from ddco_pyro.segmenting.formats.labels import check_copy, check_labels, write_labels
 from ddco_pyro.selection.small import GRANULARITIES, cut
-from ddco_pyro.spec import with_overrides
+from ddco_pyro.spec import PathSpec, with_overrides
 
 ASKED = 3
 """Demonstrations of the first question."""
@@ -101,9 +102,9 @@ class Session:
         self.document = Document({demo.name: len(demo) for demo in self.demos}, fit.names[self.level][1:])
         self.journal = Journal(out.with_name(out.name + SUFFIX), self.document, self.level)
         self.lock, self.revision, self.edits, self.saved, self.changed = threading.RLock(), 0, 0, 0, set[int]()
-        self.granularity, self.ways, self.message, self.error = "medium", dict[str, Fit](), "", ""
+        self.ways, self.message, self.error = dict[str, Fit](), "", ""
         self.refits, self.running, self.again = 0, False, False
-        self.first, self.shown = dict[str, Shown](), dict[str, Shown]()
+        self.first, self.shown, self.opened = dict[str, Shown](), dict[str, Shown](), ExitStack()
         self.take(fit)
         self.proposed = self.proposals
         """By the run."""
@@ -190,7 +191,6 @@ class Session:
                     "error": self.error,
                 },
                 "question": self._question(),
-                "granularity": self.granularity,
                 "warnings": self.warnings(),
                 "out": str(self.out),
                 "dirty": self.edits != self.saved,
@@ -299,17 +299,17 @@ class Session:
     def _followed(self, index: int) -> dict[str, Any]:
         """Numbers and paths in space that follow the cursor."""
         demo = self.demos[index]
-        if not hasattr(self, "_paths"):
-            self._paths = paths_of(self.run.spec.report.trajectory, self.demos)
         (found,) = following([demo], [], len(demo), self._paths)
         return {"numbers": found.get("n"), "paths": found.get("paths"), "view": found.get("view")}
 
-    @property
+    @cached_property
+    def _paths(self) -> tuple[PathSpec, ...]:
+        return paths_of(self.run.spec.report.trajectory, self.demos)
+
+    @cached_property
     def _pictures(self) -> list[Observed]:
-        if not hasattr(self, "_stored"):
-            self._source = open_source(self.path)
-            self._stored = stored_pictures(self._source.__enter__(), self.document.lengths)
-        return self._stored
+        source = self.opened.enter_context(open_source(self.path))
+        return stored_pictures(source, self.document.lengths)
 
     def picture(self, index: int, step: int) -> bytes:
         """The picture of a step as JPEG.
@@ -584,10 +584,12 @@ class Session:
     def _question(self) -> dict[str, Any] | None:
         if len(self.ways) < 2 or self.document.done:
             return None
+        return self._asked
+
+    @cached_property
+    def _asked(self) -> dict[str, Any]:
         asked = np.unique(np.linspace(0, len(self.demos) - 1, ASKED).round().astype(int)).tolist()
-        if not hasattr(self, "_answers"):
-            self._answers = [self._way(name, fit, asked) for name, fit in self.ways.items()]
-        return {"demos": asked, "proposals": self._answers}
+        return {"demos": asked, "proposals": [self._way(name, fit, asked) for name, fit in self.ways.items()]}
 
     def _way(self, name: str, fit: Fit, asked: Sequence[int]) -> dict[str, Any]:
         own = fit.segment(self.demos)[self.number - 1]
@@ -609,12 +611,11 @@ class Session:
 
         :raises BadInput: there is no such way, or something is labelled already.
         """
-        if way not in self.ways:
-            raise BadInput(f"there is no way to cut {way!r}; there is: {', '.join(self.ways) or 'none yet'}")
-        if self.document.done:
-            raise BadInput("choose: labels are given already; refit learns from them")
         with self.lock:
-            self.granularity = way
+            if way not in self.ways:
+                raise BadInput(f"there is no way to cut {way!r}; there is: {', '.join(self.ways) or 'none yet'}")
+            if self.document.done:
+                raise BadInput("choose: labels are given already; refit learns from them")
             self.take(self.ways[way])
             self.ways = {}
 
@@ -682,6 +683,7 @@ class Session:
         with self.lock:
             if self.edits != self.saved and self._unchanged():
                 self.save()
+            self.opened.close()
             self.journal.close()
 
 
