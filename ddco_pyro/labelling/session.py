@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,9 @@ from ddco_pyro.evaluation.inferred import runs
 from ddco_pyro.fitting.fit import fit as fit_to
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.jobs import Workers, run_all
-from ddco_pyro.labelling.document import FREE, OPEN, Change, Document
+from ddco_pyro.labelling.commands import Segment, View, whole
+from ddco_pyro.labelling.document import FREE, Document
+from ddco_pyro.labelling.expectation import expected_wrong, ranking
 from ddco_pyro.labelling.journal import SUFFIX, Journal, version
 from ddco_pyro.labelling.proposals import Proposals, Shown
 from ddco_pyro.labelling.refitting import labelled, refit
@@ -47,24 +49,14 @@ ALIKE = 0.9
 NEAREST = 5
 """Segments elsewhere that are shown for one."""
 
-PICTURE_HEIGHT, LONGEST = 240, 80
-"""Rows of a picture, and characters of a name."""
+PICTURE_HEIGHT = 240
+"""Rows of a picture."""
 
 UNCERTAIN = 20
 """Boundaries that are named as the most uncertain ones."""
 
 Exporter = Callable[[Segmented, Fit, Path, str], Path]
 """Writes segments in a format: gets them, the model, a folder and the level; gives the file or folder."""
-
-
-@dataclass(frozen=True)
-class Segment:
-    """A segment that is shown: an option 0 to k from one step to before another, and who says so."""
-
-    start: int
-    stop: int
-    option: int
-    said: str
 
 
 class Session:
@@ -139,13 +131,13 @@ class Session:
             for place, name in enumerate(self.demos.names)
             if name in before and name != edited and not np.array_equal(before[name], self.shown[name].options)
         }
-        expected, wrong = np.sum([(0.0, 0.0), *self.document.accepted.values()], axis=0)
-        self.calibration = (wrong + 1) / (expected + 1)
-        self.wrong = {
-            name: float(np.minimum(self.calibration * (1 - shown.probability), 1).sum())
-            for name, shown in self.shown.items()
-        }
+        self.wrong = expected_wrong(self.shown, self.document.accepted.values())
         self.revision += 1
+
+    @property
+    def view(self) -> View:
+        """The labels, and what is shown."""
+        return View(self.document, self.shown, self.first)
 
     # --- what is shown ------------------------------------------------------------------------------------------------
 
@@ -153,7 +145,7 @@ class Session:
         """Everything but the demonstrations themselves."""
         with self.lock:
             document, names = self.document, self.demos.names
-            order, reasons = self._order()
+            ranked, reasons = self._order()
             demos = [
                 {
                     "name": name,
@@ -179,7 +171,7 @@ class Session:
                 "colours": [option_colour(option + 1) for option in range(len(document.names))],
                 "frequency": self.frequency,
                 "demos": demos,
-                "order": order,
+                "order": [names.index(name) for name in ranked],
                 "summary": self.summary(),
                 "can_undo": bool(document.done),
                 "can_redo": bool(document.undone),
@@ -195,16 +187,6 @@ class Session:
                 "out": str(self.out),
                 "dirty": self.edits != self.saved,
             }
-
-    def _uncertain(self) -> list[dict[str, int]]:
-        """The boundaries at which the shown option is least likely, the least likely first."""
-        found = [
-            (float(self.shown[name].probability[max(own.start - 1, 0) : own.start + 1].min()), place, own.start)
-            for place, name in enumerate(self.demos.names)
-            for own in self.segments(name)[1:]
-            if self.document.labels[name][own.start - 1 : own.start + 1].min() == FREE
-        ]
-        return [{"demo": place, "step": step} for _, place, step in sorted(found)[:UNCERTAIN]]
 
     def summary(self) -> dict[str, Any]:
         """The expected share of wrong steps, how much of it one more demonstration saves, and labelled ones.
@@ -227,35 +209,29 @@ class Session:
     def _unchanged(self) -> bool:
         return self.path.exists() and version(self.path) == self.version
 
-    def _order(self) -> tuple[list[int], dict[str, str]]:
+    def _order(self) -> tuple[list[str], dict[str, str]]:
         """Demonstrations that are not accepted, the most informative first, and why; then the others."""
-        document, names = self.document, self.demos.names
-        centres = {name: self.proposals.centre(name, 0, document.lengths[name]) for name in names}
-        known = [centres[name] for name in names if name in document.accepted]
-        away = {
-            name: min((float(np.linalg.norm(own - one)) for one in known), default=1.0) for name, own in centres.items()
-        }
-        typical = float(np.median([*away.values()])) or 1.0
-        value = {name: self.wrong[name] * (1 + away[name] / typical) for name in names}
-        farthest = max(names, key=lambda name: away[name])
-        reasons = {}
-        for name in names:
-            said = f"{self.wrong[name]:.0f} of {document.lengths[name]} steps expected wrong"
-            reasons[name] = f"{said}; the least like those you labelled" if known and name == farthest else said
-        ranks = sorted(range(len(names)), key=lambda n: (names[n] in document.accepted, -value[names[n]]))
-        return ranks, reasons
+        lengths, known = self.document.lengths, self.document.accepted
+        centres = {name: self.proposals.centre(name, 0, steps) for name, steps in lengths.items()}
+        ranked, farthest = ranking(self.wrong, centres, known)
+        reasons = {name: f"{self.wrong[name]:.0f} of {lengths[name]} steps expected wrong" for name in ranked}
+        if farthest is not None:
+            reasons[farthest] += "; the least like those you labelled"
+        return ranked, reasons
+
+    def _uncertain(self) -> list[dict[str, int]]:
+        """The boundaries at which the shown option is least likely, the least likely first."""
+        found = [
+            (float(self.shown[name].probability[max(own.start - 1, 0) : own.start + 1].min()), place, own.start)
+            for place, name in enumerate(self.demos.names)
+            for own in self.segments(name)[1:]
+            if self.document.labels[name][own.start - 1 : own.start + 1].min() == FREE
+        ]
+        return [{"demo": place, "step": step} for _, place, step in sorted(found)[:UNCERTAIN]]
 
     def segments(self, name: str) -> list[Segment]:
         """The segments of a demonstration that are shown."""
-        options, labels = self.shown[name].options, self.document.labels[name]
-        starts = (np.diff(options, prepend=-1) != 0) | (np.diff((labels == OPEN).astype(int), prepend=0) != 0)
-        starts[[*self.document.cuts[name], 0]] = True
-        found = []
-        for option, start, stop in runs(options, starts):
-            own = labels[start:stop]
-            said = "open" if (own == OPEN).all() else "said" if (own > 0).all() else "proposed"
-            found.append(Segment(start, stop, int(option), said))
-        return found
+        return self.view.segments(name)
 
     def demo(self, index: int) -> dict[str, Any]:
         """One demonstration with its segments, boundaries, and what follows the cursor."""
@@ -326,7 +302,7 @@ class Session:
         """The segments of other demonstrations that are most like the one at a step."""
         with self.lock:
             name = self._name(index)
-            here = self._at(name, step)
+            here = self.view.at(name, step)
             centre, found = self.proposals.centre(name, here.start, here.stop), []
             for place, other in enumerate(self.demos.names):
                 if other != name:
@@ -348,7 +324,7 @@ class Session:
         """
         with self.lock:
             before, do = self._shown_now(), command.get("do")
-            index = _whole(command, "demo") if "demo" in command else None
+            index = whole(command, "demo") if "demo" in command else None
             name = None if index is None else self._name(index)
             if do in ("undo", "redo"):
                 getattr(self.journal, do)()
@@ -356,7 +332,7 @@ class Session:
                 touched = next((change[1] for change in last if change[0] != "names"), None)
                 index = None if touched is None else self.demos.names.index(touched)
             else:
-                self.journal.edit(self._changes(str(do), name, command))
+                self.journal.edit(self.view.changes(str(do), name, command))
             self.edits += 1
             self._update(before, None if index is None else self.demos.names[index])
             self._name_options()
@@ -371,122 +347,10 @@ class Session:
                 "can_redo": bool(self.document.undone),
             }
 
-    def _changes(self, do: str, name: str | None, command: Mapping[str, Any]) -> list[Change]:
-        """The changes of the document that a command stands for."""
-        names = self.document.names
-        if do == "new":
-            return [("names", [*names, self._text(command)])]
-        if do == "rename":
-            option = self._option(command, 1)
-            return [("names", [*names[: option - 1], self._text(command), *names[option:]])]
-        if name is None:
-            raise BadInput(f"{do}: names no demonstration, or is no command")
-        if do == "accept":
-            if name in self.document.accepted:
-                return [("accept", name, False, 0.0, 0)]
-            labels = self.document.labels[name]
-            painted = [
-                ("paint", name, start, stop, int(option))
-                for option, start, stop in runs(
-                    self.shown[name].options, np.diff(self.shown[name].options, prepend=-1) != 0
-                )
-                if option > 0
-            ]
-            opened = [
-                ("paint", name, start, stop, OPEN)
-                for value, start, stop in runs(labels, np.diff(labels, prepend=-9) != 0)
-                if value == OPEN
-            ]
-            return [*painted, *opened, ("accept", name, True, *self._first_wrong(name))]
-        if do == "paint":
-            start, stop = (_whole(command, key) for key in ("start", "stop"))
-            if not 0 <= start < stop <= self.document.lengths[name]:
-                raise BadInput(
-                    f"paint: steps {start} to {stop} are not in {name}, which has {self.document.lengths[name]}"
-                )
-            return [("paint", name, start, stop, self._option(command, 0) or OPEN)]
-        if do == "move":
-            return self._move(name, _whole(command, "boundary"), _whole(command, "to"))
-        step = _whole(command, "step")
-        here = self._at(name, step)
-        if do == "name":
-            return [("paint", name, here.start, here.stop, self._option(command, 1))]
-        if do == "open":
-            return [("paint", name, here.start, here.stop, OPEN)]
-        if do == "free":
-            return [("paint", name, here.start, here.stop, FREE)]
-        if do == "everywhere":
-            option = self._option(command, 1)
-            return [
-                ("paint", other, own.start, own.stop, option)
-                for other in self.demos.names
-                if other == name or other not in self.document.accepted
-                for own in self.segments(other)
-                if own.option == here.option and own.said != "open"
-            ]
-        if do == "split":
-            if step == here.start:
-                raise BadInput(f"split: a segment of {name} begins at step {step} already")
-            return [("cut", name, step, True)]
-        if do == "merge":
-            if here.stop == self.document.lengths[name]:
-                raise BadInput(f"merge: the segment at step {step} is the last of {name}; it has none to merge with")
-            after = self._at(name, here.stop)
-            if not here.option:
-                raise BadInput(f"merge: the segment at step {step} of {name} has no option; name it first")
-            return [("cut", name, here.stop, False), ("paint", name, here.start, after.stop, here.option)]
-        raise BadInput(f"{do}: is no command")
-
-    def _first_wrong(self, name: str) -> tuple[float, int]:
-        """The steps of a demonstration whose proposal, before anything was said of it, was expected to be wrong; and
-        the steps in which it is not what is shown now.
-        """
-        first = self.first.get(name, self.shown[name])
-        return float((1 - first.probability).sum()), int((first.options != self.shown[name].options).sum())
-
-    def _move(self, name: str, boundary: int, to: int) -> list[Change]:
-        """A boundary elsewhere: the steps between, and one on either side, are said."""
-        own = self.segments(name)
-        place = next((n for n, segment in enumerate(own) if n and segment.start == boundary), None)
-        if place is None:
-            raise BadInput(f"move: no segment of {name} begins at step {boundary}")
-        left, right = own[place - 1], own[place]
-        if not left.start < to < right.stop:
-            raise BadInput(f"move: step {to} is not within the segments at both sides of step {boundary} of {name}")
-        sides = [(segment, OPEN if segment.said == "open" else segment.option) for segment in (left, right)]
-        low, high = min(boundary, to) - 1, max(boundary, to) + 1
-        changes: list[Change] = [
-            ("paint", name, *ends, option)
-            for (_, option), ends in zip(sides, ((low, to), (to, high)), strict=True)
-            if option
-        ]
-        if boundary in self.document.cuts[name]:
-            changes += [("cut", name, boundary, False), ("cut", name, to, True)]
-        return changes
-
     def _name(self, index: int) -> str:
         if not 0 <= index < len(self.demos):
             raise BadInput(f"there is no demonstration {index}; there are 0 to {len(self.demos) - 1}")
         return self.demos.names[index]
-
-    def _at(self, name: str, step: int) -> Segment:
-        for segment in self.segments(name):
-            if segment.start <= step < segment.stop:
-                return segment
-        raise BadInput(f"{name}: has no step {step}; it has {self.document.lengths[name]}")
-
-    def _option(self, command: Mapping[str, Any], least: int) -> int:
-        option = _whole(command, "option")
-        if not least <= option <= len(self.document.names):
-            raise BadInput(f"there is no option {option}; there are {least} to {len(self.document.names)}")
-        return option
-
-    def _text(self, command: Mapping[str, Any]) -> str:
-        text = command.get("text")
-        name = text.strip() if isinstance(text, str) else ""
-        if not name or len(name) > LONGEST or not name.isprintable() or name in ("control", *self.document.names):
-            raise BadInput(f"a name is one line of at most {LONGEST} characters that no other option has")
-        return name
 
     def _name_options(self) -> None:
         """Give the run's options the names of the options that they stand for."""
@@ -685,10 +549,3 @@ class Session:
                 self.save()
             self.opened.close()
             self.journal.close()
-
-
-def _whole(command: Mapping[str, Any], key: str) -> int:
-    value = command.get(key)
-    if not isinstance(value, int) or isinstance(value, bool):
-        raise BadInput(f"{key}: give a whole number")
-    return value

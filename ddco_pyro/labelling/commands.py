@@ -1,0 +1,179 @@
+"""What a person asks for on the page, as changes of the labels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ddco_pyro.errors import BadInput
+from ddco_pyro.evaluation.inferred import runs
+from ddco_pyro.labelling.document import FREE, OPEN, Change, Document
+from ddco_pyro.labelling.expectation import first_wrong
+from ddco_pyro.labelling.proposals import Shown
+
+LONGEST = 80
+"""Characters of a name."""
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A segment that is shown: an option 0 to k from one step to before another, and who says so."""
+
+    start: int
+    stop: int
+    option: int
+    said: str
+
+
+@dataclass(frozen=True)
+class View:
+    """What a person looks at: the labels, and what is shown of each demonstration.
+
+    :param first: what was shown before anything was said of a demonstration.
+    """
+
+    document: Document
+    shown: Mapping[str, Shown]
+    first: Mapping[str, Shown]
+
+    def segments(self, name: str) -> list[Segment]:
+        """The segments of a demonstration that are shown."""
+        options, labels = self.shown[name].options, self.document.labels[name]
+        starts = (np.diff(options, prepend=-1) != 0) | (np.diff((labels == OPEN).astype(int), prepend=0) != 0)
+        starts[[*self.document.cuts[name], 0]] = True
+        found = []
+        for option, start, stop in runs(options, starts):
+            own = labels[start:stop]
+            said = "open" if (own == OPEN).all() else "said" if (own > 0).all() else "proposed"
+            found.append(Segment(start, stop, int(option), said))
+        return found
+
+    def at(self, name: str, step: int) -> Segment:
+        """The segment of a step.
+
+        :raises BadInput: the demonstration has no such step.
+        """
+        for segment in self.segments(name):
+            if segment.start <= step < segment.stop:
+                return segment
+        raise BadInput(f"{name}: has no step {step}; it has {self.document.lengths[name]}")
+
+    def changes(self, do: str, name: str | None, command: Mapping[str, Any]) -> list[Change]:
+        """The changes of the document that a command stands for.
+
+        :param name: of the demonstration; None for commands that concern none.
+        :raises BadInput: the command is none, or cannot be done here.
+        """
+        names = self.document.names
+        if do == "new":
+            return [("names", [*names, self._text(command)])]
+        if do == "rename":
+            option = self._option(command, 1)
+            return [("names", [*names[: option - 1], self._text(command), *names[option:]])]
+        if name is None:
+            raise BadInput(f"{do}: names no demonstration, or is no command")
+        if do == "accept":
+            return self._accept(name)
+        if do == "paint":
+            start, stop = (whole(command, key) for key in ("start", "stop"))
+            if not 0 <= start < stop <= self.document.lengths[name]:
+                raise BadInput(
+                    f"paint: steps {start} to {stop} are not in {name}, which has {self.document.lengths[name]}"
+                )
+            return [("paint", name, start, stop, self._option(command, 0) or OPEN)]
+        if do == "move":
+            return self._move(name, whole(command, "boundary"), whole(command, "to"))
+        step = whole(command, "step")
+        here = self.at(name, step)
+        if do == "name":
+            return [("paint", name, here.start, here.stop, self._option(command, 1))]
+        if do == "open":
+            return [("paint", name, here.start, here.stop, OPEN)]
+        if do == "free":
+            return [("paint", name, here.start, here.stop, FREE)]
+        if do == "everywhere":
+            option = self._option(command, 1)
+            return [
+                ("paint", other, own.start, own.stop, option)
+                for other in self.document.lengths
+                if other == name or other not in self.document.accepted
+                for own in self.segments(other)
+                if own.option == here.option and own.said != "open"
+            ]
+        if do == "split":
+            if step == here.start:
+                raise BadInput(f"split: a segment of {name} begins at step {step} already")
+            return [("cut", name, step, True)]
+        if do == "merge":
+            if here.stop == self.document.lengths[name]:
+                raise BadInput(f"merge: the segment at step {step} is the last of {name}; it has none to merge with")
+            after = self.at(name, here.stop)
+            if not here.option:
+                raise BadInput(f"merge: the segment at step {step} of {name} has no option; name it first")
+            return [("cut", name, here.stop, False), ("paint", name, here.start, after.stop, here.option)]
+        raise BadInput(f"{do}: is no command")
+
+    def _accept(self, name: str) -> list[Change]:
+        """Everything that is shown is said, except what is open; an accepted demonstration is accepted no longer."""
+        if name in self.document.accepted:
+            return [("accept", name, False, 0.0, 0)]
+        options, labels = self.shown[name].options, self.document.labels[name]
+        painted = [
+            ("paint", name, start, stop, int(option))
+            for option, start, stop in runs(options, np.diff(options, prepend=-1) != 0)
+            if option > 0
+        ]
+        opened = [
+            ("paint", name, start, stop, OPEN)
+            for value, start, stop in runs(labels, np.diff(labels, prepend=-9) != 0)
+            if value == OPEN
+        ]
+        first = self.first.get(name, self.shown[name])
+        return [*painted, *opened, ("accept", name, True, *first_wrong(first, self.shown[name]))]
+
+    def _move(self, name: str, boundary: int, to: int) -> list[Change]:
+        """A boundary elsewhere: the steps between, and one on either side, are said."""
+        own = self.segments(name)
+        place = next((n for n, segment in enumerate(own) if n and segment.start == boundary), None)
+        if place is None:
+            raise BadInput(f"move: no segment of {name} begins at step {boundary}")
+        left, right = own[place - 1], own[place]
+        if not left.start < to < right.stop:
+            raise BadInput(f"move: step {to} is not within the segments at both sides of step {boundary} of {name}")
+        sides = [(segment, OPEN if segment.said == "open" else segment.option) for segment in (left, right)]
+        low, high = min(boundary, to) - 1, max(boundary, to) + 1
+        changes: list[Change] = [
+            ("paint", name, *ends, option)
+            for (_, option), ends in zip(sides, ((low, to), (to, high)), strict=True)
+            if option
+        ]
+        if boundary in self.document.cuts[name]:
+            changes += [("cut", name, boundary, False), ("cut", name, to, True)]
+        return changes
+
+    def _option(self, command: Mapping[str, Any], least: int) -> int:
+        option = whole(command, "option")
+        if not least <= option <= len(self.document.names):
+            raise BadInput(f"there is no option {option}; there are {least} to {len(self.document.names)}")
+        return option
+
+    def _text(self, command: Mapping[str, Any]) -> str:
+        text = command.get("text")
+        name = text.strip() if isinstance(text, str) else ""
+        if not name or len(name) > LONGEST or not name.isprintable() or name in ("control", *self.document.names):
+            raise BadInput(f"a name is one line of at most {LONGEST} characters that no other option has")
+        return name
+
+
+def whole(command: Mapping[str, Any], key: str) -> int:
+    """The whole number that a command gives.
+
+    :raises BadInput: it gives none.
+    """
+    value = command.get(key)
+    if not isinstance(value, int) or isinstance(value, bool):
+        raise BadInput(f"{key}: give a whole number")
+    return value
