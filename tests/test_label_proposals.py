@@ -234,6 +234,15 @@ def test_a_model_of_several_levels_is_fitted_as_its_spec_says():
     assert again.metrics.trained_labels.level == LEVEL
 
 
+def test_a_refit_by_gradient_steps_is_tuned_by_demonstrations_without_labels():
+    _, demos, truth = planted(5, 6)
+    trained = begun(demos, 3, optimizer={"lr": 0.03}, tune_fraction=0.4, restarts=1)
+    for chosen in demos.names:
+        said = free(demos) | {chosen: truth[chosen]}
+        again = refit(trained, LEVEL, 3, labelled(demos, said), free(demos))
+        assert again.metrics.trained_labels.level == LEVEL
+
+
 def test_demonstrations_for_a_refit_have_a_persons_labels_alone_and_hold_nothing_out():
     _, demos, _ = planted(3, 5)
     masked = Demonstrations(demos.demonstrations, {"valid": ("demo_1",)})

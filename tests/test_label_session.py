@@ -504,6 +504,14 @@ def test_a_source_that_changed_underneath_is_said_and_nothing_is_saved(begin, de
     assert (tmp_path / "out.hdf5").read_bytes() == content
 
 
+def test_edits_of_other_controls_of_the_same_lengths_are_refused(begin, demos, tmp_path):
+    begin().close()
+    (tmp_path / "demos.hdf5").unlink()
+    Demonstrations([replace(demo, actions=demo.actions / 2) for demo in demos]).write(tmp_path / "demos.hdf5")
+    with pytest.raises(BadInput, match="has edits of other demonstrations or of another level"):
+        begin()
+
+
 def test_an_out_of_something_else_is_refused(begin, tmp_path):
     (tmp_path / "other.hdf5").write_text("mine")
     with pytest.raises(BadInput, match="not a labelled copy"):

@@ -10,10 +10,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import Damaged
 from ddco_pyro.errors import BadInput
 from ddco_pyro.labelling.document import FREE, OPEN, Document
-from ddco_pyro.labelling.journal import Journal
+from ddco_pyro.labelling.journal import Journal, digest
 
 LENGTHS, NAMES = {"demo_0": 6, "demo_1": 3}, ("reach", "grasp")
 QUICK = settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
@@ -137,17 +138,30 @@ def test_a_new_name_in_a_journal_outlives_the_process(tmp_path):
     np.testing.assert_array_equal(again.labels["demo_0"], 3)
 
 
-@pytest.mark.parametrize(("lengths", "level"), [({**LENGTHS, "demo_1": 4}, "option"), (LENGTHS, "upper")])
-def test_edits_of_something_else_are_refused_and_kept(tmp_path, lengths, level):
-    path = tmp_path / "labels.journal"
-    journal = Journal(path, empty(), "option")
+def recorded(lengths=LENGTHS, control=0.0):
+    each = [(name, {"place": np.zeros((steps, 1))}, np.full((steps, 2), control)) for name, steps in lengths.items()]
+    return Demonstrations([Demonstration(*own) for own in each])
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        digest(recorded({**LENGTHS, "demo_1": 4}), "option"),
+        digest(recorded({"demo_1": 6, "demo_0": 3}), "option"),
+        digest(recorded(control=1e-9), "option"),
+        digest(recorded(), "upper"),
+    ],
+)
+def test_edits_of_something_else_are_refused_and_kept(tmp_path, other):
+    path, ours = tmp_path / "labels.journal", digest(recorded(), "option")
+    journal = Journal(path, empty(), ours)
     journal.edit([("paint", "demo_0", 0, 6, 1)])
     journal.close()
     content = path.read_bytes()
     with pytest.raises(BadInput, match="edits of other demonstrations or of another level; give another --out"):
-        Journal(path, Document(lengths, NAMES), level)
+        Journal(path, empty(), other)
     assert path.read_bytes() == content
-    Journal(path, empty(), "option").close()  # and left to others
+    Journal(path, empty(), ours).close()  # and left to others
 
 
 WRITER = """

@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import Damaged
 from ddco_pyro.errors import BadInput
 from ddco_pyro.labelling.document import Change, Document
@@ -31,21 +32,25 @@ def version(path: Path) -> list[int]:
     return [stat.st_size, stat.st_mtime_ns]
 
 
-def digest(lengths: dict[str, int], level: str) -> str:
-    """What the labels of a document are for: demonstrations by name, their steps, and the level."""
-    return hashlib.sha256(json.dumps([level, *lengths.items()]).encode()).hexdigest()
+def digest(demos: Demonstrations, level: str) -> str:
+    """What labels are for: the demonstrations by name, with their controls, and the level."""
+    found = hashlib.sha256(json.dumps([level, [(demo.name, demo.actions.shape) for demo in demos]]).encode())
+    for demo in demos:
+        found.update(demo.actions.tobytes())
+    return found.hexdigest()
 
 
 class Journal:
     """A file of edits that one process has open.
 
     :param path: of the file; it is made where it is missing.
-    :param document: gets the edits of the file. Its lengths and ``level`` must be those of the file.
+    :param document: gets the edits of the file.
+    :param labels: what the labels are for, as :func:`digest` gives it.
     :raises BadInput: another process has the file, or it is of other demonstrations.
     :raises Damaged: a line is none of a journal, which stays as it is.
     """
 
-    def __init__(self, path: Path, document: Document, level: str) -> None:
+    def __init__(self, path: Path, document: Document, labels: str) -> None:
         self.path, self.document = path, document
         path.parent.mkdir(parents=True, exist_ok=True)
         self.file = open(path, "a+b", buffering=0)  # noqa: SIM115  (open as long as this object)
@@ -54,7 +59,7 @@ class Journal:
         except OSError:
             self.file.close()
             raise BadInput(f"{path}: is open in {self._holder()}; end it, or give another --out") from None
-        header = {"labels": digest(dict(document.lengths), level), "names": list(document.names)}
+        header = {"labels": labels, "names": list(document.names)}
         try:
             whole = self._read(header)
         except BadInput:

@@ -46,7 +46,7 @@ def refit(trained: Fit, level: str, count: int, demos: Demonstrations, kept: Map
     spec, before = refit_spec(trained, level, count), trained.hierarchy
     with one_thread():
         if before.depth > 1 or not _by_em(trained):
-            return fit_to(spec, demos)
+            return fit_to(spec, _tuned(spec, demos))
         scaling, names = before.scaling, demos.names
         others = sorted({*range(scaling.size)} - {*scaling.varying.tolist()})
         constant = dict(zip(others, scaling.constant.tolist(), strict=True))
@@ -71,6 +71,14 @@ def refit(trained: Fit, level: str, count: int, demos: Demonstrations, kept: Map
         by_em(data, model, batch, replace(labels, train=starts, tune=starts))
         by_em(data, model, batch, replace(labels, evidence=(evidence, evidence)), STEPS)
     return Fit(spec, model.eval(), trained.metrics.model_copy(update={"agreement": None}))
+
+
+def _tuned(spec: Spec, demos: Demonstrations) -> Demonstrations:
+    """The demonstrations, of which those without labels tune where there are any: the labelled ones are few."""
+    free = [demo.name for demo in demos if (demo.labels[SAID] < 1).all()]
+    number = max(1, round(spec.training.tune_fraction * len(demos)))
+    drawn = np.random.default_rng(spec.seed).permutation(free)[:number].tolist()
+    return replace(demos, masks={"tune": tuple(drawn)} if drawn else {})
 
 
 def _padded(rows: list[np.ndarray]) -> Tensor:

@@ -28,7 +28,7 @@ from ddco_pyro.jobs import Workers, run_all
 from ddco_pyro.labelling.commands import Segment, View, whole
 from ddco_pyro.labelling.document import FREE, Document
 from ddco_pyro.labelling.expectation import expected_wrong, ranking
-from ddco_pyro.labelling.journal import SUFFIX, Journal, version
+from ddco_pyro.labelling.journal import SUFFIX, Journal, digest, version
 from ddco_pyro.labelling.proposals import Proposals, Shown
 from ddco_pyro.labelling.refitting import labelled, refit
 from ddco_pyro.names import choice_names, option_name
@@ -92,7 +92,7 @@ class Session:
         check_labels(path, [self.level], self.demos.names)
         self.version, self.frequency = version(path), self.demos.frequency
         self.document = Document({demo.name: len(demo) for demo in self.demos}, fit.names[self.level][1:])
-        self.journal = Journal(out.with_name(out.name + SUFFIX), self.document, self.level)
+        self.journal = Journal(out.with_name(out.name + SUFFIX), self.document, digest(self.demos, self.level))
         self.lock, self.revision, self.edits, self.saved, self.changed = threading.RLock(), 0, 0, 0, set[int]()
         self.ways, self.message, self.error = dict[str, Fit](), "", ""
         self.refits, self.running, self.again = 0, False, False
