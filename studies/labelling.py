@@ -1,7 +1,7 @@
 """What the page of ``ddco-pyro label`` saves a person, by simulated people who know the true labels.
 
-    python studies/labelling.py [--tasks pick-place-v3 ...] [--data FOLDER] [--orders page random ...] [--seeds 10]
-        [--most 5] [--slack 1] [--jobs 2] [--runs DIR]
+    python studies/labelling.py [--tasks pick-place-v3 ...] [--data FOLDER] [--orders page random ...] [--seeds 4]
+        [--fits 3] [--most 5] [--slack 1] [--jobs 2] [--runs DIR]
 
 Tasks are those of ``studies/arena.py``, with fifty demonstrations, and ``Knot_Tying`` and ``Suturing`` in FOLDER, as
 ``studies/people.py`` has them. A person opens a demonstration and does a few commands of the page that make every name
@@ -64,21 +64,22 @@ Command = dict[str, Any]
 
 @dataclass(frozen=True)
 class LabellingCell(Cell):
-    """A task, in which order its demonstrations are labelled, and of how many random orders the mean is taken."""
+    """A task, in which order its demonstrations are labelled, how many random orders, and the first fit's seed."""
 
     data: str
     task: str
     order: str
     orders: int = 1
+    seed: int = 0
 
     @property
     def name(self) -> str:
         """Of its files."""
-        return f"{self.task}-{self.order.replace(' ', '_')}-{self.orders}"
+        return f"{self.task}-{self.order.replace(' ', '_')}-{self.orders}-{self.seed}"
 
     def depends(self, settings: Settings) -> dict[str, Any]:
         """What decides its results; the place of the data does not."""
-        return {"task": self.task, "order": self.order, "orders": self.orders} | settings.kept()
+        return {"task": self.task, "order": self.order, "orders": self.orders, "seed": self.seed} | settings.kept()
 
     @property
     def target(self) -> float:
@@ -99,7 +100,8 @@ class LabellingCell(Cell):
         alone = {"control.power": NOTHING} if self.order == "recogniser" else {}
         weight = (lambda power: ALONE_WEIGHT) if alone else proposals.weight
         path, people = settings.runs / "labelling" / self.task / "demos.hdf5", list[Person]()
-        first = first_fit(path, replace(demos, masks={}), len(named(truth)), alone)
+        changes = alone | {"training.seed": self.seed}
+        first = first_fit(path, replace(demos, masks={}), len(named(truth)), changes)
         for seed in range(self.orders):
             with tempfile.TemporaryDirectory() as own, weighted(weight):
                 session = Patient(first, path, Path(own) / "labels.hdf5")
@@ -115,7 +117,7 @@ class LabellingCell(Cell):
     def _label(self, person: Person, most: int, seed: int) -> None:
         """Label so many demonstrations in order, and more until the target is reached; not of the control."""
         longest = np.argsort([-len(own) for own in person.truth], kind="stable").tolist()
-        random = np.random.default_rng(seed).permutation(len(longest)).tolist()
+        random = np.random.default_rng((self.seed, seed)).permutation(len(longest)).tolist()
         given = {"longest": longest, "random": random}.get(self.order)
         for number in range(len(person.truth)):
             if number >= most and (self.order == "recogniser" or person.curve[-1]["right"] >= self.target):
@@ -141,12 +143,12 @@ class LabellingCell(Cell):
         for number in (number for number in SHOWN if number < len(results["curve"])):
             values = results["curve"][number]
             for measure, value in {**values, "wrong": 1 - values["right"]}.items():
-                yield Row(*named, number, 0, measure, value)
+                yield Row(*named, number, self.seed, measure, value)
         if results["edits"] is not None:
-            yield Row(*named, None, 0, "edits at target", results["edits"])
-            yield Row(*named, None, 0, "share of edits", results["edits"] / results["scratch"])
+            yield Row(*named, None, self.seed, "edits at target", results["edits"])
+            yield Row(*named, None, self.seed, "share of edits", results["edits"] / results["scratch"])
             if "sd" in results:
-                yield Row(*named, None, 0, "edits at target, sd", results["sd"])
+                yield Row(*named, None, self.seed, "edits at target, sd", results["sd"])
 
 
 class Patient(Session):
@@ -291,8 +293,9 @@ def first_fit(path: Path, demos: Demonstrations, count: int, changes: Mapping[st
     """What the page begins with: a fit of the spec that ``init`` writes, with as many options as there are labels.
 
     :param path: keeps the demonstrations; the fit is kept beside them.
+    :param changes: of the spec; ``training.seed`` is one.
     """
-    folder = path.with_name("alone" if changes else "fit")
+    folder = path.with_name(f"{'alone' if 'control.power' in changes else 'fit'}-{changes['training.seed']}")
     with only_one(path.parent, wait=True):
         if not path.exists():
             demos.write(path)
@@ -347,11 +350,12 @@ def reached(curve: Sequence[Mapping[str, float]], target: float) -> float | None
 
 
 def cells(own: argparse.Namespace) -> list[LabellingCell]:
-    """All orders of a task before another task."""
+    """All orders of a task before another task, and all tasks of a first fit before another fit."""
     tasks = [*own.tasks, *(SURGEONS if own.data else ())]
     return [
-        LabellingCell(str(own.data), task, order, own.seeds if order == "random" else 1)
-        for task, order in itertools.product(tasks, own.orders)
+        LabellingCell(str(own.data), task, order, own.seeds if order == "random" else 1, seed)
+        for seed, task, order in itertools.product(range(own.fits), tasks, own.orders)
+        if seed == 0 or order not in ("equal parts", "from scratch")
     ]
 
 
@@ -361,7 +365,8 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="*", default=list(TASKS), metavar="TASK")
     parser.add_argument("--data", type=Path, metavar="FOLDER")
     parser.add_argument("--orders", nargs="+", default=list(ORDERS), choices=ORDERS)
-    parser.add_argument("--seeds", type=int, default=10, help="random orders, whose mean is taken")
+    parser.add_argument("--seeds", type=int, default=4, help="random orders of each first fit, whose mean is taken")
+    parser.add_argument("--fits", type=int, default=3, help="first fits of each task, by their training seeds")
     study.main("labelling", parser, DEFAULTS, cells, lambda settings: sawyer(settings).made())
 
 

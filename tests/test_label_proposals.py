@@ -150,6 +150,24 @@ def test_an_option_that_the_model_lacks_clamps_nothing():
     np.testing.assert_array_equal(proposals.shown("demo_0").options, segments[0])
 
 
+def test_a_demonstration_that_is_held_out_is_proposed_as_if_nothing_were_said_of_it():
+    fit, demos, truth = planted(5, 20)
+    said = free(demos) | {name: truth[name] for name in demos.names[:3]}
+    proposals = Proposals(fit, demos, 1, 3)
+    proposals.update(said)
+    found = proposals.held_out(said, demos.names[:3])
+    assert [*found] == [*demos.names[:3]]
+    for name, own in found.items():
+        other = Proposals(fit, demos, 1, 3)
+        other.update({**said, name: np.full(20, -1)})
+        expected = other.shown(name)
+        np.testing.assert_array_equal(own.options, expected.options)
+        np.testing.assert_allclose(own.probability, expected.probability)
+        assert own.probability.min() < 1  # nothing is clamped
+    proposals.update(said)
+    assert all((proposals.shown(name, said[name]).options == said[name]).all() for name in found)
+
+
 # --- a refit ----------------------------------------------------------------------------------------------------------
 
 

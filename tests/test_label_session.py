@@ -25,6 +25,8 @@ from ddco_pyro.data.planted import pick_and_place
 from ddco_pyro.errors import BadInput
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.labelling.document import FREE, OPEN
+from ddco_pyro.labelling.expectation import USUAL
+from ddco_pyro.labelling.proposals import Proposals, Shown
 from ddco_pyro.labelling.refitting import labelled, refit_spec
 from ddco_pyro.labelling.session import Session
 from ddco_pyro.spec import parse_spec, with_overrides
@@ -125,7 +127,7 @@ def test_before_any_label_the_fit_proposes(begin, run, demos):
         assert by_step(found["segments"]) == [(option, "proposed") for option in path.tolist()]
         probability = u[index].numpy()[np.arange(len(path)), path]
         np.testing.assert_array_equal(unpacked(found["probability"]), np.rint(255 * np.minimum(probability, 1)))
-        wrong.append((1 - probability).sum())
+        wrong.append((1 - probability + USUAL * probability).sum())
         assert [own["step"] for own in found["boundaries"]] == (np.flatnonzero(np.diff(path)) + 1).tolist()
         assert all(own["low"] <= own["step"] <= own["high"] for own in found["boundaries"])
     assert [own["expected_wrong"] for own in state["demos"]] == pytest.approx(wrong, abs=0.006)
@@ -372,6 +374,35 @@ def test_two_labelled_demonstrations_label_the_others_and_exports_have_the_names
     for name, read in (("csv", by_csv), ("elan", by_elan)):
         (tmp_path / name).mkdir()
         assert read(session.export(name, tmp_path / name), demos.names) == expected
+
+
+def test_expected_wrong_steps_follow_from_accepted_demonstrations_that_are_held_out_at_a_refit(
+    begin, demos, monkeypatch
+):
+    def wrong_at_every_second_step(proposals, labels, names):
+        asked.append([*names])
+        return {name: Shown(np.where(np.arange(len(labels[name])) % 2, labels[name], 0), whole(name)) for name in names}
+
+    def whole(name):
+        return np.ones(session.document.lengths[name])
+
+    asked = []
+    session = begin()
+    monkeypatch.setattr(Proposals, "held_out", wrong_at_every_second_step)
+    for index in (0, 1):
+        session.edit({"do": "accept", "demo": index})
+        refitted(session)
+    assert asked == [[], ["demo_0", "demo_1"]]  # one alone has nothing to be compared with
+    rows = [(session.document.accepted[name], session.document.lengths[name]) for name in asked[-1]]
+    first = np.mean([(wrong - expected) / steps for (expected, wrong), steps in rows])
+    sure = (first + sum((steps + 1) // 2 / steps for _, steps in rows)) / 3
+    left = [session.shown[name].probability for name in demos.names[2:]]
+    expected = sum((1 - p + sure * p).sum() for p in left) / sum(len(demo) for demo in demos)
+    assert session.summary()["expected_wrong"] == pytest.approx(expected)
+    state = session.state()
+    assert session.summary()["one_more"] * sum(len(demo) for demo in demos) == pytest.approx(
+        state["demos"][state["order"][0]]["expected_wrong"], abs=0.006
+    )
 
 
 def by_csv(file, names):

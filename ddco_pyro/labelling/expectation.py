@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Sequence
 
 import numpy as np
 
+from ddco_pyro.labelling.document import FREE
 from ddco_pyro.labelling.proposals import Shown
+
+USUAL = 0.1
+"""ε before anything is accepted."""
 
 
 def first_wrong(first: Shown, accepted: Shown) -> tuple[float, int]:
@@ -14,31 +18,60 @@ def first_wrong(first: Shown, accepted: Shown) -> tuple[float, int]:
     return float((1 - first.probability).sum()), int((first.options != accepted.options).sum())
 
 
-def expected_wrong(shown: Mapping[str, Shown], accepted: Iterable[tuple[float, int]]) -> dict[str, float]:
-    """The expected number of wrong steps of each demonstration.
+def excess(proposed: Shown, labels: np.ndarray) -> float:
+    """The share of named steps that are wrong in a proposal, less the share that the posterior expects.
 
-    What posteriors expect is multiplied by the ratio of wrong to expected steps of accepted demonstrations.
-
-    :param accepted: as :func:`first_wrong` gives them.
+    :param labels: an option of each step, [T]; below 1 where none is named.
     """
-    expected, wrong = np.sum([(0.0, 0.0), *accepted], axis=0)
-    ratio = (wrong + 1) / (expected + 1)
-    return {name: float(np.minimum(ratio * (1 - own.probability), 1).sum()) for name, own in shown.items()}
+    said = labels > 0
+    return float(((proposed.options != labels) - (1 - proposed.probability))[said].mean()) if said.any() else 0.0
+
+
+def unforeseen(first: Sequence[float], held_out: Sequence[float]) -> float:
+    """ε, the share of steps that are wrong although the posterior is sure of them.
+
+    It is the mean of what was in excess in demonstrations that were held out. The mean of all first proposals counts
+    as one more of these: it alone is known of a single demonstration.
+
+    :param first: of each accepted demonstration, :func:`excess` of what was shown before anything was said of it.
+    :param held_out: the same of what the model says without its labels.
+    """
+    if not first:
+        return USUAL
+    return max(0.0, (float(np.mean(first)) + sum(held_out)) / (1 + len(held_out)))
+
+
+def expected_wrong(shown: Shown, labels: np.ndarray, sure: float) -> float:
+    """The expected number of wrong steps of a demonstration, Σ (1 - p) + ε p over those of which nothing is said.
+
+    :param sure: ε, as :func:`unforeseen` gives it.
+    """
+    p = shown.probability[labels == FREE]
+    return float((1 - p + sure * p).sum())
 
 
 def ranking(
-    wrong: Mapping[str, float], centres: Mapping[str, np.ndarray], accepted: Collection[str]
-) -> tuple[list[str], str | None]:
-    """Demonstrations that are not accepted, the most informative first, then the others; and the least like those.
+    wrong: np.ndarray, edits: np.ndarray, centres: np.ndarray, accepted: np.ndarray
+) -> tuple[list[int], int | None]:
+    """Demonstrations that are not accepted, the one most worth labelling first, then the others; and the least like
+    accepted ones, None where there are none.
 
-    :param wrong: of each demonstration, the expected number of wrong steps.
-    :param centres: of each demonstration, its mean features.
+    Worth is the expected number of wrong steps for an edit, times the mean likeness to those that are not accepted,
+    times one minus the likeness to the nearest accepted one. Likeness is exp(-d²/2h²), of the distance d between mean
+    features, and h is the median of d.
+
+    :param wrong: the expected number of wrong steps, [N].
+    :param edits: the expected number of edits, [N].
+    :param centres: mean features, [N, F].
+    :param accepted: whether a person is done with each, [N].
     """
-    known = [centres[name] for name in accepted]
-    away = {
-        name: min((float(np.linalg.norm(own - one)) for one in known), default=1.0) for name, own in centres.items()
-    }
-    typical = float(np.median([*away.values()])) or 1.0
-    value = {name: wrong[name] * (1 + away[name] / typical) for name in wrong}
-    ranked = sorted(wrong, key=lambda name: (name in accepted, -value[name]))
-    return ranked, max(away, key=lambda name: away[name]) if known else None
+    away = np.linalg.norm(centres[:, None] - centres, axis=-1)
+    usual = float(np.median(away[np.triu_indices(len(away), 1)])) if len(away) > 1 else 0.0
+    like = np.exp(-((away / (usual or 1.0)) ** 2) / 2)
+    worth = wrong / edits
+    if not accepted.all():
+        worth = worth * like[:, ~accepted].mean(1)
+    if accepted.any():
+        worth = worth * (1 - like[:, accepted].max(1))
+    ranked = sorted(range(len(worth)), key=lambda place: (accepted[place], -worth[place]))
+    return ranked, int(away[:, accepted].min(1).argmax()) if accepted.any() else None

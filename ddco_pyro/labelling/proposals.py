@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -15,6 +15,7 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.evaluation.inferred import Inferred, runs
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.inference import posterior
+from ddco_pyro.labelling.document import FREE
 from ddco_pyro.model.recogniser import Windows
 from ddco_pyro.model.tables import NEVER
 from ddco_pyro.training.recognition import SHARES, learn
@@ -126,6 +127,18 @@ class Proposals:
             tables = tables.with_evidence(self.level, torch.where(own, 0.0, NEVER))
             again.append(Inferred(piece.names, piece.batch, piece.hierarchy, tables))
         self.pieces = again
+
+    def held_out(self, labels: Mapping[str, np.ndarray], names: Iterable[str]) -> dict[str, Shown]:
+        """What would be shown of each of these demonstrations if nothing were said of it.
+
+        The recogniser is learned without its labels; the model stays, which may have been trained with them.
+        :meth:`update` has to follow.
+        """
+        found = {}
+        for name in names:
+            self.update({**labels, name: np.full_like(labels[name], FREE)})
+            found[name] = self.shown(name)
+        return found
 
     def aligned(self, labels: Mapping[str, np.ndarray]) -> np.ndarray:
         """The person's option for each option 0 to k of the model, another one for each where there are enough.

@@ -27,7 +27,7 @@ from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.jobs import Workers, run_all
 from ddco_pyro.labelling.commands import Segment, View, whole
 from ddco_pyro.labelling.document import FREE, Document
-from ddco_pyro.labelling.expectation import expected_wrong, ranking
+from ddco_pyro.labelling.expectation import excess, expected_wrong, ranking, unforeseen
 from ddco_pyro.labelling.journal import SUFFIX, Journal, digest, version
 from ddco_pyro.labelling.proposals import Proposals, Shown
 from ddco_pyro.labelling.refitting import labelled, refit
@@ -112,9 +112,13 @@ class Session:
         """Show another model's proposals; its options have the numbers that named steps and what is shown give them."""
         with self.lock:
             before, count = self._shown_now(), len(self.document.names)
+            labels = {name: own.copy() for name, own in self.document.labels.items()}
+            accepted = [*self.document.accepted]
         proposals = Proposals(fit, self.demos, [*fit.names].index(self.level) + 1, count, before)
+        held_out = proposals.held_out(labels, accepted if len(accepted) > 1 else ())
         with self.lock:
             self.fit, self.proposals = fit, proposals
+            self.excess = {name: excess(own, labels[name]) for name, own in held_out.items()}
             self._update(before)
 
     def _shown_now(self) -> dict[str, np.ndarray]:
@@ -131,7 +135,11 @@ class Session:
             for place, name in enumerate(self.demos.names)
             if name in before and name != edited and not np.array_equal(before[name], self.shown[name].options)
         }
-        self.wrong = expected_wrong(self.shown, self.document.accepted.values())
+        lengths, accepted = self.document.lengths, self.document.accepted
+        first = [(wrong - expected) / lengths[name] for name, (expected, wrong) in accepted.items()]
+        sure = unforeseen(first, [own for name, own in self.excess.items() if name in accepted])
+        self.wrong = {name: expected_wrong(shown, labels[name], sure) for name, shown in self.shown.items()}
+        self.order = self._order()
         self.revision += 1
 
     @property
@@ -145,7 +153,7 @@ class Session:
         """Everything but the demonstrations themselves."""
         with self.lock:
             document, names = self.document, self.demos.names
-            ranked, reasons = self._order()
+            ranked, reasons = self.order
             demos = [
                 {
                     "name": name,
@@ -171,7 +179,7 @@ class Session:
                 "colours": [option_colour(option + 1) for option in range(len(document.names))],
                 "frequency": self.frequency,
                 "demos": demos,
-                "order": [names.index(name) for name in ranked],
+                "order": ranked,
                 "summary": self.summary(),
                 "can_undo": bool(document.done),
                 "can_redo": bool(document.undone),
@@ -189,16 +197,15 @@ class Session:
             }
 
     def summary(self) -> dict[str, Any]:
-        """The expected share of wrong steps, how much of it one more demonstration saves, and labelled ones.
+        """The expected share of wrong steps, how much of it is in the demonstration to label next, and labelled ones.
 
-        What posteriors expect is multiplied by the ratio of wrong to expected steps of accepted demonstrations. Both
-        shares are None before there are any.
+        Both shares are None before anything is accepted.
         """
         steps, labelled = sum(self.document.lengths.values()), len(self.document.accepted)
-        left = [self.wrong[name] for name in self.demos.names if name not in self.document.accepted]
+        following = self.demos.names[self.order[0][0]]
         return {
             "expected_wrong": sum(self.wrong.values()) / steps if labelled else None,
-            "one_more": max(left, default=0.0) / steps if labelled else None,
+            "one_more": self.wrong[following] / steps if labelled else None,
             "labelled": labelled,
         }
 
@@ -209,14 +216,16 @@ class Session:
     def _unchanged(self) -> bool:
         return self.path.exists() and version(self.path) == self.version
 
-    def _order(self) -> tuple[list[str], dict[str, str]]:
-        """Demonstrations that are not accepted, the most informative first, and why; then the others."""
-        lengths, known = self.document.lengths, self.document.accepted
-        centres = {name: self.proposals.centre(name, 0, steps) for name, steps in lengths.items()}
-        ranked, farthest = ranking(self.wrong, centres, known)
-        reasons = {name: f"{self.wrong[name]:.0f} of {lengths[name]} steps expected wrong" for name in ranked}
+    def _order(self) -> tuple[list[int], dict[str, str]]:
+        """Demonstrations that are not accepted, the one most worth labelling first, and why; then the others."""
+        lengths, accepted = self.document.lengths, self.document.accepted
+        wrong, steps = np.array([self.wrong[name] for name in lengths]), np.array([*lengths.values()])
+        edits = 1 + np.array([len(self.segments(name)) for name in lengths]) * wrong / steps
+        centres = np.stack([self.proposals.centre(name, 0, own) for name, own in lengths.items()])
+        ranked, farthest = ranking(wrong, edits, centres, np.array([name in accepted for name in lengths]))
+        reasons = {name: f"{self.wrong[name]:.0f} of {own} steps expected wrong" for name, own in lengths.items()}
         if farthest is not None:
-            reasons[farthest] += "; the least like those you labelled"
+            reasons[[*lengths][farthest]] += "; the least like those you labelled"
         return ranked, reasons
 
     def _uncertain(self) -> list[dict[str, int]]:
