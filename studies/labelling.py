@@ -48,6 +48,8 @@ from ddco_pyro.spec import parse_spec, with_overrides
 from ddco_pyro.spec.yaml import read_yaml
 
 SURGEONS = ("Knot_Tying", "Suturing")
+CHOSE = ("pick-place-v3", "hammer-v3", "stick-pull-v3")
+"""Tasks by which settings of the page were chosen."""
 TRAINED = 50
 ORDERS = ("page", "random", "longest", "recogniser", "equal parts", "from scratch")
 DEFAULTS = Settings({"demonstrations": 70, "noise": 0.1, "most": 5, "slack": 1}, Path("runs/arena"))
@@ -137,18 +139,24 @@ class LabellingCell(Cell):
     def rows(self, results: Mapping[str, Any]) -> Iterator[Row]:
         """What there is after some demonstrations, and the edits at the target beside those of labelling from scratch.
 
-        A target that is never reached has no rows.
+        A target that is never reached has no rows. Tasks of Meta-World that chose nothing are in another study, too.
         """
-        named = "surgeons" if self.task in SURGEONS else "Meta-World", self.task, self.order
+        found = dict[tuple[int | None, str], float]()
         for number in (number for number in SHOWN if number < len(results["curve"])):
             values = results["curve"][number]
-            for measure, value in {**values, "wrong": 1 - values["right"]}.items():
-                yield Row(*named, number, self.seed, measure, value)
+            found |= {(number, measure): value for measure, value in values.items()}
+            found[number, "wrong"] = wrong = 1 - values["right"]
+            if "expected wrong" in values:
+                found[number, "expected less wrong"] = values["expected wrong"] - wrong
         if results["edits"] is not None:
-            yield Row(*named, None, self.seed, "edits at target", results["edits"])
-            yield Row(*named, None, self.seed, "share of edits", results["edits"] / results["scratch"])
+            found[None, "edits at target"] = results["edits"]
+            found[None, "share of edits"] = results["edits"] / results["scratch"]
             if "sd" in results:
-                yield Row(*named, None, self.seed, "edits at target, sd", results["sd"])
+                found[None, "edits at target, sd"] = results["sd"]
+        studies = ["surgeons"] if self.task in SURGEONS else ["Meta-World"]
+        studies += [] if self.task in (*SURGEONS, *CHOSE) else ["kept aside"]
+        for study_name, ((number, measure), value) in itertools.product(studies, found.items()):
+            yield Row(study_name, self.task, self.order, number, self.seed, measure, value)
 
 
 class Patient(Session):
