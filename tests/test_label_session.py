@@ -6,6 +6,7 @@ import json
 import subprocess
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import pairwise
 from xml.etree import ElementTree
@@ -24,9 +25,11 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.planted import pick_and_place
 from ddco_pyro.errors import BadInput
 from ddco_pyro.fitting.fit import fit
+from ddco_pyro.labelling.background import Background
 from ddco_pyro.labelling.document import FREE, OPEN
 from ddco_pyro.labelling.refitting import labelled, refit_spec
 from ddco_pyro.labelling.session import Session
+from ddco_pyro.labelling.ways import Ways
 from ddco_pyro.spec import parse_spec, with_overrides
 from ddco_pyro.training.labels import used
 
@@ -59,7 +62,7 @@ def run(demos):
 @pytest.fixture
 def begin(run, demos, tmp_path, monkeypatch):
     """Begins a session with the fit; refits are made by this process."""
-    monkeypatch.setattr(Session, "_away", lambda session, calls: {name: call() for name, call in calls.items()})
+    monkeypatch.setattr(Background, "_submit", here)
     path = tmp_path / "demos.hdf5"
     demos.write(path)
     begun = []
@@ -89,6 +92,14 @@ def unchanged(run, demos, tmp_path_factory):
 def quiet(monkeypatch):
     """No refit follows an accepted demonstration."""
     monkeypatch.setattr(Session, "refit", lambda session: None)
+
+
+POOL = ThreadPoolExecutor()
+
+
+def here(background, call):
+    """Have a call made by this process."""
+    return POOL.submit(call)
 
 
 def refitted(session):
@@ -422,22 +433,22 @@ def test_a_refit_that_fails_unexpectedly_is_said_and_can_be_asked_for_again(begi
     session = begin()
     label(session, 0, demos[0].labels["phase"])
     with monkeypatch.context() as patch:
-        patch.setattr(Session, "_away", lambda session, calls: {}[0])
+        patch.setattr(Background, "_submit", lambda background, call: {}[0])
         session.refit()
-        assert refitted(session)["error"] == "unexpected KeyError: 0"
+        assert refitted(session)["error"] == "fitting the labels failed: unexpected KeyError: 0"
     session.refit()
     assert (refitted(session)["error"], refitted(session)["done"]) == ("", 1)
 
 
 def test_labels_that_are_undone_while_a_refit_runs_need_no_other_refit(begin, monkeypatch):
-    session, begun, go_on, away = begin(), threading.Event(), threading.Event(), Session._away
+    session, begun, go_on = begin(), threading.Event(), threading.Event()
 
-    def waiting(session, calls):
+    def waiting(call):
         begun.set()
         go_on.wait()
-        return away(session, calls)
+        return call()
 
-    monkeypatch.setattr(Session, "_away", waiting)
+    monkeypatch.setattr(Background, "_submit", lambda background, call: POOL.submit(waiting, call))
     session.edit(paint)
     session.refit()
     begun.wait()
@@ -445,6 +456,88 @@ def test_labels_that_are_undone_while_a_refit_runs_need_no_other_refit(begin, mo
     session.edit({"do": "undo"})
     go_on.set()
     assert (refitted(session)["error"], refitted(session)["done"]) == ("", 1)
+
+
+def test_a_refit_that_is_cancelled_leaves_what_is_shown(begin, monkeypatch):
+    session, begun, go_on = begin(), threading.Event(), threading.Event()
+
+    def waiting(call):
+        found = call()
+        begun.set()
+        go_on.wait()
+        return found
+
+    monkeypatch.setattr(Background, "_submit", lambda background, call: POOL.submit(waiting, call))
+    session.edit(paint)
+    session.refit()
+    before, model = shown(session), session.fit
+    begun.wait()
+    session.cancel()
+    assert not session.state()["refit"]["running"]
+    go_on.set()
+    session.refit()
+    assert refitted(session)["done"] == 1
+    assert session.fit is not model
+    session.edit({"do": "undo"})
+    session.edit(paint)
+    again = begin("other.hdf5")
+    again.edit(paint)
+    assert shown(again) == before
+
+
+# --- ways to cut ------------------------------------------------------------------------------------------------------
+
+
+def test_ways_to_cut_are_asked_for_as_they_come_until_something_is_said(begin, run, monkeypatch):
+    session, go_on = begin(), threading.Semaphore(0)
+
+    def coming():
+        go_on.acquire()
+        return run
+
+    monkeypatch.setattr(Background, "_submit", lambda background, call: POOL.submit(coming))
+
+    def known():
+        return [own["id"] for own in session.state()["question"]["proposals"]]
+
+    assert session.state()["question"] is None
+    session.ask()
+    assert (known(), session.state()["question"]["asked"]) == (["medium"], True)
+    go_on.release()
+    while len(known()) < 2:
+        time.sleep(0.01)
+    assert known() == ["medium", "coarse"]
+    (way, *_) = session.state()["question"]["proposals"]
+    for index, segments in zip(session.state()["question"]["demos"], way["demos"], strict=True):
+        found = session.demo(index)["segments"]
+        assert segments == [{key: own[key] for key in ("start", "stop", "option")} for own in found]
+    go_on.release(3)
+    refitted(session)
+    assert known() == ["medium", "coarse", "fine"], "another seed gives the same options here"
+    with pytest.raises(BadInput, match="no way to cut 'x'; there is: medium, coarse, fine"):
+        session.choose("x")
+    session.edit(paint)
+    assert not session.state()["question"]["asked"]
+    session.edit({"do": "undo"})
+    session.choose("fine")
+    assert (session.state()["question"]["asked"], session.state()["question"]["chosen"]) == (False, "fine")
+
+
+def test_another_way_to_cut_keeps_the_labels_and_learns_from_them(begin, run, demos, monkeypatch):
+    """The other way has two options for four."""
+    coarse = fit(with_overrides(run.spec, {"hierarchy.levels.0.count": 2}), demos)
+    session = begin()
+    monkeypatch.setattr(Ways, "calls", {"coarse": lambda: coarse})
+    label(session, 0, demos[0].labels["phase"])
+    before = session.document.labels["demo_0"].copy()
+    session.ask()
+    refitted(session)
+    session.choose("coarse")
+    assert session.state()["refit"]["message"] == "fitting the labels"
+    assert (refitted(session)["error"], session.state()["refit"]["done"]) == ("", 1)
+    assert shown(session)[0][1] == [(option, "said") for option in before]
+    np.testing.assert_array_equal(session.document.labels["demo_0"], before)
+    assert session.fit.spec.hierarchy.levels[0].count == COUNT, "a refit has an option for each name"
 
 
 # --- files ------------------------------------------------------------------------------------------------------------

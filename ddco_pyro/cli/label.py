@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import webbrowser
-from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -56,23 +55,21 @@ def label(
     except ModuleNotFoundError as error:
         raise BadInput(f"label needs {error.name}; install it with: pip install 'ddco-pyro[label]'") from None
     from ddco_pyro.fitting.fitted import load
-    from ddco_pyro.jobs import processes
     from ddco_pyro.labelling.session import Session
 
     run = paths[0] if len(paths) == 2 else _fitted(file)
-    with ExitStack() as stack:
-        stack.enter_context(processes(1))
-        listening = Listening.at(port)
-        session = Session(load(run, allow_code), file, place, level, _exporters(run, file))
-        session.journal.at(listening.address)
+    listening = Listening.at(port)
+    session = Session(load(run, allow_code), file, place, level, _exporters(run, file))
+    session.journal.at(listening.address)
+    if not session.document.done:
         session.ask()
 
-        def ready() -> None:
-            print(f"{listening.address}\nCtrl-C saves the labels and ends", flush=True)
-            if browser:
-                webbrowser.open(listening.address)
+    def ready() -> None:
+        print(f"{listening.address}\nCtrl-C saves the labels and ends", flush=True)
+        if browser:
+            webbrowser.open(listening.address)
 
-        print(serve(session, listening, ready))
+    print(serve(session, listening, ready))
 
 
 def _fitted(file: Path) -> Path:

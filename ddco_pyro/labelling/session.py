@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from sklearn.metrics import normalized_mutual_info_score
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.pictures import Observed
@@ -20,29 +19,22 @@ from ddco_pyro.data.sources.recording import label_names
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.drawing.shown import frames, jpeg, paths_of, stored_pictures
 from ddco_pyro.drawing.timeline import following, text
-from ddco_pyro.errors import BadInput, reason
+from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.inferred import runs
-from ddco_pyro.fitting.fit import fit as fit_to
 from ddco_pyro.fitting.fitted import Fit
-from ddco_pyro.jobs import Workers, run_all
+from ddco_pyro.labelling.background import Away, Background
 from ddco_pyro.labelling.document import FREE, OPEN, Change, Document
 from ddco_pyro.labelling.journal import SUFFIX, Journal, version
 from ddco_pyro.labelling.proposals import Proposals, Shown
 from ddco_pyro.labelling.refitting import labelled, refit
+from ddco_pyro.labelling.ways import Ways
 from ddco_pyro.names import choice_names, option_name
 from ddco_pyro.segmenting import LevelLabels, Segmented, Segments, segments
 from ddco_pyro.segmenting.formats.labels import check_copy, check_labels, write_labels
-from ddco_pyro.selection.small import GRANULARITIES, cut
-from ddco_pyro.spec import PathSpec, with_overrides
+from ddco_pyro.spec import PathSpec
 
-ASKED = 3
-"""Demonstrations of the first question."""
-
-SEEDS = (1, 2)
-"""Further training seeds of the first question."""
-
-ALIKE = 0.9
-"""The NMI of segments from which on two ways to cut are the same."""
+REFIT, LOOK = "fitting the labels", "looking for other ways to cut"
+"""What a page says of the work in the background."""
 
 NEAREST = 5
 """Segments elsewhere that are shown for one."""
@@ -102,8 +94,9 @@ class Session:
         self.document = Document({demo.name: len(demo) for demo in self.demos}, fit.names[self.level][1:])
         self.journal = Journal(out.with_name(out.name + SUFFIX), self.document, self.level)
         self.lock, self.revision, self.edits, self.saved, self.changed = threading.RLock(), 0, 0, 0, set[int]()
-        self.ways, self.message, self.error = dict[str, Fit](), "", ""
-        self.refits, self.running, self.again = 0, False, False
+        self.ways: Ways | None = None
+        self.refits, self.turn, self.chosen = 0, 0, ""
+        self.background = Background(self.lock, self._changed)
         self.first, self.shown, self.opened = dict[str, Shown](), dict[str, Shown](), ExitStack()
         self.take(fit)
         self.proposed = self.proposals
@@ -116,14 +109,27 @@ class Session:
         """The level's number, 1 for the lowest."""
         return [*self.fit.names].index(self.level) + 1
 
-    def take(self, fit: Fit) -> None:
-        """Show another model's proposals; its options have the numbers that named steps and what is shown give them."""
+    def take(self, fit: Fit, refit: int | None = None) -> None:
+        """Show another model's proposals; its options have the numbers that named steps and what is shown give them.
+
+        Where :attr:`turn` moves on meanwhile, nothing is shown: another model is taken, or the refit is cancelled.
+
+        :param refit: of a refit, the turn at which it began.
+        """
         with self.lock:
-            before, count = self._shown_now(), len(self.document.names)
+            if refit not in (None, self.turn):
+                return
+            self.turn += 1
+            turn, before, count = self.turn, self._shown_now(), len(self.document.names)
         proposals = Proposals(fit, self.demos, [*fit.names].index(self.level) + 1, count, before)
         with self.lock:
-            self.fit, self.proposals = fit, proposals
-            self._update(before)
+            if turn == self.turn:
+                self.fit, self.proposals = fit, proposals
+                self.refits += refit is not None
+                self._update(before)
+
+    def _changed(self) -> None:
+        self.revision += 1
 
     def _shown_now(self) -> dict[str, np.ndarray]:
         return {name: shown.options for name, shown in self.shown.items()}
@@ -184,11 +190,11 @@ class Session:
                 "can_undo": bool(document.done),
                 "can_redo": bool(document.undone),
                 "refit": {
-                    "running": self.running,
-                    "progress": None,
-                    "message": self.message,
+                    "running": self.background.work is not None,
+                    "progress": self.background.progress,
+                    "message": self.background.work.message if self.background.work else "",
                     "done": self.refits,
-                    "error": self.error,
+                    "error": self.background.error,
                 },
                 "question": self._question(),
                 "warnings": self.warnings(),
@@ -506,38 +512,17 @@ class Session:
         with self.lock:
             if not self._is_labelled():
                 raise BadInput("refit: nothing is labelled yet")
-            self.again = self.running
-            if not self.running:
-                self._start(self._refit, "fitting the labels")
+            self.background.begin(REFIT, self._refit)
 
     def _is_labelled(self) -> bool:
         return any(bool(self.document.said(name).any()) for name in self.demos.names)
 
-    def _start(self, work: Callable[[], None], message: str) -> None:
-        self.running, self.message, self.error = True, message, ""
+    def _refit(self, away: Away) -> None:
+        turn = self.turn
+        if self._is_labelled():  # or the labels are undone
+            self.take(away(self.refitting()), turn)
 
-        def do() -> None:
-            try:
-                work()
-            except Exception as error:  # the page says what has failed, and labelling goes on
-                self.error = reason(error)
-            finally:
-                with self.lock:
-                    self.running, self.message, again = False, "", self.again and self._is_labelled()
-                    self.again = False
-                    self.revision += 1
-                    if again:
-                        self.refit()
-
-        threading.Thread(target=do, daemon=True).start()
-
-    def _refit(self) -> None:
-        found = self._away({"refit": self.refitting()})["refit"]
-        with self.lock:
-            self.refits += 1
-            self.take(found)
-
-    def refitting(self) -> Callable[[], Fit]:
+    def refitting(self) -> Callable[..., Fit]:
         """The call that fits to what is said so far, for any process; :meth:`take` shows its result."""
         with self.lock:
             labels = {name: self.document.in_file(name) for name in self.demos.names}
@@ -551,73 +536,50 @@ class Session:
         )
         return partial(refit, trained, self.level, count, labelled(demos, labels), kept)
 
-    def _away(self, calls: Mapping[str, Callable[..., Fit]]) -> dict[str, Fit]:
-        """The results of fits in another process, one after another."""
-        with run_all(calls, Workers(2), "fitted the labels", beside=len(calls)) as results:
-            return dict(results)
+    def cancel(self) -> None:
+        """End what is under way in the background at once; what is shown stays."""
+        with self.lock:
+            self.turn += 1
+            self.background.cancel()
 
     def ask(self) -> None:
-        """Prepare the first question, in the background: which way to cut is meant?"""
-        with self.lock:
-            if not (self.document.done or self.running):
-                self._start(self._ask, "looking for other ways to cut")
+        """Look for other ways to cut, in the background; :meth:`choose` takes one.
 
-    def _ask(self) -> None:
-        trained, names = self.run, self.demos.names
-        calls: dict[str, Callable[..., Fit]] = {}
-        if trained.spec.training.labels is None and self.number == 1:
-            calls = {name: partial(cut, trained, name) for name in GRANULARITIES if name != "medium"}
-        alone = {"compare_with": [], "demonstrations.leave_one_out": False}
-        for seed in SEEDS:
-            spec = with_overrides(trained.spec, alone | {"training.seed": seed})
-            calls[f"seed {seed}"] = partial(fit_to, spec, trained.demonstrations, keep=False)
-        ways, found = {"medium": trained}, {"medium": np.concatenate([self.shown[name].options for name in names])}
-        for name, each in self._away(calls).items():
-            options = np.concatenate([*each.segment(self.demos)[self.number - 1]])
-            alike = max(normalized_mutual_info_score(options, other) for other in found.values())
-            if name in GRANULARITIES or alike < ALIKE:
-                ways[name], found[name] = each, options
-        with self.lock:
-            order = [name for name in ("coarse", "medium", "fine", *calls) if name in ways]
-            self.ways = {name: ways[name] for name in dict.fromkeys(order)}
-
-    def _question(self) -> dict[str, Any] | None:
-        if len(self.ways) < 2 or self.document.done:
-            return None
-        return self._asked
-
-    @cached_property
-    def _asked(self) -> dict[str, Any]:
-        asked = np.unique(np.linspace(0, len(self.demos) - 1, ASKED).round().astype(int)).tolist()
-        return {"demos": asked, "proposals": [self._way(name, fit, asked) for name, fit in self.ways.items()]}
-
-    def _way(self, name: str, fit: Fit, asked: Sequence[int]) -> dict[str, Any]:
-        own = fit.segment(self.demos)[self.number - 1]
-        lengths = [segment.steps for segment in own.segments]
-        each = [
-            [
-                {"start": start, "stop": stop, "option": int(option)}
-                for option, start, stop in runs(own[index], np.diff(own[index], prepend=-1) != 0)
-            ]
-            for index in asked
-        ]
-        names = list(fit.names[self.level][1:])
-        colours = [option_colour(option) for option in range(1, len(names) + 1)]
-        median = float(np.median(lengths))
-        return {"id": name, "name": name, "median": median, "demos": each, "names": names, "colours": colours}
-
-    def choose(self, way: str) -> None:
-        """Go on with one of the ways to cut.
-
-        :raises BadInput: there is no such way, or something is labelled already.
+        A page asks for an answer while nothing is labelled.
         """
         with self.lock:
-            if way not in self.ways:
-                raise BadInput(f"there is no way to cut {way!r}; there is: {', '.join(self.ways) or 'none yet'}")
-            if self.document.done:
-                raise BadInput("choose: labels are given already; refit learns from them")
-            self.take(self.ways[way])
-            self.ways = {}
+            if self.ways is None or (len(self.ways.fits) == 1 and self.background.work is None):
+                ways = self.ways = Ways(self.run, self.demos, self.number)
+                self.background.begin(LOOK, partial(self._look, ways), len(ways.calls))
+
+    def _look(self, ways: Ways, away: Away) -> None:
+        for name, call in ways.calls.items():
+            found = away(call)
+            with self.lock:
+                ways.add(name, found)
+                self.revision += 1
+
+    def _question(self) -> dict[str, Any] | None:
+        if self.ways is None:
+            return None
+        open_ = len(self.ways.fits) > 1 or self.background.work is not None
+        return {**self.ways.shown(), "asked": open_ and not (self.chosen or self.document.done), "chosen": self.chosen}
+
+    def choose(self, way: str) -> None:
+        """Go on with one of the ways to cut; all labels stay, and the model learns from them.
+
+        :raises BadInput: there is no such way.
+        """
+        with self.lock:
+            known = {} if self.ways is None else self.ways.fits
+            if way not in known:
+                raise BadInput(f"there is no way to cut {way!r}; there is: {', '.join(known) or 'none yet'}")
+            if self.background.work and self.background.work.message == REFIT:
+                self.background.cancel()
+            self.chosen = way
+        self.take(known[way])
+        if self._is_labelled():
+            self.refit()
 
     # --- files --------------------------------------------------------------------------------------------------------
 
@@ -679,8 +641,9 @@ class Session:
         return self.exporters[form](self.segmented(), named, folder, self.level)
 
     def close(self) -> None:
-        """Save, and leave the labels to other processes."""
+        """Save, end what is under way, and leave the labels to other processes."""
         with self.lock:
+            self.background.close()
             if self.edits != self.saved and self._unchanged():
                 self.save()
             self.opened.close()
