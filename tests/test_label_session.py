@@ -138,7 +138,10 @@ def test_before_any_label_the_fit_proposes(begin, run, demos):
         np.testing.assert_array_equal(unpacked(found["probability"]), np.rint(255 * np.minimum(probability, 1)))
         wrong.append((1 - probability).sum())
         assert [own["step"] for own in found["boundaries"]] == (np.flatnonzero(np.diff(path)) + 1).tolist()
-        assert all(own["low"] <= own["step"] <= own["high"] for own in found["boundaries"])
+        for own in found["boundaries"]:
+            assert own["low"] <= own["step"] <= own["high"]
+            density = unpacked(own["density"])
+            assert (len(density), max(density)) == (own["high"] - own["low"] + 1, 255)
     assert [own["expected_wrong"] for own in state["demos"]] == pytest.approx(wrong, abs=0.006)
     assert state["summary"] == {"expected_wrong": None, "one_more": None, "labelled": 0}
     assert [own["steps"] for own in state["demos"]] == [*demos.lengths]

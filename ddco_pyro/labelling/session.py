@@ -20,7 +20,7 @@ from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.drawing.shown import frames, jpeg, paths_of, stored_pictures
 from ddco_pyro.drawing.timeline import following, text
 from ddco_pyro.errors import BadInput
-from ddco_pyro.evaluation.inferred import runs
+from ddco_pyro.evaluation.inferred import runs, within
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.labelling.background import Away, Background
 from ddco_pyro.labelling.document import FREE, OPEN, Change, Document
@@ -267,12 +267,10 @@ class Session:
         """One demonstration with its segments, boundaries, and what follows the cursor."""
         with self.lock:
             name = self._name(index)
-            shown, ends, own = self.shown[name], self.proposals.intervals(name), self.segments(name)
+            shown, drawn, own = self.shown[name], self.proposals.drawn(name), self.segments(name)
             boundaries = [
                 {
-                    "step": segment.start,
-                    "low": ends.get(segment.start, (segment.start,) * 2)[0],
-                    "high": ends.get(segment.start, (segment.start,) * 2)[1],
+                    **_band(segment.start, drawn.get(segment.start, np.array([], int))),
                     "probability": round(float(shown.probability[segment.start]), 4),
                     "said": bool(self.document.labels[name][segment.start - 1 : segment.start + 1].min() > 0),
                 }
@@ -648,6 +646,13 @@ class Session:
                 self.save()
             self.opened.close()
             self.journal.close()
+
+
+def _band(step: int, drawn: np.ndarray) -> dict[str, Any]:
+    """A boundary with its 90 % interval and, within it, how often draws have each step, beside the most frequent."""
+    low, high = within(drawn, step)
+    often = np.bincount(drawn[(drawn >= low) & (drawn <= high)] - low, minlength=high - low + 1)
+    return {"step": step, "low": low, "high": high, "density": text(np.rint(255 * often / max(often.max(), 1)))}
 
 
 def _whole(command: Mapping[str, Any], key: str) -> int:

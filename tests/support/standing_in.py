@@ -125,6 +125,7 @@ class StandIn:
             {
                 "step": one["start"], "low": max(one["start"] - (0 if pinned else 3), 0),
                 "high": one["start"] + (0 if pinned else 4), "probability": 0.8, "said": pinned,
+                "density": text(np.array([255] if pinned else [20, 90, 160, 255, 120, 60, 80, 30])),
             }
             for one in shown[1:] for pinned in [bool((said[one["start"] - 1 : one["start"] + 1] > 0).all())]
         ]  # fmt: skip
