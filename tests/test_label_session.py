@@ -20,11 +20,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from time_lines import unpacked
 
-from ddco_pyro.cli.label import _exporters
+from ddco_pyro.cli.label import _exporters, _fitted
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.planted import pick_and_place
 from ddco_pyro.errors import BadInput
 from ddco_pyro.fitting.fit import fit
+from ddco_pyro.fitting.fitted import load
 from ddco_pyro.labelling.background import Background
 from ddco_pyro.labelling.document import FREE, OPEN
 from ddco_pyro.labelling.refitting import labelled, refit_spec
@@ -620,6 +621,24 @@ def test_what_is_closed_is_saved_and_left_to_others(begin, tmp_path):
 def test_a_format_that_is_none_is_refused(begin, tmp_path):
     with pytest.raises(BadInput, match="csv"):
         begin().export("xls", tmp_path)
+
+
+@pytest.mark.usefixtures("undecided")
+def test_without_a_run_one_is_fitted_for_its_proposals_alone_and_used_again(demos, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    demos.write(tmp_path / "mine.hdf5")
+    run = _fitted(tmp_path / "mine.hdf5")
+    first = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
+    assert not {path.name for path in first} & {"baselines", "report.html", "figures"}
+    session = Session(load(run), tmp_path / "mine.hdf5", tmp_path / "out.hdf5")
+    assert sorted(session.state()["order"]) == [*range(len(demos))]
+    session.close()
+    assert _fitted(tmp_path / "mine.hdf5") == run
+    assert {path: path.stat().st_mtime_ns for path in run.rglob("*")} == first
+    (tmp_path / "other").mkdir()
+    demos.write(tmp_path / "other" / "mine.hdf5")
+    with pytest.raises(BadInput, match="copy the file under another name"):
+        _fitted(tmp_path / "other" / "mine.hdf5")
 
 
 @pytest.mark.slow

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ddco_pyro.cli import AllowCode, Level, demos, fits, going_on, out_file, runs, written
+from ddco_pyro.cli import AllowCode, Level, demos, going_on, out_file, runs, written
 from ddco_pyro.cli.starting import refuse_other
 from ddco_pyro.data.files import Output, check_outputs
 from ddco_pyro.errors import BadInput
+from ddco_pyro.spec import load_spec
 
 if TYPE_CHECKING:
     from ddco_pyro.fitting.fitted import Fit
@@ -73,8 +74,10 @@ def label(
 
 
 def _fitted(file: Path) -> Path:
-    """A run fitted to the file, without baselines; a finished one is used again."""
+    """A run fitted to the file, without baselines and report; a finished one is used again."""
+    from ddco_pyro.cli import console
     from ddco_pyro.data.sources import refuse_foreign
+    from ddco_pyro.fitting.fit import fit
 
     folder = Path("runs") / file.stem
     spec, run = folder / "spec.yaml", folder / "run"
@@ -86,7 +89,8 @@ def _fitted(file: Path) -> Path:
         with going_on():
             if not spec.exists():
                 demos.init(file, spec)
-            fits.fit(spec, run, overrides=["compare_with=[]"], resume=True)
+        with console.Progress() as progress:
+            fit(load_spec(spec, ["compare_with=[]"]), None, run, progress)
     return run
 
 
