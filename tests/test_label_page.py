@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from standing_in import StandIn
 
+from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.planted import pick_and_place
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.labelling.background import Background
@@ -430,6 +431,50 @@ def test_a_refit_says_how_far_it_is_is_cancelled_and_said_when_it_is_done(tab, s
     going.set()
     said(tab, "Refit 1 is done: expected wrong steps")
     playwright.expect(bar).to_be_hidden()
+
+
+PIXEL = """one => {
+  const canvas = new OffscreenCanvas(1, 1), context = canvas.getContext("2d");
+  context.drawImage(one, 0, 0, 1, 1);
+  return [one.naturalWidth, one.naturalHeight, ...context.getImageData(0, 0, 1, 1).data];
+}"""
+
+
+def test_the_picture_is_that_of_the_step_at_the_cursor(tabs, run, tmp_path):
+    def pictured(number, demo):
+        shape = (len(demo), 30, 40, 3)
+        picture = np.full(shape, np.array([0, 60 + 20 * number, 250]), np.uint8)
+        picture[..., 0] = 4 * np.arange(len(demo))[:, None, None]
+        return replace(demo, observations={**demo.observations, "camera": picture})
+
+    demos = Demonstrations(tuple(pictured(*one) for one in enumerate(pick_and_place(6))))
+    demos.write(tmp_path / "demos.hdf5")
+    session = Session(replace(run, named={}), tmp_path / "demos.hdf5", tmp_path / "labels.hdf5")
+
+    def shows(index, step):
+        def holds():
+            size, colour = np.split(np.array(tab.locator("#look img").evaluate(PIXEL)), [2])
+            assert size.tolist() == [320, 240]
+            return np.abs(colour[:3] - [4 * step, 60 + 20 * index, 250]).max() <= 3
+
+        until(holds)
+
+    with served(session) as address:
+        tab = tabs(address)
+        tab.get_by_role("slider", name="Step").focus()
+        first = session.state()["order"][0]
+        shows(first, 0)
+        keys(tab, "ArrowRight", "Shift+ArrowRight")
+        shows(first, 11)
+        keys(tab, "End")
+        shows(first, len(demos[first]) - 1)
+        other = session.state()["order"][1]
+        items(tab, f"demo_{other}").click()
+        shows(other, 0)
+        alike, own = tab.get_by_label("Alike elsewhere").locator("img").first, session.nearest(other, 0)[0]
+        middle = (own["start"] + own["stop"]) // 2
+        until(lambda: abs(alike.evaluate(PIXEL)[2] - 4 * middle) <= 3)
+    session.close()
 
 
 @pytest.mark.slow
