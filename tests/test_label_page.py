@@ -254,6 +254,7 @@ def test_each_key_does_what_the_list_says(tab, session):
     playwright.expect(items(tab)).to_have_count(1)
     keys(tab, "Enter")
     playwright.expect(tab.get_by_role("heading", name="demo_4")).to_be_visible()
+    playwright.expect(items(tab)).to_have_count(6)
     keys(tab, "g")
     said(tab, "Boundary 1 of the")
 

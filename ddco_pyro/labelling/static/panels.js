@@ -88,7 +88,8 @@ export class List {  // all demonstrations, the most informative first, each wit
     find.onkeydown = event => {
       const first = this.shown()[0];
       if (event.key === "Escape") { find.value = ""; this.filter(); root.focus(); }
-      else if (event.key === "Enter" && first !== undefined) { root.focus(); open(first); }
+      else if (event.key === "Enter" && first !== undefined) { find.value = ""; this.filter(); root.focus(); open(first); }
+      else if (event.key === "ArrowDown") root.focus();  // to walk through what is found
       else return;
       event.preventDefault(); event.stopPropagation();
     };
