@@ -527,6 +527,15 @@ def test_ways_to_cut_are_asked_for_as_they_come_until_something_is_said(begin, r
     assert (session.state()["question"]["asked"], session.state()["question"]["chosen"]) == (False, "fine")
 
 
+def test_where_the_demonstrations_of_the_run_are_gone_no_other_way_is_asked_for(begin):
+    session = begin()
+    session.run = replace(session.run, given=None)
+    session.ask()
+    assert "looking for other ways to cut failed: demonstrations.path: none.hdf5" in refitted(session)["error"]
+    assert not session.state()["question"]["asked"]
+    session.edit(paint)
+
+
 def test_another_way_to_cut_keeps_the_labels_and_learns_from_them(begin, run, demos, monkeypatch):
     """The other way has two options for four."""
     coarse = fit(with_overrides(run.spec, {"hierarchy.levels.0.count": 2}), demos)

@@ -560,8 +560,9 @@ class Session:
     def _question(self) -> dict[str, Any] | None:
         if self.ways is None:
             return None
-        open_ = len(self.ways.fits) > 1 or self.background.work is not None
-        return {**self.ways.shown(), "asked": open_ and not (self.chosen or self.document.done), "chosen": self.chosen}
+        answered = self.chosen or self.document.done
+        asked = not answered and (len(self.ways.fits) > 1 or self.background.work is not None)
+        return {**self.ways.shown(), "asked": asked, "chosen": self.chosen}
 
     def choose(self, way: str) -> None:
         """Go on with one of the ways to cut; all labels stay, and the model learns from them.

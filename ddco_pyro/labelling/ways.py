@@ -12,6 +12,7 @@ from sklearn.metrics import normalized_mutual_info_score
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.evaluation.inferred import runs
+from ddco_pyro.events import OnEvent, ignore
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.selection.small import GRANULARITIES, cut
@@ -43,14 +44,11 @@ class Ways:
     @cached_property
     def calls(self) -> dict[str, Callable[..., Fit]]:
         """The fits that find other ways, for any process."""
-        trained, calls = self.trained, dict[str, Callable[..., Fit]]()
-        if trained.spec.training.labels is None and self.number == 1:
-            calls = {name: partial(cut, trained, name) for name in GRANULARITIES if name != "medium"}
-        alone = {"compare_with": [], "demonstrations.leave_one_out": False}
-        for seed in SEEDS:
-            spec = with_overrides(trained.spec, alone | {"training.seed": seed})
-            calls[f"seed {seed}"] = partial(fit, spec, trained.demonstrations, keep=False)
-        return calls
+        spec, calls = self.trained.spec, dict[str, Callable[..., Fit]]()
+        assert spec.hierarchy is not None
+        if spec.training.labels is None and self.number == 1 and spec.hierarchy.levels[0].lasts:
+            calls = {name: partial(cut, self.trained, name) for name in GRANULARITIES if name != "medium"}
+        return calls | {f"seed {seed}": partial(_again, self.trained, seed) for seed in SEEDS}
 
     def add(self, name: str, found: Fit) -> None:
         """Another way; one that is hardly different is left out, unless it is a granularity."""
@@ -76,3 +74,9 @@ class Ways:
     def shown(self) -> dict[str, Any]:
         """What a page shows of them."""
         return {"demos": self.asked, "proposals": [*self._shown]}
+
+
+def _again(trained: Fit, seed: int, on_event: OnEvent = ignore) -> Fit:
+    """A run's model, fitted with another training seed."""
+    changes = {"compare_with": [], "demonstrations.leave_one_out": False, "training.seed": seed}
+    return fit(with_overrides(trained.spec, changes), trained.demonstrations, None, on_event)
