@@ -3,35 +3,32 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.data.pictures import Observed
 from ddco_pyro.data.sources import open_source
-from ddco_pyro.data.sources.recording import label_names
 from ddco_pyro.drawing.colours import option_colour
-from ddco_pyro.drawing.shown import frames, jpeg, paths_of, stored_pictures
-from ddco_pyro.drawing.timeline import following, text
+from ddco_pyro.drawing.timeline import text
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.inferred import runs, within
 from ddco_pyro.fitting.fitted import Fit
+from ddco_pyro.labelling import writing
 from ddco_pyro.labelling.background import Away, Background
 from ddco_pyro.labelling.document import FREE, OPEN, Change, Document
+from ddco_pyro.labelling.following import Following
 from ddco_pyro.labelling.journal import SUFFIX, Journal, version
 from ddco_pyro.labelling.proposals import Proposals, Shown
 from ddco_pyro.labelling.refitting import labelled, refit
 from ddco_pyro.labelling.ways import Ways
-from ddco_pyro.names import choice_names, option_name
-from ddco_pyro.segmenting import LevelLabels, Segmented, Segments, segments
+from ddco_pyro.names import option_name
+from ddco_pyro.segmenting import Segmented
 from ddco_pyro.segmenting.formats.labels import check_copy, check_labels, write_labels
-from ddco_pyro.spec import PathSpec
 
 REFIT, LOOK = "fitting the labels", "looking for other ways to cut"
 """What a page says of the work in the background."""
@@ -39,8 +36,8 @@ REFIT, LOOK = "fitting the labels", "looking for other ways to cut"
 NEAREST = 5
 """Segments elsewhere that are shown for one."""
 
-PICTURE_HEIGHT, LONGEST = 240, 80
-"""Rows of a picture, and characters of a name."""
+LONGEST = 80
+"""Characters of a name."""
 
 UNCERTAIN = 20
 """Boundaries that are named as the most uncertain ones."""
@@ -97,7 +94,8 @@ class Session:
         self.ways: Ways | None = None
         self.refits, self.turn, self.chosen = 0, 0, ""
         self.background = Background(self.lock, self._changed)
-        self.first, self.shown, self.opened = dict[str, Shown](), dict[str, Shown](), ExitStack()
+        self.first, self.shown = dict[str, Shown](), dict[str, Shown]()
+        self.following = Following(path, self.demos, fit.spec.report.trajectory)
         self.take(fit)
         self.proposed = self.proposals
         """By the run."""
@@ -296,24 +294,8 @@ class Session:
                 "boundaries": boundaries,
                 "probability": text(np.rint(255 * shown.probability)),
                 "upper": upper,
-                "pictures": len(self._pictures[index]) if self._pictures else 0,
-                **self._followed(index),
+                **self.following.shown(index),
             }
-
-    def _followed(self, index: int) -> dict[str, Any]:
-        """Numbers and paths in space that follow the cursor."""
-        demo = self.demos[index]
-        (found,) = following([demo], [], len(demo), self._paths)
-        return {"numbers": found.get("n"), "paths": found.get("paths"), "view": found.get("view")}
-
-    @cached_property
-    def _paths(self) -> tuple[PathSpec, ...]:
-        return paths_of(self.run.spec.report.trajectory, self.demos)
-
-    @cached_property
-    def _pictures(self) -> list[Observed]:
-        source = self.opened.enter_context(open_source(self.path))
-        return stored_pictures(source, self.document.lengths)
 
     def picture(self, index: int, step: int) -> bytes:
         """The picture of a step as JPEG.
@@ -321,10 +303,8 @@ class Session:
         :raises BadInput: there is none.
         """
         with self.lock:
-            name = self._name(index)
-            if not self._pictures or not 0 <= step < self.document.lengths[name]:
-                raise BadInput(f"{name}: has no picture of step {step}")
-            return jpeg(frames(self._pictures[index], [step], PICTURE_HEIGHT)[0])
+            self._name(index)
+            return self.following.picture(index, step)
 
     def nearest(self, index: int, step: int) -> list[dict[str, Any]]:
         """The segments of other demonstrations that are most like the one at a step."""
@@ -582,36 +562,6 @@ class Session:
 
     # --- files --------------------------------------------------------------------------------------------------------
 
-    def segmented(self, said: bool = False) -> Segmented:
-        """All segments that are shown, as ``segment`` has them.
-
-        :param said: only those of steps that a person has named, -1 elsewhere, and no other level.
-        """
-        with self.lock, open_source(self.path) as source:
-            if said:
-                each = tuple(self._labels_of(name) for name in self.demos.names)
-                names: dict[str, Sequence[str]] = {}
-                names[self.level] = choice_names(len(self.document.names), self.document.names)
-                counts = {self.level: len(self.document.names)}
-                return Segmented(each, counts, self.frequency, {}, names, label_names(source.attributes))
-            if len(self.document.names) + 1 != len(self.fit.names[self.level]):
-                raise BadInput("an option is new; refit before you write segments")
-            model = segments(self.fit, source)
-            shown = []
-            for demo in model.segments:
-                own = self.shown[demo.name]
-                starts = np.diff(own.options, prepend=-1) != 0
-                level = LevelLabels(own.options, starts, own.probability)
-                shown.append(replace(demo, levels={**demo.levels, self.level: level}))
-            names = dict(model.names) | {self.level: choice_names(len(self.document.names), self.document.names)}
-            return replace(model, segments=tuple(shown), names=names)
-
-    def _labels_of(self, name: str) -> Segments:
-        labels = self.document.in_file(name)
-        starts = np.diff(labels, prepend=-9) != 0
-        starts[[*self.document.cuts[name]]] = True
-        return Segments(name, {self.level: LevelLabels(labels, starts, np.ones(len(labels)))}, 0.0, False)
-
     def save(self) -> str:
         """Write ``labels/<level>``, -1 where nothing is said, whole or not at all.
 
@@ -621,12 +571,14 @@ class Session:
         with self.lock:
             if not self._unchanged():
                 raise BadInput(self.warnings()[0])
-            write_labels(self.path, self.out, self.segmented(said=True))
+            with open_source(self.path) as source:
+                labels = writing.said(self.document, self.level, source, self.frequency)
+            write_labels(self.path, self.out, labels)
             if self.out.exists() and self.out.samefile(self.path):
                 self.version = version(self.path)
             self.saved = self.edits
-            said = sum(int(self.document.said(name).sum()) for name in self.demos.names)
-            return f"{self.out}: labels/{self.level}, {said} of {sum(self.document.lengths.values())} steps"
+            steps = sum(int(self.document.said(name).sum()) for name in self.demos.names)
+            return f"{self.out}: labels/{self.level}, {steps} of {sum(self.document.lengths.values())} steps"
 
     def export(self, form: str, folder: Path) -> Path:
         """Write the shown segments in one of ``segment``'s formats into a folder.
@@ -636,8 +588,10 @@ class Session:
         """
         if form not in self.exporters:
             raise BadInput(f"there is no format {form!r}; there is: {', '.join(self.exporters)}")
-        named = replace(self.fit, named={**self.fit.named, self.level: self.document.names})
-        return self.exporters[form](self.segmented(), named, folder, self.level)
+        with self.lock, open_source(self.path) as source:
+            named = replace(self.fit, named={**self.fit.named, self.level: self.document.names})
+            segmented = writing.shown(self.fit, source, self.level, self.shown, self.document.names)
+        return self.exporters[form](segmented, named, folder, self.level)
 
     def close(self) -> None:
         """Save, end what is under way, and leave the labels to other processes."""
@@ -645,7 +599,7 @@ class Session:
             self.background.close()
             if self.edits != self.saved and self._unchanged():
                 self.save()
-            self.opened.close()
+            self.following.close()
             self.journal.close()
 
 
