@@ -503,6 +503,7 @@ def test_a_server_killed_during_an_edit_loses_nothing_that_it_acknowledged(tabs,
 
         tab = tabs(address)
         tab.on("response", answered)
+        tab.get_by_role("button", name="Choose way 1").click()
         tab.get_by_role("slider", name="Step").focus()
         before = set(starts_of(address))
         for _ in range(12):

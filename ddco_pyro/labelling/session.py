@@ -492,6 +492,9 @@ class Session:
                 raise BadInput("refit: nothing is labelled yet")
             self.background.begin(REFIT, self._refit)
 
+    def _refits(self) -> bool:
+        return self.background.work is not None and self.background.work.message == REFIT
+
     def _is_labelled(self) -> bool:
         return any(bool(self.document.said(name).any()) for name in self.demos.names)
 
@@ -517,7 +520,7 @@ class Session:
     def cancel(self) -> None:
         """End what is under way in the background at once; what is shown stays."""
         with self.lock:
-            self.turn += 1
+            self.turn += self._refits()
             self.background.cancel()
 
     def ask(self) -> None:
@@ -553,7 +556,7 @@ class Session:
             known = {} if self.ways is None else self.ways.fits
             if way not in known:
                 raise BadInput(f"there is no way to cut {way!r}; there is: {', '.join(known) or 'none yet'}")
-            if self.background.work and self.background.work.message == REFIT:
+            if self._refits():
                 self.background.cancel()
             self.chosen = way
         self.take(known[way])

@@ -198,7 +198,7 @@ const here = name => () => edit({ do: name, demo: demo.index, step: cursor });
 const commands = {
   undo: () => edit({ do: "undo" }), redo: () => edit({ do: "redo" }), split: here("split"), merge: here("merge"), open: here("open"), accept, play, uncertain,
   refit: () => tried(async () => { await ask("refit", {}); await poll(); say("Refit begun"); }),
-  cancel: () => tried(async () => { await ask("cancel", {}); await poll(); say("Cancelled; what is shown stays"); }),
+  cancel: () => tried(async () => { if (!state.refit.running) { say("Nothing is under way"); return; } await ask("cancel", {}); await poll(); say("Cancelled; what is shown stays"); }),
   ways: () => tried(async () => { stop(); asking = true; await ask("ask", {}); await refresh(); }),
   save: () => tried(async () => { say((await ask("save", {})).message); status(Object.assign(state, { dirty: false })); }),
   export: () => { const { left, bottom } = document.querySelector("[data-do=export]").getBoundingClientRect(); popup(left, bottom, "Export", state.formats.map(name => [name, () => download(name)])); },
