@@ -4,6 +4,7 @@ import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -14,11 +15,14 @@ import numpy as np
 import pytest
 from standing_in import StandIn
 
+from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.planted import pick_and_place
 from ddco_pyro.fitting.fit import fit
+from ddco_pyro.labelling.background import Background
 from ddco_pyro.labelling.document import FREE, OPEN
 from ddco_pyro.labelling.server import Listening, running
 from ddco_pyro.labelling.session import Session
+from ddco_pyro.labelling.ways import Ways
 from ddco_pyro.spec import parse_spec
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
@@ -64,11 +68,19 @@ def run(file, tmp_path_factory):
 @pytest.fixture
 def session(run, file, tmp_path, monkeypatch):
     """A session of the fit; its refits are made by this process, and not after every acceptance."""
-    monkeypatch.setattr(Session, "_away", lambda session, calls: {name: call() for name, call in calls.items()})
+    monkeypatch.setattr(Background, "_submit", here)
     begun = Session(replace(run, named={}), file, tmp_path / "labels.hdf5", exporters={"csv": exported})
     monkeypatch.setattr(begun, "refit", lambda: None)
     yield begun
     begun.close()
+
+
+POOL = ThreadPoolExecutor()
+
+
+def here(background, call):
+    """Have a call made by this process."""
+    return POOL.submit(call)
 
 
 def exported(segmented, fit, folder, level):
@@ -160,21 +172,45 @@ def starts(session, demo):
     return [one.start for one in session.segments(session.demos.names[demo])]
 
 
-def test_the_question_comes_first_and_its_answer_is_what_is_shown(tabs, session, run):
-    turned = replace(run, named={})  # another way to cut: the same options in another order of states is enough
-    session.ways = {"medium": session.fit, "fine": turned}
+def test_the_question_comes_first_and_can_be_answered_again_once_something_is_named(tabs, session, run, monkeypatch):
+    turned, come = replace(run, named={}), threading.Event()  # another way to cut; that it is another model is enough
+
+    def coming():
+        assert come.wait(SOON)
+        return turned
+
+    monkeypatch.setattr(Ways, "calls", {"fine": coming})
+    session.ask()
     with served(session) as address:
         tab = tabs(address)
-        playwright.expect(tab.get_by_role("heading", name="Which of these ways")).to_be_visible()
-        assert tab.locator("#question canvas[role=img]").count() == 6
-        slider = tab.get_by_role("slider")
+        asked = tab.get_by_role("heading", name="Which of these ways")
+        playwright.expect(asked).to_be_visible()
+        cards, slider = tab.locator("#question canvas[role=img]"), tab.get_by_role("slider")
+        playwright.expect(cards).to_have_count(3)
         playwright.expect(slider).to_be_focused()
+        playwright.expect(tab.get_by_role("progressbar")).to_be_visible()
+        come.set()
+        playwright.expect(cards).to_have_count(6)
         assert slider.get_attribute("aria-valuetext") == "medium"
         keys(tab, "End")
         assert slider.get_attribute("aria-valuetext") == "fine"
         keys(tab, "Enter")
         playwright.expect(items(tab)).to_have_count(6)
         assert session.fit is turned
+        keys(tab, "2")
+        said(tab, "option 2 in")
+        keys(tab, "w")
+        playwright.expect(asked).to_be_visible()
+        playwright.expect(tab.get_by_text("chosen")).to_be_visible()
+        assert slider.get_attribute("aria-valuetext") == "fine"
+        keys(tab, "Escape")
+        playwright.expect(asked).to_be_hidden()
+        tab.get_by_role("button", name="Ways to cut").click()
+        tab.get_by_role("button", name="Choose way 1").click()
+        playwright.expect(tab.get_by_role("slider", name="Step")).to_be_focused()
+        said(tab, "Cut as in medium")
+        assert session.fit is session.run
+        assert any((own == 2).any() for own in session.document.labels.values())
 
 
 def test_each_key_does_what_the_list_says(tab, session):
@@ -218,6 +254,7 @@ def test_each_key_does_what_the_list_says(tab, session):
     playwright.expect(items(tab)).to_have_count(1)
     keys(tab, "Enter")
     playwright.expect(tab.get_by_role("heading", name="demo_4")).to_be_visible()
+    playwright.expect(items(tab)).to_have_count(6)
     keys(tab, "g")
     said(tab, "Boundary 1 of the")
 
@@ -371,21 +408,74 @@ def test_what_changed_elsewhere_is_marked_until_it_is_looked_at(tab, session):
     playwright.expect(row).not_to_contain_text("changed")
 
 
-def test_a_refit_is_shown_while_it_runs_and_said_when_it_is_done(tab, session, monkeypatch):
+def test_a_refit_says_how_far_it_is_is_cancelled_and_said_when_it_is_done(tab, session, monkeypatch):
     monkeypatch.undo()
     going = threading.Event()
 
-    def away(session, calls):
+    def waiting(call):
         assert going.wait(SOON)
-        return {name: call() for name, call in calls.items()}
+        return call()
 
-    monkeypatch.setattr(Session, "_away", away)
+    monkeypatch.setattr(Background, "_submit", lambda background, call: POOL.submit(waiting, call))
     keys(tab, "2", "Enter")
-    playwright.expect(tab.get_by_role("progressbar")).to_be_visible()
+    bar = tab.get_by_role("progressbar")
+    playwright.expect(bar).to_be_visible()
+    assert bar.get_attribute("value") is None
+    session.background._told.write_text("0.2500\n")
+    playwright.expect(bar).to_have_js_property("value", 0.25)
     playwright.expect(tab.get_by_role("button", name="Refit")).to_be_disabled()
+    keys(tab, "c")
+    said(tab, "Cancelled")
+    playwright.expect(bar).to_be_hidden()
+    keys(tab, "r")
+    playwright.expect(bar).to_be_visible()
     going.set()
     said(tab, "Refit 1 is done: expected wrong steps")
-    playwright.expect(tab.get_by_role("progressbar")).to_be_hidden()
+    playwright.expect(bar).to_be_hidden()
+
+
+PIXEL = """one => {
+  const canvas = new OffscreenCanvas(1, 1), context = canvas.getContext("2d");
+  context.drawImage(one, 0, 0, 1, 1);
+  return [one.naturalWidth, one.naturalHeight, ...context.getImageData(0, 0, 1, 1).data];
+}"""
+
+
+def test_the_picture_is_that_of_the_step_at_the_cursor(tabs, run, tmp_path):
+    def pictured(number, demo):
+        shape = (len(demo), 30, 40, 3)
+        picture = np.full(shape, np.array([0, 60 + 20 * number, 250]), np.uint8)
+        picture[..., 0] = 4 * np.arange(len(demo))[:, None, None]
+        return replace(demo, observations={**demo.observations, "camera": picture})
+
+    demos = Demonstrations(tuple(pictured(*one) for one in enumerate(pick_and_place(6))))
+    demos.write(tmp_path / "demos.hdf5")
+    session = Session(replace(run, named={}), tmp_path / "demos.hdf5", tmp_path / "labels.hdf5")
+
+    def shows(index, step):
+        def holds():
+            size, colour = np.split(np.array(tab.locator("#look img").evaluate(PIXEL)), [2])
+            assert size.tolist() == [320, 240]
+            return np.abs(colour[:3] - [4 * step, 60 + 20 * index, 250]).max() <= 3
+
+        until(holds)
+
+    with served(session) as address:
+        tab = tabs(address)
+        tab.get_by_role("slider", name="Step").focus()
+        first = session.state()["order"][0]
+        shows(first, 0)
+        keys(tab, "ArrowRight", "Shift+ArrowRight")
+        shows(first, 11)
+        keys(tab, "End")
+        shows(first, len(demos[first]) - 1)
+        other = session.state()["order"][1]
+        items(tab, f"demo_{other}").click()
+        shows(other, 0)
+        alike, own = tab.get_by_label("Alike elsewhere").locator("img").first, session.nearest(other, 0)[0]
+        middle = (own["start"] + own["stop"]) // 2
+        until(lambda: abs(alike.evaluate(PIXEL)[2] - 4 * middle) <= 3)
+    session.close()
 
 
 @pytest.mark.slow
@@ -413,6 +503,7 @@ def test_a_server_killed_during_an_edit_loses_nothing_that_it_acknowledged(tabs,
 
         tab = tabs(address)
         tab.on("response", answered)
+        tab.get_by_role("button", name="Choose way 1").click()
         tab.get_by_role("slider", name="Step").focus()
         before = set(starts_of(address))
         for _ in range(12):

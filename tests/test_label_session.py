@@ -6,6 +6,7 @@ import json
 import subprocess
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import pairwise
 from xml.etree import ElementTree
@@ -19,16 +20,19 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from time_lines import unpacked
 
-from ddco_pyro.cli.label import _exporters
+from ddco_pyro.cli.label import _exporters, _fitted
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.planted import pick_and_place
 from ddco_pyro.errors import BadInput
 from ddco_pyro.fitting.fit import fit
+from ddco_pyro.fitting.fitted import load
+from ddco_pyro.labelling.background import Background
 from ddco_pyro.labelling.document import FREE, OPEN
 from ddco_pyro.labelling.expectation import USUAL
 from ddco_pyro.labelling.proposals import Proposals, Shown
 from ddco_pyro.labelling.refitting import labelled, refit_spec
 from ddco_pyro.labelling.session import Session
+from ddco_pyro.labelling.ways import Ways
 from ddco_pyro.spec import parse_spec, with_overrides
 from ddco_pyro.training.labels import used
 
@@ -61,7 +65,7 @@ def run(demos):
 @pytest.fixture
 def begin(run, demos, tmp_path, monkeypatch):
     """Begins a session with the fit; refits are made by this process."""
-    monkeypatch.setattr(Session, "_away", lambda session, calls: {name: call() for name, call in calls.items()})
+    monkeypatch.setattr(Background, "_submit", here)
     path = tmp_path / "demos.hdf5"
     demos.write(path)
     begun = []
@@ -91,6 +95,14 @@ def unchanged(run, demos, tmp_path_factory):
 def quiet(monkeypatch):
     """No refit follows an accepted demonstration."""
     monkeypatch.setattr(Session, "refit", lambda session: None)
+
+
+POOL = ThreadPoolExecutor()
+
+
+def here(background, call):
+    """Have a call made by this process."""
+    return POOL.submit(call)
 
 
 def refitted(session):
@@ -129,7 +141,10 @@ def test_before_any_label_the_fit_proposes(begin, run, demos):
         np.testing.assert_array_equal(unpacked(found["probability"]), np.rint(255 * np.minimum(probability, 1)))
         wrong.append((1 - probability + USUAL * probability).sum())
         assert [own["step"] for own in found["boundaries"]] == (np.flatnonzero(np.diff(path)) + 1).tolist()
-        assert all(own["low"] <= own["step"] <= own["high"] for own in found["boundaries"])
+        for own in found["boundaries"]:
+            assert own["low"] <= own["step"] <= own["high"]
+            density = unpacked(own["density"])
+            assert (len(density), max(density)) == (own["high"] - own["low"] + 1, 255)
     assert [own["expected_wrong"] for own in state["demos"]] == pytest.approx(wrong, abs=0.006)
     assert state["summary"] == {"expected_wrong": None, "one_more": None, "labelled": 0}
     assert [own["steps"] for own in state["demos"]] == [*demos.lengths]
@@ -453,22 +468,22 @@ def test_a_refit_that_fails_unexpectedly_is_said_and_can_be_asked_for_again(begi
     session = begin()
     label(session, 0, demos[0].labels["phase"])
     with monkeypatch.context() as patch:
-        patch.setattr(Session, "_away", lambda session, calls: {}[0])
+        patch.setattr(Background, "_submit", lambda background, call: {}[0])
         session.refit()
-        assert refitted(session)["error"] == "unexpected KeyError: 0"
+        assert refitted(session)["error"] == "fitting the labels failed: unexpected KeyError: 0"
     session.refit()
     assert (refitted(session)["error"], refitted(session)["done"]) == ("", 1)
 
 
 def test_labels_that_are_undone_while_a_refit_runs_need_no_other_refit(begin, monkeypatch):
-    session, begun, go_on, away = begin(), threading.Event(), threading.Event(), Session._away
+    session, begun, go_on = begin(), threading.Event(), threading.Event()
 
-    def waiting(session, calls):
+    def waiting(call):
         begun.set()
         go_on.wait()
-        return away(session, calls)
+        return call()
 
-    monkeypatch.setattr(Session, "_away", waiting)
+    monkeypatch.setattr(Background, "_submit", lambda background, call: POOL.submit(waiting, call))
     session.edit(paint)
     session.refit()
     begun.wait()
@@ -476,6 +491,97 @@ def test_labels_that_are_undone_while_a_refit_runs_need_no_other_refit(begin, mo
     session.edit({"do": "undo"})
     go_on.set()
     assert (refitted(session)["error"], refitted(session)["done"]) == ("", 1)
+
+
+def test_a_refit_that_is_cancelled_leaves_what_is_shown(begin, monkeypatch):
+    session, begun, go_on = begin(), threading.Event(), threading.Event()
+
+    def waiting(call):
+        found = call()
+        begun.set()
+        go_on.wait()
+        return found
+
+    monkeypatch.setattr(Background, "_submit", lambda background, call: POOL.submit(waiting, call))
+    session.edit(paint)
+    session.refit()
+    before, model = shown(session), session.fit
+    begun.wait()
+    session.cancel()
+    assert not session.state()["refit"]["running"]
+    go_on.set()
+    session.refit()
+    assert refitted(session)["done"] == 1
+    assert session.fit is not model
+    session.edit({"do": "undo"})
+    session.edit(paint)
+    again = begin("other.hdf5")
+    again.edit(paint)
+    assert shown(again) == before
+
+
+# --- ways to cut ------------------------------------------------------------------------------------------------------
+
+
+def test_ways_to_cut_are_asked_for_as_they_come_until_something_is_said(begin, run, monkeypatch):
+    session, go_on = begin(), threading.Semaphore(0)
+
+    def coming():
+        go_on.acquire()
+        return run
+
+    monkeypatch.setattr(Background, "_submit", lambda background, call: POOL.submit(coming))
+
+    def known():
+        return [own["id"] for own in session.state()["question"]["proposals"]]
+
+    assert session.state()["question"] is None
+    session.ask()
+    assert (known(), session.state()["question"]["asked"]) == (["medium"], True)
+    go_on.release()
+    while len(known()) < 2:
+        time.sleep(0.01)
+    assert known() == ["medium", "coarse"]
+    (way, *_) = session.state()["question"]["proposals"]
+    for index, segments in zip(session.state()["question"]["demos"], way["demos"], strict=True):
+        found = session.demo(index)["segments"]
+        assert segments == [{key: own[key] for key in ("start", "stop", "option")} for own in found]
+    go_on.release(3)
+    refitted(session)
+    assert known() == ["medium", "coarse", "fine"], "another seed gives the same options here"
+    with pytest.raises(BadInput, match="no way to cut 'x'; there is: medium, coarse, fine"):
+        session.choose("x")
+    session.edit(paint)
+    assert not session.state()["question"]["asked"]
+    session.edit({"do": "undo"})
+    session.choose("fine")
+    assert (session.state()["question"]["asked"], session.state()["question"]["chosen"]) == (False, "fine")
+
+
+def test_where_the_demonstrations_of_the_run_are_gone_no_other_way_is_asked_for(begin):
+    session = begin()
+    session.run = replace(session.run, given=None)
+    session.ask()
+    assert "looking for other ways to cut failed: demonstrations.path: none.hdf5" in refitted(session)["error"]
+    assert not session.state()["question"]["asked"]
+    session.edit(paint)
+
+
+def test_another_way_to_cut_keeps_the_labels_and_learns_from_them(begin, run, demos, monkeypatch):
+    """The other way has two options for four."""
+    coarse = fit(with_overrides(run.spec, {"hierarchy.levels.0.count": 2}), demos)
+    session = begin()
+    monkeypatch.setattr(Ways, "calls", {"coarse": lambda: coarse})
+    label(session, 0, demos[0].labels["phase"])
+    before = session.document.labels["demo_0"].copy()
+    session.ask()
+    refitted(session)
+    session.choose("coarse")
+    assert session.state()["refit"]["message"] == "fitting the labels"
+    assert (refitted(session)["error"], session.state()["refit"]["done"]) == ("", 1)
+    assert shown(session)[0][1] == [(option, "said") for option in before]
+    np.testing.assert_array_equal(session.document.labels["demo_0"], before)
+    assert session.fit.spec.hierarchy.levels[0].count == COUNT, "a refit has an option for each name"
 
 
 # --- files ------------------------------------------------------------------------------------------------------------
@@ -563,6 +669,24 @@ def test_what_is_closed_is_saved_and_left_to_others(begin, tmp_path):
 def test_a_format_that_is_none_is_refused(begin, tmp_path):
     with pytest.raises(BadInput, match="csv"):
         begin().export("xls", tmp_path)
+
+
+@pytest.mark.usefixtures("undecided")
+def test_without_a_run_one_is_fitted_for_its_proposals_alone_and_used_again(demos, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    demos.write(tmp_path / "mine.hdf5")
+    run = _fitted(tmp_path / "mine.hdf5")
+    first = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
+    assert not {path.name for path in first} & {"baselines", "report.html", "figures"}
+    session = Session(load(run), tmp_path / "mine.hdf5", tmp_path / "out.hdf5")
+    assert sorted(session.state()["order"]) == [*range(len(demos))]
+    session.close()
+    assert _fitted(tmp_path / "mine.hdf5") == run
+    assert {path: path.stat().st_mtime_ns for path in run.rglob("*")} == first
+    (tmp_path / "other").mkdir()
+    demos.write(tmp_path / "other" / "mine.hdf5")
+    with pytest.raises(BadInput, match="copy the file under another name"):
+        _fitted(tmp_path / "other" / "mine.hdf5")
 
 
 @pytest.mark.slow

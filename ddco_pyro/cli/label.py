@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import webbrowser
-from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ddco_pyro.cli import AllowCode, Level, demos, fits, going_on, out_file, runs, written
+from ddco_pyro.cli import AllowCode, Level, demos, going_on, out_file, runs, written
 from ddco_pyro.cli.starting import refuse_other
 from ddco_pyro.data.files import Output, check_outputs
 from ddco_pyro.errors import BadInput
+from ddco_pyro.spec import load_spec
 
 if TYPE_CHECKING:
     from ddco_pyro.fitting.fitted import Fit
@@ -56,28 +56,28 @@ def label(
     except ModuleNotFoundError as error:
         raise BadInput(f"label needs {error.name}; install it with: pip install 'ddco-pyro[label]'") from None
     from ddco_pyro.fitting.fitted import load
-    from ddco_pyro.jobs import processes
     from ddco_pyro.labelling.session import Session
 
     run = paths[0] if len(paths) == 2 else _fitted(file)
-    with ExitStack() as stack:
-        stack.enter_context(processes(1))
-        listening = Listening.at(port)
-        session = Session(load(run, allow_code), file, place, level, _exporters(run, file))
-        session.journal.at(listening.address)
+    listening = Listening.at(port)
+    session = Session(load(run, allow_code), file, place, level, _exporters(run, file))
+    session.journal.at(listening.address)
+    if not session.document.done:
         session.ask()
 
-        def ready() -> None:
-            print(f"{listening.address}\nCtrl-C saves the labels and ends", flush=True)
-            if browser:
-                webbrowser.open(listening.address)
+    def ready() -> None:
+        print(f"{listening.address}\nCtrl-C saves the labels and ends", flush=True)
+        if browser:
+            webbrowser.open(listening.address)
 
-        print(serve(session, listening, ready))
+    print(serve(session, listening, ready))
 
 
 def _fitted(file: Path) -> Path:
-    """A run fitted to the file, without baselines; a finished one is used again."""
+    """A run fitted to the file, without baselines and report; a finished one is used again."""
+    from ddco_pyro.cli import console
     from ddco_pyro.data.sources import refuse_foreign
+    from ddco_pyro.fitting.fit import fit
 
     folder = Path("runs") / file.stem
     spec, run = folder / "spec.yaml", folder / "run"
@@ -89,7 +89,8 @@ def _fitted(file: Path) -> Path:
         with going_on():
             if not spec.exists():
                 demos.init(file, spec)
-            fits.fit(spec, run, overrides=["compare_with=[]"], resume=True)
+        with console.Progress() as progress:
+            fit(load_spec(spec, ["compare_with=[]"]), None, run, progress)
     return run
 
 

@@ -67,22 +67,36 @@ def boundaries(
     :param mass: the share of these draws whose step is within the interval, at least; half of the rest is on
         either side.
     """
+    found = []
+    for step, at in drawn(path, starts, options, chosen):
+        found.append(Boundary(step, *within(at, step, mass), len(at) / len(options)))
+    return found
+
+
+def drawn(
+    path: np.ndarray, starts: np.ndarray, options: np.ndarray, chosen: np.ndarray
+) -> Iterator[tuple[int, np.ndarray]]:
+    """Each boundary of a path, and its steps in the draws that have it, ascending; as :func:`boundaries`."""
     steps = len(path)
     edges = [0, *(np.flatnonzero(starts[1:]) + 1).tolist(), steps]
-    found = []
     for before, step, after in zip(edges, edges[1:-1], edges[2:], strict=False):
         window = np.arange(before + 1, after)
         here = (options[:, before : after - 1] == path[step - 1]) & (options[:, before + 1 : after] == path[step])
         here &= chosen[:, before + 1 : after]
         distance = np.where(here, np.abs(window - step), steps)
-        having = here.any(1)
-        low = high = step
-        if having.any():
-            at = np.sort(window[distance.argmin(1)][having])
-            tail = int((1 - mass) / 2 * len(at))
-            low, high = int(at[tail]), int(at[-1 - tail])
-        found.append(Boundary(step, low, high, float(having.mean())))
-    return found
+        yield step, np.sort(window[distance.argmin(1)][here.any(1)])
+
+
+def within(at: np.ndarray, step: int, mass: float = 0.9) -> tuple[int, int]:
+    """The first and the last step of the interval of a boundary; both are its step if no draw has it.
+
+    :param at: its steps in draws, ascending.
+    :param mass: as in :func:`boundaries`.
+    """
+    if not len(at):
+        return step, step
+    tail = int((1 - mass) / 2 * len(at))
+    return int(at[tail]), int(at[-1 - tail])
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +159,7 @@ class Inferred:
     def segmented(self, row: int, lasts: Sequence[bool]) -> list[tuple[np.ndarray, np.ndarray]]:
         """The most likely choices of one demonstration, and where segments begin, each [T], for each level.
 
-        :param lasts: as in :meth:`intervals`.
+        :param lasts: as in :meth:`drawn`.
         """
         steps = self.lengths[row]
         paths = ((choices[row, :steps].numpy().copy(), ends[row, :steps].numpy())
@@ -158,17 +172,23 @@ class Inferred:
         path = sample_paths(self.tables.trajectory(row, length), torch.tensor([length]), number, seed)
         return torch.stack([torch.stack(kind)[:, :, 0] for kind in path]).numpy()
 
-    def intervals(self, row: int, lasts: Sequence[bool]) -> list[np.ndarray]:
-        """The 90 % interval of the first step of each segment of one demonstration, for each level, [segments, 2].
+    def drawn(self, row: int, lasts: Sequence[bool]) -> list[dict[int, np.ndarray]]:
+        """The boundaries of one demonstration, for each level: their steps in draws, by the step of the path.
 
         :param lasts: of each level, whether its options can be active for more than one step; see :func:`started`.
         """
-        found = []
-        draws = self.draws(row, DRAWS, (0, self.lengths[row]))
+        found, draws = [], self.draws(row, DRAWS, (0, self.lengths[row]))
         for lasting, (path, starts), options, ended in zip(lasts, self.segmented(row, lasts), *draws, strict=True):
-            every = boundaries(path, starts, options, started(options, ended, lasting))
-            found.append(np.array([(0, 0), *((each.low, each.high) for each in every)]))
+            found.append(dict(drawn(path, starts, options, started(options, ended, lasting))))
         return found
+
+    def intervals(self, row: int, lasts: Sequence[bool]) -> list[np.ndarray]:
+        """The 90 % interval of the first step of each segment of one demonstration, for each level, [segments, 2].
+
+        :param lasts: as in :meth:`drawn`.
+        """
+        every = self.drawn(row, lasts)
+        return [np.array([(0, 0), *(within(at, step) for step, at in level.items())]) for level in every]
 
     @cached_property
     def decomposition(self) -> Decomposition:

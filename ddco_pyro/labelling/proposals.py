@@ -186,11 +186,10 @@ class Proposals:
         piece, row = self.place[name]
         return runs(*self.pieces[piece].segmented(row, self.lasts)[self.level - 1])
 
-    def intervals(self, name: str) -> dict[int, tuple[int, int]]:
-        """The 90 % interval of each boundary of the most likely path, by its step."""
+    def drawn(self, name: str) -> dict[int, np.ndarray]:
+        """The steps of each boundary of the most likely path in draws from the posterior, by its step in the path."""
         piece, row = self.place[name]
-        ends = self.pieces[piece].intervals(row, self.lasts)[self.level - 1].tolist()
-        return {start: (low, high) for (_, start, _), (low, high) in zip(self.runs(name), ends, strict=True)}
+        return self.pieces[piece].drawn(row, self.lasts)[self.level - 1]
 
     def upper(self, name: str) -> list[tuple[int, list[tuple[int, int, int]]]]:
         """The segments of the other levels, with their numbers, 1 for the lowest."""

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.events import OnEvent, TrainingBegan, ignore
 from ddco_pyro.fitting.fit import fit as fit_to
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.labelling.proposals import RIDGE, weight
@@ -21,7 +22,7 @@ from ddco_pyro.training.devices import one_thread
 from ddco_pyro.training.labels import Labels
 from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.optimizers import optimizer_of
-from ddco_pyro.training.recognition import by_em, recognise
+from ddco_pyro.training.recognition import EM_STEPS, by_em, recognise
 
 SAID = "said"
 """The labels of the demonstrations of a refit."""
@@ -33,7 +34,14 @@ STEPS = 8
 """EM steps of a refit, after those in which its options begin."""
 
 
-def refit(trained: Fit, level: str, count: int, demos: Demonstrations, kept: Mapping[str, np.ndarray]) -> Fit:
+def refit(
+    trained: Fit,
+    level: str,
+    count: int,
+    demos: Demonstrations,
+    kept: Mapping[str, np.ndarray],
+    on_event: OnEvent = ignore,
+) -> Fit:
     """The model with so many options at a level, fitted to all demonstrations and to the labels :data:`SAID`.
 
     Option h stands for label h. A level that EM trains, under a meta-policy alone, takes a few steps from the options
@@ -46,7 +54,8 @@ def refit(trained: Fit, level: str, count: int, demos: Demonstrations, kept: Map
     spec, before = refit_spec(trained, level, count), trained.hierarchy
     with one_thread():
         if before.depth > 1 or not _by_em(trained):
-            return fit_to(spec, _tuned(spec, demos))
+            return fit_to(spec, _tuned(spec, demos), on_event=on_event)
+        on_event(TrainingBegan(trained.name, EM_STEPS + STEPS))
         scaling, names = before.scaling, demos.names
         others = sorted({*range(scaling.size)} - {*scaling.varying.tolist()})
         constant = dict(zip(others, scaling.constant.tolist(), strict=True))
@@ -68,8 +77,8 @@ def refit(trained: Fit, level: str, count: int, demos: Demonstrations, kept: Map
         evidence = torch.where(silent.unsqueeze(-1), 0.0, taught.evidence[0])
         starts = torch.where(silent, own, taught.starts[0])
         starts = torch.where(alive, torch.where(known > 0, known, starts), -1)
-        by_em(data, model, batch, replace(labels, train=starts, tune=starts))
-        by_em(data, model, batch, replace(labels, evidence=(evidence, evidence)), STEPS)
+        by_em(data, model, batch, replace(labels, train=starts, tune=starts), EM_STEPS, on_event)
+        by_em(data, model, batch, replace(labels, evidence=(evidence, evidence)), STEPS, on_event)
     return Fit(spec, model.eval(), trained.metrics.model_copy(update={"agreement": None}))
 
 

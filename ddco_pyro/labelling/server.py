@@ -88,6 +88,12 @@ class Served(Protocol):
     def refit(self) -> None:
         """Fit again in the background."""
 
+    def cancel(self) -> None:
+        """End what runs in the background."""
+
+    def ask(self) -> None:
+        """Look for other ways to cut in the background."""
+
     def choose(self, proposal: Any) -> None:
         """Answer the question which way to cut is meant."""
 
@@ -98,7 +104,7 @@ class Served(Protocol):
         """Write one file or folder of a format into a folder."""
 
     def close(self) -> None:
-        """End what runs in the background."""
+        """Leave the labels to other processes."""
 
 
 @dataclass(frozen=True)
@@ -277,6 +283,8 @@ def _answers(session: Served) -> list[Route]:
     posts = {
         "edit": session.edit,
         "refit": lambda asked: session.refit(),
+        "cancel": lambda asked: session.cancel(),
+        "ask": lambda asked: session.ask(),
         "choose": lambda asked: session.choose(asked.get("proposal")),
         "save": lambda asked: {"message": session.save()},
     }

@@ -3,54 +3,41 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from sklearn.metrics import normalized_mutual_info_score
 
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.data.pictures import Observed
 from ddco_pyro.data.sources import open_source
-from ddco_pyro.data.sources.recording import label_names
 from ddco_pyro.drawing.colours import option_colour
-from ddco_pyro.drawing.shown import frames, jpeg, paths_of, stored_pictures
-from ddco_pyro.drawing.timeline import following, text
-from ddco_pyro.errors import BadInput, reason
-from ddco_pyro.evaluation.inferred import runs
-from ddco_pyro.fitting.fit import fit as fit_to
+from ddco_pyro.drawing.timeline import text
+from ddco_pyro.errors import BadInput
+from ddco_pyro.evaluation.inferred import within
 from ddco_pyro.fitting.fitted import Fit
-from ddco_pyro.jobs import Workers, run_all
+from ddco_pyro.labelling import writing
+from ddco_pyro.labelling.background import Away, Background
 from ddco_pyro.labelling.commands import Segment, View, whole
 from ddco_pyro.labelling.document import FREE, Document
 from ddco_pyro.labelling.expectation import excess, expected_wrong, ranking, unforeseen
+from ddco_pyro.labelling.following import Following
 from ddco_pyro.labelling.journal import SUFFIX, Journal, digest, version
 from ddco_pyro.labelling.proposals import Proposals, Shown
 from ddco_pyro.labelling.refitting import labelled, refit
-from ddco_pyro.names import choice_names, option_name
-from ddco_pyro.segmenting import LevelLabels, Segmented, Segments, segments
+from ddco_pyro.labelling.ways import Ways
+from ddco_pyro.names import option_name
+from ddco_pyro.segmenting import Segmented
 from ddco_pyro.segmenting.formats.labels import check_copy, check_labels, write_labels
-from ddco_pyro.selection.small import GRANULARITIES, cut
-from ddco_pyro.spec import PathSpec, with_overrides
 
-ASKED = 3
-"""Demonstrations of the first question."""
-
-SEEDS = (1, 2)
-"""Further training seeds of the first question."""
-
-ALIKE = 0.9
-"""The NMI of segments from which on two ways to cut are the same."""
+REFIT, LOOK = "fitting the labels", "looking for other ways to cut"
+"""What a page says of the work in the background."""
 
 NEAREST = 5
 """Segments elsewhere that are shown for one."""
 
-PICTURE_HEIGHT = 240
-"""Rows of a picture."""
 
 UNCERTAIN = 20
 """Boundaries that are named as the most uncertain ones."""
@@ -94,9 +81,11 @@ class Session:
         self.document = Document({demo.name: len(demo) for demo in self.demos}, fit.names[self.level][1:])
         self.journal = Journal(out.with_name(out.name + SUFFIX), self.document, digest(self.demos, self.level))
         self.lock, self.revision, self.edits, self.saved, self.changed = threading.RLock(), 0, 0, 0, set[int]()
-        self.ways, self.message, self.error = dict[str, Fit](), "", ""
-        self.refits, self.running, self.again = 0, False, False
-        self.first, self.shown, self.opened = dict[str, Shown](), dict[str, Shown](), ExitStack()
+        self.ways: Ways | None = None
+        self.refits, self.turn, self.chosen = 0, 0, ""
+        self.background = Background(self.lock, self._changed)
+        self.first, self.shown = dict[str, Shown](), dict[str, Shown]()
+        self.following = Following(path, self.demos, fit.spec.report.trajectory)
         self.take(fit)
         self.proposed = self.proposals
         """By the run."""
@@ -108,18 +97,31 @@ class Session:
         """The level's number, 1 for the lowest."""
         return [*self.fit.names].index(self.level) + 1
 
-    def take(self, fit: Fit) -> None:
-        """Show another model's proposals; its options have the numbers that named steps and what is shown give them."""
+    def take(self, fit: Fit, refit: int | None = None) -> None:
+        """Show another model's proposals; its options have the numbers that named steps and what is shown give them.
+
+        Where :attr:`turn` moves on meanwhile, nothing is shown: another model is taken, or the refit is cancelled.
+
+        :param refit: of a refit, the turn at which it began.
+        """
         with self.lock:
-            before, count = self._shown_now(), len(self.document.names)
+            if refit not in (None, self.turn):
+                return
+            self.turn += 1
+            turn, before, count = self.turn, self._shown_now(), len(self.document.names)
             labels = {name: own.copy() for name, own in self.document.labels.items()}
             accepted = [*self.document.accepted]
         proposals = Proposals(fit, self.demos, [*fit.names].index(self.level) + 1, count, before)
         held_out = proposals.held_out(labels, accepted if len(accepted) > 1 else ())
         with self.lock:
-            self.fit, self.proposals = fit, proposals
-            self.excess = {name: excess(own, labels[name]) for name, own in held_out.items()}
-            self._update(before)
+            if turn == self.turn:
+                self.fit, self.proposals = fit, proposals
+                self.excess = {name: excess(own, labels[name]) for name, own in held_out.items()}
+                self.refits += refit is not None
+                self._update(before)
+
+    def _changed(self) -> None:
+        self.revision += 1
 
     def _shown_now(self) -> dict[str, np.ndarray]:
         return {name: shown.options for name, shown in self.shown.items()}
@@ -184,11 +186,11 @@ class Session:
                 "can_undo": bool(document.done),
                 "can_redo": bool(document.undone),
                 "refit": {
-                    "running": self.running,
-                    "progress": None,
-                    "message": self.message,
+                    "running": self.background.work is not None,
+                    "progress": self.background.progress,
+                    "message": self.background.work.message if self.background.work else "",
                     "done": self.refits,
-                    "error": self.error,
+                    "error": self.background.error,
                 },
                 "question": self._question(),
                 "warnings": self.warnings(),
@@ -246,12 +248,10 @@ class Session:
         """One demonstration with its segments, boundaries, and what follows the cursor."""
         with self.lock:
             name = self._name(index)
-            shown, ends, own = self.shown[name], self.proposals.intervals(name), self.segments(name)
+            shown, drawn, own = self.shown[name], self.proposals.drawn(name), self.segments(name)
             boundaries = [
                 {
-                    "step": segment.start,
-                    "low": ends.get(segment.start, (segment.start,) * 2)[0],
-                    "high": ends.get(segment.start, (segment.start,) * 2)[1],
+                    **_band(segment.start, drawn.get(segment.start, np.array([], int))),
                     "probability": round(float(shown.probability[segment.start]), 4),
                     "said": bool(self.document.labels[name][segment.start - 1 : segment.start + 1].min() > 0),
                 }
@@ -277,24 +277,8 @@ class Session:
                 "boundaries": boundaries,
                 "probability": text(np.rint(255 * shown.probability)),
                 "upper": upper,
-                "pictures": len(self._pictures[index]) if self._pictures else 0,
-                **self._followed(index),
+                **self.following.shown(index),
             }
-
-    def _followed(self, index: int) -> dict[str, Any]:
-        """Numbers and paths in space that follow the cursor."""
-        demo = self.demos[index]
-        (found,) = following([demo], [], len(demo), self._paths)
-        return {"numbers": found.get("n"), "paths": found.get("paths"), "view": found.get("view")}
-
-    @cached_property
-    def _paths(self) -> tuple[PathSpec, ...]:
-        return paths_of(self.run.spec.report.trajectory, self.demos)
-
-    @cached_property
-    def _pictures(self) -> list[Observed]:
-        source = self.opened.enter_context(open_source(self.path))
-        return stored_pictures(source, self.document.lengths)
 
     def picture(self, index: int, step: int) -> bytes:
         """The picture of a step as JPEG.
@@ -302,10 +286,8 @@ class Session:
         :raises BadInput: there is none.
         """
         with self.lock:
-            name = self._name(index)
-            if not self._pictures or not 0 <= step < self.document.lengths[name]:
-                raise BadInput(f"{name}: has no picture of step {step}")
-            return jpeg(frames(self._pictures[index], [step], PICTURE_HEIGHT)[0])
+            self._name(index)
+            return self.following.picture(index, step)
 
     def nearest(self, index: int, step: int) -> list[dict[str, Any]]:
         """The segments of other demonstrations that are most like the one at a step."""
@@ -379,38 +361,20 @@ class Session:
         with self.lock:
             if not self._is_labelled():
                 raise BadInput("refit: nothing is labelled yet")
-            self.again = self.running
-            if not self.running:
-                self._start(self._refit, "fitting the labels")
+            self.background.begin(REFIT, self._refit)
+
+    def _refits(self) -> bool:
+        return self.background.work is not None and self.background.work.message == REFIT
 
     def _is_labelled(self) -> bool:
         return any(bool(self.document.said(name).any()) for name in self.demos.names)
 
-    def _start(self, work: Callable[[], None], message: str) -> None:
-        self.running, self.message, self.error = True, message, ""
+    def _refit(self, away: Away) -> None:
+        turn = self.turn
+        if self._is_labelled():  # or the labels are undone
+            self.take(away(self.refitting()), turn)
 
-        def do() -> None:
-            try:
-                work()
-            except Exception as error:  # the page says what has failed, and labelling goes on
-                self.error = reason(error)
-            finally:
-                with self.lock:
-                    self.running, self.message, again = False, "", self.again and self._is_labelled()
-                    self.again = False
-                    self.revision += 1
-                    if again:
-                        self.refit()
-
-        threading.Thread(target=do, daemon=True).start()
-
-    def _refit(self) -> None:
-        found = self._away({"refit": self.refitting()})["refit"]
-        with self.lock:
-            self.refits += 1
-            self.take(found)
-
-    def refitting(self) -> Callable[[], Fit]:
+    def refitting(self) -> Callable[..., Fit]:
         """The call that fits to what is said so far, for any process; :meth:`take` shows its result."""
         with self.lock:
             labels = {name: self.document.in_file(name) for name in self.demos.names}
@@ -424,105 +388,53 @@ class Session:
         )
         return partial(refit, trained, self.level, count, labelled(demos, labels), kept)
 
-    def _away(self, calls: Mapping[str, Callable[..., Fit]]) -> dict[str, Fit]:
-        """The results of fits in another process, one after another."""
-        with run_all(calls, Workers(2), "fitted the labels", beside=len(calls)) as results:
-            return dict(results)
+    def cancel(self) -> None:
+        """End what is under way in the background at once; what is shown stays."""
+        with self.lock:
+            self.turn += self._refits()
+            self.background.cancel()
 
     def ask(self) -> None:
-        """Prepare the first question, in the background: which way to cut is meant?"""
-        with self.lock:
-            if not (self.document.done or self.running):
-                self._start(self._ask, "looking for other ways to cut")
+        """Look for other ways to cut, in the background; :meth:`choose` takes one.
 
-    def _ask(self) -> None:
-        trained, names = self.run, self.demos.names
-        calls: dict[str, Callable[..., Fit]] = {}
-        if trained.spec.training.labels is None and self.number == 1:
-            calls = {name: partial(cut, trained, name) for name in GRANULARITIES if name != "medium"}
-        alone = {"compare_with": [], "demonstrations.leave_one_out": False}
-        for seed in SEEDS:
-            spec = with_overrides(trained.spec, alone | {"training.seed": seed})
-            calls[f"seed {seed}"] = partial(fit_to, spec, trained.demonstrations, keep=False)
-        ways, found = {"medium": trained}, {"medium": np.concatenate([self.shown[name].options for name in names])}
-        for name, each in self._away(calls).items():
-            options = np.concatenate([*each.segment(self.demos)[self.number - 1]])
-            alike = max(normalized_mutual_info_score(options, other) for other in found.values())
-            if name in GRANULARITIES or alike < ALIKE:
-                ways[name], found[name] = each, options
+        A page asks for an answer while nothing is labelled.
+        """
         with self.lock:
-            order = [name for name in ("coarse", "medium", "fine", *calls) if name in ways]
-            self.ways = {name: ways[name] for name in dict.fromkeys(order)}
+            if self.ways is None or (len(self.ways.fits) == 1 and self.background.work is None):
+                ways = self.ways = Ways(self.run, self.demos, self.number)
+                self.background.begin(LOOK, partial(self._look, ways), len(ways.calls))
+
+    def _look(self, ways: Ways, away: Away) -> None:
+        for name, call in ways.calls.items():
+            found = away(call)
+            with self.lock:
+                ways.add(name, found)
+                self.revision += 1
 
     def _question(self) -> dict[str, Any] | None:
-        if len(self.ways) < 2 or self.document.done:
+        if self.ways is None:
             return None
-        return self._asked
-
-    @cached_property
-    def _asked(self) -> dict[str, Any]:
-        asked = np.unique(np.linspace(0, len(self.demos) - 1, ASKED).round().astype(int)).tolist()
-        return {"demos": asked, "proposals": [self._way(name, fit, asked) for name, fit in self.ways.items()]}
-
-    def _way(self, name: str, fit: Fit, asked: Sequence[int]) -> dict[str, Any]:
-        own = fit.segment(self.demos)[self.number - 1]
-        lengths = [segment.steps for segment in own.segments]
-        each = [
-            [
-                {"start": start, "stop": stop, "option": int(option)}
-                for option, start, stop in runs(own[index], np.diff(own[index], prepend=-1) != 0)
-            ]
-            for index in asked
-        ]
-        names = list(fit.names[self.level][1:])
-        colours = [option_colour(option) for option in range(1, len(names) + 1)]
-        median = float(np.median(lengths))
-        return {"id": name, "name": name, "median": median, "demos": each, "names": names, "colours": colours}
+        answered = self.chosen or self.document.done
+        asked = not answered and (len(self.ways.fits) > 1 or self.background.work is not None)
+        return {**self.ways.shown(), "asked": asked, "chosen": self.chosen}
 
     def choose(self, way: str) -> None:
-        """Go on with one of the ways to cut.
+        """Go on with one of the ways to cut; all labels stay, and the model learns from them.
 
-        :raises BadInput: there is no such way, or something is labelled already.
+        :raises BadInput: there is no such way.
         """
         with self.lock:
-            if way not in self.ways:
-                raise BadInput(f"there is no way to cut {way!r}; there is: {', '.join(self.ways) or 'none yet'}")
-            if self.document.done:
-                raise BadInput("choose: labels are given already; refit learns from them")
-            self.take(self.ways[way])
-            self.ways = {}
+            known = {} if self.ways is None else self.ways.fits
+            if way not in known:
+                raise BadInput(f"there is no way to cut {way!r}; there is: {', '.join(known) or 'none yet'}")
+            if self._refits():
+                self.background.cancel()
+            self.chosen = way
+        self.take(known[way])
+        if self._is_labelled():
+            self.refit()
 
     # --- files --------------------------------------------------------------------------------------------------------
-
-    def segmented(self, said: bool = False) -> Segmented:
-        """All segments that are shown, as ``segment`` has them.
-
-        :param said: only those of steps that a person has named, -1 elsewhere, and no other level.
-        """
-        with self.lock, open_source(self.path) as source:
-            if said:
-                each = tuple(self._labels_of(name) for name in self.demos.names)
-                names: dict[str, Sequence[str]] = {}
-                names[self.level] = choice_names(len(self.document.names), self.document.names)
-                counts = {self.level: len(self.document.names)}
-                return Segmented(each, counts, self.frequency, {}, names, label_names(source.attributes))
-            if len(self.document.names) + 1 != len(self.fit.names[self.level]):
-                raise BadInput("an option is new; refit before you write segments")
-            model = segments(self.fit, source)
-            shown = []
-            for demo in model.segments:
-                own = self.shown[demo.name]
-                starts = np.diff(own.options, prepend=-1) != 0
-                level = LevelLabels(own.options, starts, own.probability)
-                shown.append(replace(demo, levels={**demo.levels, self.level: level}))
-            names = dict(model.names) | {self.level: choice_names(len(self.document.names), self.document.names)}
-            return replace(model, segments=tuple(shown), names=names)
-
-    def _labels_of(self, name: str) -> Segments:
-        labels = self.document.in_file(name)
-        starts = np.diff(labels, prepend=-9) != 0
-        starts[[*self.document.cuts[name]]] = True
-        return Segments(name, {self.level: LevelLabels(labels, starts, np.ones(len(labels)))}, 0.0, False)
 
     def save(self) -> str:
         """Write ``labels/<level>``, -1 where nothing is said, whole or not at all.
@@ -533,12 +445,14 @@ class Session:
         with self.lock:
             if not self._unchanged():
                 raise BadInput(self.warnings()[0])
-            write_labels(self.path, self.out, self.segmented(said=True))
+            with open_source(self.path) as source:
+                labels = writing.said(self.document, self.level, source, self.frequency)
+            write_labels(self.path, self.out, labels)
             if self.out.exists() and self.out.samefile(self.path):
                 self.version = version(self.path)
             self.saved = self.edits
-            said = sum(int(self.document.said(name).sum()) for name in self.demos.names)
-            return f"{self.out}: labels/{self.level}, {said} of {sum(self.document.lengths.values())} steps"
+            steps = sum(int(self.document.said(name).sum()) for name in self.demos.names)
+            return f"{self.out}: labels/{self.level}, {steps} of {sum(self.document.lengths.values())} steps"
 
     def export(self, form: str, folder: Path) -> Path:
         """Write the shown segments in one of ``segment``'s formats into a folder.
@@ -548,13 +462,23 @@ class Session:
         """
         if form not in self.exporters:
             raise BadInput(f"there is no format {form!r}; there is: {', '.join(self.exporters)}")
-        named = replace(self.fit, named={**self.fit.named, self.level: self.document.names})
-        return self.exporters[form](self.segmented(), named, folder, self.level)
+        with self.lock, open_source(self.path) as source:
+            named = replace(self.fit, named={**self.fit.named, self.level: self.document.names})
+            segmented = writing.shown(self.fit, source, self.level, self.shown, self.document.names)
+        return self.exporters[form](segmented, named, folder, self.level)
 
     def close(self) -> None:
-        """Save, and leave the labels to other processes."""
+        """Save, end what is under way, and leave the labels to other processes."""
         with self.lock:
+            self.background.close()
             if self.edits != self.saved and self._unchanged():
                 self.save()
-            self.opened.close()
+            self.following.close()
             self.journal.close()
+
+
+def _band(step: int, drawn: np.ndarray) -> dict[str, Any]:
+    """A boundary with its 90 % interval and, within it, how often draws have each step, beside the most frequent."""
+    low, high = within(drawn, step)
+    often = np.bincount(drawn[(drawn >= low) & (drawn <= high)] - low, minlength=high - low + 1)
+    return {"step": step, "low": low, "high": high, "density": text(np.rint(255 * often / max(often.max(), 1)))}

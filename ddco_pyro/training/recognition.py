@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.events import EpochEnded, OnEvent, ignore
 from ddco_pyro.inference.paths import most_likely_path
 from ddco_pyro.model.batch import Batch, encode
 from ddco_pyro.model.hierarchy import Hierarchy
@@ -266,8 +267,18 @@ def _continued(
     return by_em(data, model, batch, labels)
 
 
-def by_em(data: TrainingData, model: Hierarchy, batch: Batch, labels: Labels, number: int = EM_STEPS) -> Hierarchy:
-    """The model after so many EM steps of all its networks, with these labels in place of the data's."""
+def by_em(
+    data: TrainingData,
+    model: Hierarchy,
+    batch: Batch,
+    labels: Labels,
+    number: int = EM_STEPS,
+    on_event: OnEvent = ignore,
+) -> Hierarchy:
+    """The model after so many EM steps of all its networks, with these labels in place of the data's.
+
+    A step is an epoch of the events.
+    """
     stage = plan(data.spec, model.depth)[-1]
     objective = Objective(replace(data, train=batch, tune=batch, labels=labels), Progress(0), stage)
 
@@ -275,6 +286,7 @@ def by_em(data: TrainingData, model: Hierarchy, batch: Batch, labels: Labels, nu
         return objective.values(objective.clamped(tables, rows), piece.lengths).sum()
 
     steps = Expectation(model, stage.trained, score, data.spec.training.optimizer.ridge)
-    for _ in range(number):
-        steps.step(batch)
+    for epoch in range(1, number + 1):
+        value = steps.step(batch) / batch.steps
+        on_event(EpochEnded(0, stage.name, epoch, value, value))
     return model

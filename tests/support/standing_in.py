@@ -30,7 +30,8 @@ class StandIn:
 
     def __init__(self, demos: int = 6, steps: int = 120, levels: int = 2, ask: bool = True) -> None:
         generator = np.random.default_rng(0)
-        self.steps, self.levels, self.asks, self.revision, self.dirty = steps, levels, ask, 1, False
+        self.steps, self.levels, self.revision, self.dirty = steps, levels, 1, False
+        self.asks, self.answered = True if ask else None, ""
         self.names = ["reach", "grasp", "lift", "place"]
         self.refits, self.running = 0, 0
         each = max(steps // 8, 1)
@@ -74,16 +75,16 @@ class StandIn:
         order = sorted(range(count), key=lambda demo: -self.wrong(demo))
         names = ["skill", "task", "plan"][: self.levels]
         question = None
-        if self.asks:
+        if self.asks is not None:
             shown = list(range(min(3, count)))
             proposals = []
-            for place, (name, width) in enumerate({"coarse": 4, "medium": 2, "fine": 1}.items()):
+            for name, width in {"medium": 2, "coarse": 4, "fine": 1}.items():
                 cut = [(self.proposed[demo] - 1) // width + 1 for demo in shown]
                 runs = [segments(one, set(), self.said[demo]) for demo, one in zip(shown, cut, strict=True)]
                 median = float(np.median([one["stop"] - one["start"] for run in runs for one in run]))
                 look = {"names": [f"skill {n}" for n in range(1, 5)], "colours": list(OPTIONS[:4])}
-                proposals.append({"id": place, "name": name, "median": median, "demos": runs, **look})
-            question = {"demos": shown, "proposals": proposals}
+                proposals.append({"id": name, "name": name, "median": median, "demos": runs, **look})
+            question = {"demos": shown, "proposals": proposals, "asked": self.asks, "chosen": self.answered}
         return {
             "title": "made-up.hdf5", "revision": self.revision, "level": names[0], "levels": names,
             "names": list(self.names), "colours": [OPTIONS[n % len(OPTIONS)] for n in range(len(self.names))],
@@ -105,7 +106,7 @@ class StandIn:
             "can_undo": bool(self.done), "can_redo": bool(self.undone),
             "refit": {
                 "running": bool(self.running), "progress": 1 - self.running / 3 if self.running else None,
-                "message": "epoch 3 of 10" if self.running else "", "done": self.refits, "error": None,
+                "message": "fitting the labels" if self.running else "", "done": self.refits, "error": "",
             },
             "question": question, "warnings": [], "out": "labelled.hdf5",
             "dirty": self.dirty, "formats": ["csv", "elan"],
@@ -124,6 +125,7 @@ class StandIn:
             {
                 "step": one["start"], "low": max(one["start"] - (0 if pinned else 3), 0),
                 "high": one["start"] + (0 if pinned else 4), "probability": 0.8, "said": pinned,
+                "density": text(np.array([255] if pinned else [20, 90, 160, 255, 120, 60, 80, 30])),
             }
             for one in shown[1:] for pinned in [bool((said[one["start"] - 1 : one["start"] + 1] > 0).all())]
         ]  # fmt: skip
@@ -239,9 +241,18 @@ class StandIn:
         """Pretend to."""
         self.running = 3
 
+    def cancel(self) -> None:
+        """End what it pretends to do."""
+        self.running = 0
+
+    def ask(self) -> None:
+        """The ways to cut are known at once."""
+        if self.asks is None:
+            self.asks, self.revision = False, self.revision + 1
+
     def choose(self, proposal: Any) -> None:
         """Answer the question."""
-        if not self.asks or proposal not in (0, 1, 2):
+        if proposal not in ("coarse", "medium", "fine"):
             raise BadInput(f"proposal {proposal!r}: there is none")
         self.asks, self.answered, self.revision = False, proposal, self.revision + 1
 

@@ -32,6 +32,7 @@ export class Timeline {
     if (this.demo?.index !== demo.index) [this.from, this.to] = [0, demo.steps];
     Object.assign(this, { demo, state });
     demo.heights ??= bytes(demo.probability);
+    for (const one of demo.boundaries) one.heights ??= bytes(one.density);
     if (demo.numbers) demo.numbers.decoded ??= new Numbers(demo.numbers, demo.steps);
     this.rows = demo.numbers?.names ?? [];
     this.lanes = AXIS + demo.upper.length * (LANE + 3) + MAIN + BAND + 4;
@@ -123,15 +124,22 @@ export class Timeline {
     row(context, demo.segments, { place, edge, top, height: MAIN, colours: state.colours, names, heights: demo.heights });
     top += MAIN;
     label("boundaries", top + BAND / 2 + 2);
-    for (const { step, low, high, said } of demo.boundaries) {
-      const x = this.x(step), left = Math.min(this.x(low), x - 3), right = Math.max(this.x(high), x + 3);
+    context.save();
+    context.beginPath(); context.rect(GUTTER, 0, width - GUTTER, this.height); context.clip();
+    for (const { step, low, high, said, heights } of demo.boundaries) {
+      const x = this.x(step), foot = Math.max(this.each, 3), left = this.x(low) - foot, right = this.x(high) + foot;
       if (right < GUTTER || left > width) continue;
       context.fillStyle = said ? looks.ink : looks.accent;
       context.beginPath();
       if (said) { context.moveTo(x - 4, top + 9); context.lineTo(x, top + 2); context.lineTo(x + 4, top + 9); }
-      else { context.moveTo(Math.max(left, GUTTER), top + BAND); context.lineTo(Math.max(x, GUTTER), top + 1); context.lineTo(right, top + BAND); }
+      else {  // the posterior density of the boundary's step
+        context.moveTo(left, top + BAND);
+        heights.forEach((height, place) => context.lineTo(this.x(low + place), top + BAND - (BAND - 1) * height / 255));
+        context.lineTo(right, top + BAND);
+      }
       context.fill();
     }
+    context.restore();
     top += BAND + 4;
     this.rows.forEach((name, number) => this.plot(context, number, name, top + number * PLOT, width, label));
   }
