@@ -525,6 +525,13 @@ def test_a_table_is_quoted_as_by_hand(tmp_path, quotation, said):
     )
 
 
+def test_a_table_is_quoted_from_another_folder(tmp_path):
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "docs" / "hand.csv").write_text(HAND)
+    for place, name in ((tmp_path, "docs/hand"), (tmp_path / "docs", "../docs/hand")):
+        assert "-->−2.50<!--" in render(f"<!-- table {name}: summary; nats --><!-- / -->", ROOT, place)
+
+
 def test_a_page_has_the_bold_words_that_holm_leaves(tmp_path):
     """Two differences of one family at a one-sided p of 0.018 are inconclusive together."""
     (tmp_path / "hand.csv").write_text(HAND)

@@ -256,7 +256,7 @@ _SHOWN: dict[str, Callable[[Estimate, str], str]] = {
 }
 """How a quotation shows an estimate."""
 
-_QUOTED = re.compile(r"<!-- ((?:study|table) [\w-]+): (.*?) -->.*?<!-- / -->", re.DOTALL)
+_QUOTED = re.compile(r"<!-- ((?:study|table) [\w./-]+): (.*?) -->.*?<!-- / -->", re.DOTALL)
 _SETTING = re.compile(r"(study|task|without|seed|form|show|times|by)=(.*)", re.DOTALL)
 
 
@@ -264,7 +264,7 @@ def render(text: str, studies: Path, tables: Path = Path()) -> str:
     """A page's text with every quoted number as the tables have it; docs/studies.md says how a page quotes.
 
     :param studies: the folder of the declarations, whose tables ``kept`` have the numbers of ``study NAME``.
-    :param tables: the folder of ``NAME.csv``, which has the numbers of ``table NAME``.
+    :param tables: the folder from which ``NAME.csv`` of ``table NAME`` is sought.
     :raises BadInput: a quotation is wrong, or there is no such value.
     """
     page = _Quoting({"study": studies, "table": tables})
