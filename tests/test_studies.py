@@ -9,6 +9,8 @@ import json
 import re
 import shutil
 import signal
+import subprocess
+from importlib import metadata
 from pathlib import Path
 
 import arena_playing
@@ -116,6 +118,12 @@ RECORDED = {"counts": [10], "held_out": 5, "test": {"first": 0, "count": 20}}
         ({"measures": ["nat"]}, "there is no measure 'nat' (did you mean 'nats'?)"),
         ({"contrasts": [{"contrast": "options - flat", "measure": "nats"}]}, "must be one of 4, 6"),
         ({"contrasts": [{"contrast": "options - flat", "measure": "ari", "demonstrations": 6}]}, "not among measures"),
+        ({"failed": {"success": 0.0}}, "failed.success: 'success' is not among measures"),
+        (
+            {"contrasts": [{**STUDY["contrasts"][0], "kind": "equivalence"}]},
+            "contrasts.0.margin: missing; say which differences are none",
+        ),
+        ({"families": {"door": ["open", "close"]}}, "families: must have tasks of the study, each once"),
         ({"choose": "nats"}, "choose: goes together with seeds.development"),
         (
             {**TUNED, "methods": {"options": {"grid": {"control.std": [0.1, 0.2]}}, "flat": {"baseline": "flat"}}},
@@ -281,7 +289,7 @@ def test_planted_options_win_in_the_table_and_the_contrast(done, tmp_path, drawn
     assert not state.missing
     write(done, state, tmp_path)
     rows = read_tidy(tmp_path / "table.csv")
-    assert len(rows) == 2 * 2 * 2 + 2 * 2  # nats of both methods, nmi of options
+    assert len(rows[rows.measure.isin(["nats", "nmi"])]) == 2 * 2 * 2 + 2 * 2  # nats of both methods, nmi of options
     (contrast,) = report.tested(done.study, rows)
     nats = rows[(rows.measure == "nats") & (rows.demonstrations == "6")].set_index(["method", "seed"]).value
     by_hand = [nats["options", seed] - nats["flat", seed] for seed in "01"]
@@ -359,10 +367,110 @@ def test_a_cell_that_another_process_works_on_is_left_to_it(made):
 def test_a_failed_cell_says_why_and_is_tried_again(made, monkeypatch):
     folder = made(demonstrations={**STUDY["demonstrations"], "counts": [6]}, seeds={"test": {"count": 1}})
     monkeypatch.setattr(cells, "fit", lambda *_, **__: 1 / 0)
-    assert set(folder.run(HERE).failed.values()) == {"unexpected ZeroDivisionError: division by zero"}
+    failed = folder.run(HERE).failed.values()
+    assert {one.failed for one in failed} == {"unexpected ZeroDivisionError: division by zero"}
     monkeypatch.undo()
     state = folder.run(HERE)
     assert (len(state.done), len(state.failed)) == (2, 0)
+
+
+SMALL = {"demonstrations": {**STUDY["demonstrations"], "counts": [6]}, "seeds": {"test": {"count": 2}}}
+
+
+def test_a_failed_cell_counts_what_is_declared(made, monkeypatch, tmp_path, drawn_here):
+    """Of flat fits none is done: each counts −50 nats, here and from the table that is kept."""
+
+    def fails(spec, *given, **named):
+        return fit(spec, *given, **named) if spec.hierarchy else 1 / 0
+
+    folder = made(**SMALL, failed={"nats": -50.0})
+    monkeypatch.setattr(cells, "fit", fails)
+    state = folder.run(HERE)
+    options = [state.done[cell].values["nats"] for cell in state.done]
+    write(folder, state, tmp_path)
+    rows = read_tidy(tmp_path / "table.csv")
+    (contrast,) = report.tested(folder.study, rows)
+    assert contrast.estimate.units == pytest.approx([own + 50 for own in options], rel=1e-8)
+    assert "2 of 4 cells failed. They count nats -50; pairs" in (tmp_path / "page.md").read_text()
+    second = made(**SMALL, failed={"nats": -50.0}, kept=[{"table": "table.csv"}])
+    elsewhere = Folder(second.study, tmp_path / "elsewhere")
+    assert (len(elsewhere.state().done), len(elsewhere.state().failed)) == (2, 2)
+    pd.testing.assert_frame_equal(
+        elsewhere.table(elsewhere.state()).sort_values(tidy.COLUMNS[:-1], ignore_index=True),
+        rows.sort_values(tidy.COLUMNS[:-1], ignore_index=True), check_dtype=False,
+    )  # fmt: skip
+    monkeypatch.undo()
+    assert len(elsewhere.run(HERE).done) == 4
+
+
+def test_a_pinned_study_is_of_one_commit(made, monkeypatch, tmp_path, drawn_here):
+    codes = iter(["11aa", "11aa", "22bb", "11aa-dirty", "11aa"])
+
+    def pinned(**changes):
+        code = next(codes)
+        monkeypatch.setattr(cells, "commit_of", lambda path: code)
+        return made(**SMALL | {"measures": ["nats"]}, pinned=True, **changes)
+
+    def refused(folder):
+        with pytest.raises(BadInput) as error:
+            folder.state()
+        return str(error.value)
+
+    first = pinned()
+    write(first, first.run(HERE), tmp_path)
+    assert "Code: 11aa (4 cells)." in (tmp_path / "page.md").read_text()
+    kept = [{"table": "table.csv"}]
+    second = pinned(kept=kept)
+    elsewhere = Folder(second.study, tmp_path / "elsewhere")
+    assert len(elsewhere.state().done) == 4
+    later = pinned(kept=kept)
+    for folder in (later, Folder(later.study, tmp_path / "elsewhere"), Folder(first.study, first.path)):
+        said = refused(folder)
+        assert "was done with commit 11aa, here are commit 22bb" in said
+        assert "\n" not in said
+    with pytest.raises(BadInput, match="pinned: the code has changes since 11aa; commit them"):
+        Folder(pinned().study, tmp_path / "third").run(HERE)
+    changed = Folder(pinned(kept=kept, in_spec={"seed": 1}, overrides={"control.std": 0.4}).study, tmp_path / "fourth")
+    assert "was done with settings" in refused(changed)
+    table = pd.read_csv(tmp_path / "table.csv")
+    table[tidy.COLUMNS].to_csv(tmp_path / "table.csv", index=False)
+    assert "was done with commit unknown, here are commit 11aa" in refused(Folder(second.study, tmp_path / "elsewhere"))
+
+
+def test_the_commit_of_the_code_is_that_of_library_and_study(tmp_path, monkeypatch):
+    monkeypatch.setattr(cells, "__file__", str(tmp_path / "ddco_pyro" / "study" / "cells.py"))
+    study, script = tmp_path / "studies" / "mine.yaml", tmp_path / "studies" / "world.py"
+    for path in (study, script, tmp_path / "ddco_pyro" / "a.py", tmp_path / "docs" / "a.csv"):
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("1")
+    assert cells.commit_of(study) == metadata.version("ddco-pyro")
+
+    def committed():
+        who = ["-c", "user.name=a", "-c", "user.email=a@b.c"]
+        for words in (["init", "-q"], ["add", "."], [*who, "commit", "-qm", "a"], ["rev-parse", "HEAD"]):
+            told = subprocess.run(["git", *words], cwd=tmp_path, capture_output=True, text=True, check=True)
+        return told.stdout[:10]
+
+    first = committed()
+    assert cells.commit_of(study) == first
+    (tmp_path / "docs" / "a.csv").write_text("2")
+    assert cells.commit_of(study) == first
+    assert committed() != first
+    assert cells.commit_of(study) == first
+    for path in (study, script, tmp_path / "ddco_pyro" / "a.py"):
+        path.write_text(f"{path} changed")
+        assert cells.commit_of(study) == f"{first}-dirty"
+        first = committed()
+        assert cells.commit_of(study) == first
+
+
+def test_cells_of_init_depend_on_its_template(made, monkeypatch, tmp_path):
+    folder = made(spec="init")
+    key = folder.key(folder.cells("test")[0])
+    (tmp_path / "other.j2").write_text(cells.TEMPLATE.read_text() + "# more\n")
+    assert folder.key(folder.cells("test")[0]) == key
+    monkeypatch.setattr(cells, "TEMPLATE", tmp_path / "other.j2")
+    assert folder.key(folder.cells("test")[0]) != key
 
 
 @pytest.mark.slow
@@ -560,7 +668,7 @@ def test_a_page_has_the_bold_words_that_holm_leaves(tmp_path):
 )
 def test_both_sides_of_a_verdict_have_holms_correction(values, said):
     family = [
-        (estimate(pd.Series({("", str(seed)): float(value) for seed, value in enumerate(own)})), 0.0)
+        estimate(pd.Series({("", str(seed)): float(value) for seed, value in enumerate(own)})).p_value(0.0)
         for own in values.values()
     ]
     assert [verdict for verdict, _ in report.verdicts(family)] == said

@@ -11,10 +11,12 @@ import hashlib
 import json
 import math
 import shutil
+import subprocess
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -26,7 +28,7 @@ from ddco_pyro.data.files import Busy, json_text, only_one, write_text
 from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.inspection import inspect
 from ddco_pyro.data.sources import open_source
-from ddco_pyro.data.starting import starting_spec
+from ddco_pyro.data.starting import TEMPLATE, starting_spec
 from ddco_pyro.errors import BadInput, reason
 from ddco_pyro.evaluation.agreement import MATCHED, UNMATCHED
 from ddco_pyro.events import CellDone, CellsBegan, OnEvent, ignore
@@ -41,10 +43,13 @@ from ddco_pyro.simulation.episodes import run_episodes
 from ddco_pyro.spec import DemonstrationsSpec, Spec, SpecError, parse_spec, with_overrides
 from ddco_pyro.spec.yaml import read_yaml
 from ddco_pyro.study.declaration import NATS, Study
-from ddco_pyro.study.table import CELL, COLUMNS, earlier
+from ddco_pyro.study.table import CELL, COLUMNS, ORIGIN, earlier
 from ddco_pyro.training import data
 from ddco_pyro.training.devices import one_thread
 from ddco_pyro.training.networks import Dimensions, baseline_spec, named_baselines
+
+FAILED, RISING, DIRTY = "failed", "not converged", "-dirty"
+"""Measures, 1, of cells that failed and of fits that have not converged; a commit with later changes."""
 
 
 @dataclass(frozen=True)
@@ -116,10 +121,13 @@ class Done(Record):
 
     :param depends: what the key is a digest of.
     :param values: by measure; empty where the cell failed for the reason ``failed``.
+    :param code: the commit of the code that gave them.
     """
 
     depends: dict[str, Any]
     values: dict[str, Any]
+    key: str = ""
+    code: str = ""
     failed: str = ""
     converged: bool = True
     seconds: float = 0.0
@@ -141,13 +149,37 @@ def work_of(path: Path) -> Path:
     return path.parents[1] / "work" / path.stem
 
 
-def do(path: Path, depends: Mapping[str, Any], work: Callable[[Path], Mapping[str, Any]], **named: Any) -> str:
+def commit_of(path: Path) -> str:
+    """The last commit that changed the library, a declaration or the scripts beside it; ``-dirty`` if changed since.
+
+    Where the library is in no repository: its version.
+    """
+    root = Path(__file__).parents[2]
+    files = ["ddco_pyro", "tasks"]
+    if path.resolve().is_relative_to(root):
+        files += [str(path.resolve()), f":(glob){path.resolve().parent}/*.py"]
+
+    def git(*words: str) -> str:
+        told = subprocess.run(["git", "-C", root, *words, "--", *files], capture_output=True, text=True, check=True)
+        return told.stdout.strip()
+
+    try:
+        commit, changed = git("log", "-1", "--format=%H")[:10], git("status", "--porcelain")
+    except (OSError, subprocess.CalledProcessError):
+        commit, changed = "", ""
+    return commit + DIRTY * bool(changed) if commit else version("ddco-pyro")
+
+
+def do(
+    path: Path, depends: Mapping[str, Any], work: Callable[[Path], Mapping[str, Any]], code: str = "", **named: Any
+) -> str:
     """Do a cell on one thread and keep its results; returns why it failed.
 
     A cell that another process works on is left to it.
 
     :param path: of its file.
     :param work: fields of :class:`Done`; given a folder, which keeps the fits.
+    :param code: the commit of the code.
     :param named: what its file says besides.
     """
     began = time.perf_counter()
@@ -157,7 +189,7 @@ def do(path: Path, depends: Mapping[str, Any], work: Callable[[Path], Mapping[st
                 return ""
             if path.exists() and before is None:  # of other defaults
                 shutil.rmtree(folder / "fit", ignore_errors=True)
-            done = Done(depends=dict(depends), values={})
+            done = Done(depends=dict(depends), values={}, key=path.stem, code=code)
             try:
                 with one_thread():
                     done = done.model_copy(update=dict(work(folder)))
@@ -185,11 +217,11 @@ def do_all(calls: Mapping[str, Callable[[], str]], kept: int, workers: Workers, 
 
 @dataclass(frozen=True)
 class State:
-    """The cells of a study, those of them that are done, and the reasons of those that failed."""
+    """The cells of a study, those of them that are done, and those that failed."""
 
     cells: Sequence[Cell]
     done: Mapping[Cell, Done]
-    failed: Mapping[Cell, str]
+    failed: Mapping[Cell, Done]
 
     @property
     def missing(self) -> list[Cell]:
@@ -227,8 +259,8 @@ class Folder:
 
         :raises Damaged: the file of a cell is damaged.
         """
-        state = self._state(self.cells(self.first))
-        if self.first == "test" or len(state.done) < len(state.cells):
+        state, declared = self._state(self.cells(self.first)), self.study.declared
+        if self.first == "test" or state.missing or (state.failed and declared.choose not in declared.failed):
             return state
         return self._state([*state.cells, *self.cells("test", self.chosen(state))])
 
@@ -239,14 +271,14 @@ class Folder:
 
     def _state(self, cells: Sequence[Cell]) -> State:
         found = {cell: one for cell in cells if (one := self.kept(cell))}
-        failed = {cell: one.failed for cell, one in found.items() if one.failed}
+        failed = {cell: one for cell, one in found.items() if one.failed}
         return State(cells, {cell: one for cell, one in found.items() if not one.failed}, failed)
 
     def chosen(self, state: State) -> dict[str, dict[str, Any]]:
         """The point of each method with the highest mean over the development cells."""
         rows = [
-            (cell.of, json.dumps(cell.point), done.values.get(str(self.study.declared.choose)))
-            for cell, done in state.done.items()
+            (cell.of, json.dumps(cell.point), one.values.get(str(self.study.declared.choose)))
+            for cell, one in self._counted(state).items()
             if cell.part == "development"
         ]
         scores = pd.DataFrame(rows, columns=["of", "point", "value"]).fillna(-math.inf)
@@ -254,26 +286,60 @@ class Folder:
         return {str(of): json.loads(own.idxmax()[1]) for of, own in means.groupby("of")}
 
     def kept(self, cell: Cell) -> Done | None:
-        """The results of a cell, if it is done: here, or in the declaration's table ``kept``."""
-        if values := self._earlier.get(tuple(map(str, cell.row))):
-            return Done(depends={}, values=values)
-        return kept(self.place(cell), self.depends(cell))
+        """The results of a cell, if it is done: here, or in the declaration's table ``kept``.
+
+        :raises BadInput: the study is pinned, and they are of another commit or of other settings.
+        """
+        rows = self._earlier.get(tuple(map(str, cell.row)))
+        known = None
+        if rows is not None:
+            values = dict(zip(rows.measure, rows.value, strict=True))
+            failed, rising = values.pop(FAILED, 0), values.pop(RISING, 0)
+            key, code = (" ".join(dict.fromkeys(rows[column])) for column in ORIGIN)
+            known = Done(
+                depends={}, values=values, key=key, code=code, failed=FAILED * bool(failed), converged=not rising
+            )
+        if known is None or known.failed:  # such a cell is tried again
+            here = kept(self.place(cell), self.depends(cell))
+            known = here if known is None or (here and not here.failed) else known
+        if known and self.study.declared.pinned:
+            self._check(cell, known)
+        return known
+
+    def _check(self, cell: Cell, known: Done) -> None:
+        """Check that the results of a pinned study are of this code and of these settings."""
+        for what, there, here in (("commit", known.code, self.code), ("settings", known.key, self.key(cell))):
+            if there != here:
+                raise BadInput(
+                    f"{self.study.path}: pinned: {cell}: was done with {what} {there or 'unknown'}, here are {what} "
+                    f"{here}; bring those back, or remove its results"
+                )
 
     @cached_property
-    def _earlier(self) -> dict[tuple[str, ...], dict[str, float | None]]:
-        """The values of the declaration's tables ``kept``, by cell and measure."""
-        by_cell = earlier(self.study).groupby(CELL)
-        return {cell: dict(zip(rows.measure, rows.value, strict=True)) for cell, rows in by_cell}
+    def code(self) -> str:
+        """The commit of the code."""
+        return commit_of(self.study.path)
+
+    @cached_property
+    def _earlier(self) -> dict[tuple[str, ...], pd.DataFrame]:
+        """The rows of the declaration's tables ``kept``, by cell."""
+        return dict(iter(earlier(self.study).groupby(CELL)))
+
+    def _counted(self, state: State) -> dict[Cell, Done]:
+        """The results of all cells that are done, and those that failed ones count."""
+        values = self.study.declared.failed
+        failed = {cell: one.model_copy(update={"values": values}) for cell, one in state.failed.items() if values}
+        return {**state.done, **failed}
 
     def table(self, state: State) -> pd.DataFrame:
-        """The declared measures of all cells that are done, tidy; methods of the development name their points."""
-        rows = [
-            (self.study.name, *map(str, cell.row), measure, value)
-            for cell, done in state.done.items()
-            for measure in self.study.declared.measures
-            if (value := done.values.get(measure)) is not None
-        ]
-        return pd.DataFrame(rows, columns=COLUMNS)
+        """The declared measures of all cells, tidy; methods of the development name their points."""
+        rows = []
+        for cell, one in self._counted(state).items():
+            values = {measure: one.values.get(measure) for measure in self.study.declared.measures}
+            values |= {FAILED: 1 if one.failed else None, RISING: None if one.converged else 1}
+            named = (self.study.name, *map(str, cell.row))
+            rows += [(*named, *item, one.key, one.code) for item in values.items() if item[1] is not None]
+        return pd.DataFrame(rows, columns=[*COLUMNS, *ORIGIN])
 
     # --- keys ---------------------------------------------------------------------------------------------------------
 
@@ -298,6 +364,8 @@ class Folder:
             given, whole = (
                 spec.model_dump(mode="json", exclude=shown, exclude_defaults=bare) for bare in (True, False)
             )
+        else:
+            given = {**changes, "template": hashlib.sha256(TEMPLATE.read_bytes()).hexdigest()[:16]}
         facts = {
             "baseline": baseline and baseline.model_dump(exclude_unset=True, mode="json"),
             "by": method.by,
@@ -372,10 +440,15 @@ class Folder:
         :raises Failed: a process died.
         """
         self.study.world()  # or something is wrong with it
+        if self.study.declared.pinned and self.code.endswith(DIRTY):
+            raise BadInput(
+                f"{self.study.path}: pinned: the code has changes since {self.code.removesuffix(DIRTY)}; commit them"
+            )
         compile_all()
         self.path.mkdir(parents=True, exist_ok=True)
         cells, state = self.cells(self.first), None
         there = Folder(replace(self.study, path=self.study.path.resolve()), self.path.resolve())  # wherever workers are
+        vars(there)["code"] = self.code  # of when the run began
         with processes(workers.number(len(cells))):
             while state is None or len(cells) > len(state.cells):
                 done = self._state(cells).done
@@ -387,7 +460,7 @@ class Folder:
 
     def do(self, cell: Cell) -> str:
         """Do a cell, as :func:`do` does."""
-        return do(self.place(cell), self.depends(cell), partial(self._measured, cell), cell=asdict(cell))
+        return do(self.place(cell), self.depends(cell), partial(self._measured, cell), self.code, cell=asdict(cell))
 
     def _measured(self, cell: Cell, folder: Path) -> dict[str, Any]:
         """The measures of a cell."""

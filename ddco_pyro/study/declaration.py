@@ -7,6 +7,7 @@ another in the blocks of ``demonstrations`` and ``starts``. Blocks that overlap 
 from __future__ import annotations
 
 import itertools
+import math
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -101,7 +102,7 @@ class MethodSpec(Model):
 
 
 class ContrastSpec(Model):
-    """A primary contrast: a one-sided test of the mean difference between two methods."""
+    """A primary contrast: a test of the mean difference between two methods."""
 
     contrast: Text
     """``ours - theirs``, names of methods."""
@@ -109,8 +110,9 @@ class ContrastSpec(Model):
     """The measure, of which more is better."""
     demonstrations: Count | None = None
     """The number of demonstrations; null: the only one there is."""
-    kind: Literal["superiority", "non_inferiority"] = "superiority"
-    """``superiority``: the difference exceeds ``margin``. ``non_inferiority``: it exceeds −``margin``."""
+    kind: Literal["superiority", "non_inferiority", "equivalence"] = "superiority"
+    """``superiority``: the difference exceeds ``margin``. ``non_inferiority``: it exceeds −``margin``. ``equivalence``:
+    it lies between −``margin`` and ``margin``."""
     margin: float = Field(default=0.0, ge=0)
     """The margin, in units of the measure."""
 
@@ -121,9 +123,11 @@ class ContrastSpec(Model):
         return ours.strip(), theirs.strip()
 
     @property
-    def bound(self) -> float:
-        """The bound that the difference has to exceed."""
-        return self.margin if self.kind == "superiority" else -self.margin
+    def bounds(self) -> tuple[float, float]:
+        """Where the difference has to lie."""
+        return self.margin if self.kind == "superiority" else -self.margin, (
+            self.margin if self.kind == "equivalence" else math.inf
+        )
 
 
 class KeptSpec(Model):
@@ -172,7 +176,16 @@ class Declaration(Model):
     measures: Annotated[Items[Text], Field(min_length=1)] = (NATS,)
     """Measures of the tables: ``nats``, ``nmi`` and others of ``ddco_pyro.metrics.Scores``, or a task's."""
     contrasts: Items[ContrastSpec] = ()
-    """The primary contrasts, whose p-values are corrected for their number."""
+    """The primary contrasts."""
+    correction: Literal["holm", "fixed_sequence"] = "holm"
+    """``holm``: Holm's correction for the number of contrasts. ``fixed_sequence``: contrasts are tested in their order,
+    each only where all before it hold, without a correction."""
+    families: dict[Text, Annotated[Items[TaskName], Field(min_length=2)]] = Field(default={})
+    """Tasks by the name of their family, whose mean is one unit of every test."""
+    failed: dict[Text, float] = Field(default={})
+    """The value of a measure that a failed cell counts; without one its pairs are left out."""
+    pinned: bool = False
+    """Whether all results must be of one commit, that of the code: others are refused."""
     kept: Items[KeptSpec] = ()
     """Tables of earlier results, the first of which decides where several have a value."""
 
@@ -226,8 +239,15 @@ class Declaration(Model):
         for number, contrast in enumerate(self.contrasts):
             if contrast.measure not in self.measures:
                 yield f"contrasts.{number}.measure", f"{contrast.measure!r} is not among measures; add it there"
-        if self.choose is not None and self.choose not in self.measures:
-            yield "choose", f"{self.choose!r} is not among measures; add it there"
+            if contrast.kind == "equivalence" and not contrast.margin:
+                yield f"contrasts.{number}.margin", "missing; say which differences are none"
+        for at, named in (("choose", self.choose), *((f"failed.{name}", name) for name in self.failed)):
+            if named is not None and named not in self.measures:
+                yield at, f"{named!r} is not among measures; add it there"
+        related = [task for tasks in self.families.values() for task in tasks]
+        units = {*self.tasks} - {*related} | {*self.families}
+        if self.families and ({*related} - {*self.tasks} or len({*related}) < len(related) or len(units) < 2):
+            yield "families", "must have tasks of the study, each once, and leave several units"
 
     def _named(self) -> Iterator[tuple[str, str]]:
         known, counts = self.labels, self.demonstrations.counts
@@ -323,6 +343,11 @@ class Study:
     def tasks(self) -> tuple[str, ...]:
         """The tasks; an empty name stands for a file of demonstrations without a task."""
         return self.declared.tasks or ((self.base.task if self.base else None) or "",)
+
+    @property
+    def family_of(self) -> dict[str, str]:
+        """The family of each task that has one."""
+        return {task: family for family, tasks in self.declared.families.items() for task in tasks}
 
     def changes(self, method: str, point: dict[str, Any]) -> dict[str, Any]:
         """What a method with a point of the grid changes in the spec, by key path."""

@@ -11,6 +11,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import pandas as pd
 
 from ddco_pyro.data.files import write_text
@@ -29,11 +30,12 @@ FILES = ("table.csv", "page.md", "page.html", "contrasts.png", "methods.png")
 BLANK = "\n\n"
 POINTS = "Grey points: single tasks, or seeds where there is one task."
 NOT_TESTED = "not tested"
+NOT_REACHED = "not reached"
 DECIDED = ("holds", "does not hold")
 
 
 class Tested(NamedTuple):
-    """A primary contrast with its estimate (None without any cell), its verdict and Holm's adjusted p-value."""
+    """A primary contrast with its estimate (None without any cell), its verdict and its adjusted p-value."""
 
     spec: ContrastSpec
     demonstrations: int
@@ -47,7 +49,8 @@ def tested(study: Study, table: pd.DataFrame) -> list[Tested]:
     contrasts, counts = study.declared.contrasts, study.declared.demonstrations.counts
     asked = [(one, one.demonstrations or counts[0]) for one in contrasts]
     found = [_estimate(study, table, one.contrast, one.measure, [number]) for one, number in asked]
-    judged = verdicts([(own, one.bound) for own, one in zip(found, contrasts, strict=True)])
+    p_values = [own.p_value(*one.bounds) if own else math.nan for own, one in zip(found, contrasts, strict=True)]
+    judged = verdicts(p_values, study.declared.correction)
     return [Tested(*one, own, *verdict) for one, own, verdict in zip(asked, found, judged, strict=True)]
 
 
@@ -59,20 +62,29 @@ def _estimate(
     own = times * values(table, what, measure, demonstrations, task)
     rates = study is not None and study.declared.starts and measure.startswith("success") and times == 1
     trials = study.declared.starts.test.count if rates else 0  # type: ignore[union-attr]
-    return estimate(own, trials, -1.0 if " - " in what else 0.0) if len(own) else None
+    return (
+        estimate(own, trials, -1.0 if " - " in what else 0.0, study.family_of if study else None) if len(own) else None
+    )
 
 
-def verdicts(family: Sequence[tuple[Estimate | None, float]]) -> list[tuple[str, float]]:
-    """Whether each estimate exceeds its bound, and Holm's p-value; both sides are corrected for the whole family.
+def verdicts(p_values: Sequence[float], correction: str = "holm") -> list[tuple[str, float]]:
+    """The verdict on each claim of a family, and its adjusted p-value.
 
-    ``does not hold``: the contrary holds, that the estimate is below the bound. ``inconclusive``: neither does.
+    ``does not hold``: the contrary does, whose p-value is one minus that of the claim. ``inconclusive``: neither does.
+    ``not reached``: in a fixed sequence, a claim before it does not hold. ``not tested``: there is no p-value.
     """
-    p_values = [math.nan if known is None else known.p_value(bound) for known, bound in family]
-    judged = []
-    for p, above, below in zip(p_values, holm(p_values), holm([1 - p for p in p_values]), strict=True):
-        verdict = "holds" if above <= LEVEL else "does not hold" if below <= LEVEL else "inconclusive"
-        judged.append((NOT_TESTED if math.isnan(p) else verdict, above))
-    return judged
+    given = np.array(p_values, float)
+    known = np.nan_to_num(given, nan=1.0)
+    before = np.zeros(len(known))
+    if correction == "fixed_sequence":
+        claims = np.maximum.accumulate(known)
+        before[1:] = claims[:-1]
+        contraries = np.maximum(before, 1 - known)
+    else:
+        claims, contraries = np.array(holm(given)), np.array(holm(1 - given))
+    named = {NOT_REACHED: before > LEVEL, NOT_TESTED: np.isnan(given), "holds": claims <= LEVEL,
+             "does not hold": contraries <= LEVEL}  # fmt: skip
+    return [*zip(np.select([*named.values()], [*named], "inconclusive").tolist(), claims.tolist(), strict=True)]
 
 
 # --- the page ---------------------------------------------------------------------------------------------------------
@@ -92,7 +104,7 @@ def write(folder: Folder, state: State, to: Path) -> Path:
             there = {name for done in state.done.values() for name in done.values}
             text = f"{folder.study.path}: measures: no cell has {measure!r}{nearest(measure, there)}; there is: "
             raise BadInput(text + ", ".join(sorted(there)))
-    write_text(to / "table.csv", table.to_csv(index=False, lineterminator="\n"))
+    write_text(to / "table.csv", table.to_csv(index=False, lineterminator="\n", float_format="%.9g"))
     whole = page(folder.study, table, state, to)
     write_text(to / "page.md", f"# {whole.title}\n\n{whole.markdown()}")
     write_text(to / "page.html", whole.html())
@@ -104,7 +116,7 @@ def page(study: Study, table: pd.DataFrame, state: State, to: Path) -> Page:
     contrasts = tested(study, table)
     sections = []
     if any(one.estimate for one in contrasts):
-        sections.append(Section("contrasts", "Primary contrasts", _contrasts(contrasts, to)))
+        sections.append(Section("contrasts", "Primary contrasts", _contrasts(study, contrasts, to)))
     sections.append(Section("methods", "Every method", _methods(study, table, to)))
     sections.append(Section("design", "Design", [note(line) for line in design(study, state)]))
     top: list[Block] = [Text(verdict(contrasts), "verdict")] * bool(contrasts)
@@ -117,20 +129,29 @@ def verdict(contrasts: Sequence[Tested]) -> str:
     return f"Verdicts on primary contrasts: {', '.join(f'{verdict} {count}' for verdict, count in counts.items())}."
 
 
-def _contrasts(contrasts: Sequence[Tested], to: Path) -> list[Block]:
-    head = ["contrast", "measure", "demos", "verdict", "has to exceed", "mean [95 % t]", "median [95 %]", "p (Holm)"]
+_CORRECTION = {
+    "holm": "Holm's correction is over these contrasts.",
+    "fixed_sequence": "Contrasts are tested in this order, each only where all before it hold; the p-value is the "
+    "largest so far, without a correction.",
+}
+
+
+def _contrasts(study: Study, contrasts: Sequence[Tested], to: Path) -> list[Block]:
+    adjusted = "p (Holm)" if study.declared.correction == "holm" else "p (in order)"
+    head = ["contrast", "measure", "demos", "verdict", "has to lie", "mean [95 % t]", "median [95 %]", adjusted]
     rows = []
     for one in contrasts:
         numbers = ["–"] * 3
         if one.estimate:
             p = "–" if one.verdict == NOT_TESTED else words.p_value(one.adjusted)
             numbers = [shown(one.estimate, "+.2f"), _between(*one.estimate.median, "+.2f"), p]
+        low, high = one.spec.bounds
         facts = [one.spec.contrast, name_of(one.spec.measure), str(one.demonstrations), one.verdict]
-        rows.append([*facts, words.signed(one.spec.bound), *numbers])
+        rows.append([*facts, f"above {words.signed(low)}" if high == math.inf else f"within ±{high:g}", *numbers])
     text = (
-        "Differences are paired by task and training seed. The test of each contrast is one-sided, at 2.5 %. For "
-        "superiority the difference has to exceed the margin, for non-inferiority minus the margin. Holm's correction "
-        "is over these contrasts; intervals are not corrected. With several tasks the units are tasks, so an interval "
+        "Differences are paired by task and training seed. The test of each contrast is one-sided, at 2.5 %; "
+        f"equivalence has two, so the interval has to lie within ± the margin. {_CORRECTION[study.declared.correction]}"
+        " Intervals are not corrected. With several tasks the units are tasks or their families, so an interval "
         "speaks of further tasks. Rare failures and outliers make t intervals too short: they may cover 75 %. The "
         "median's interval is exact, and needs six units."
     )
@@ -138,7 +159,7 @@ def _contrasts(contrasts: Sequence[Tested], to: Path) -> list[Block]:
     drawn = [one for one in contrasts if one.estimate]
     panels = {
         name_of(measure): [
-            _drawn(one.estimate, one.spec.bound) if one.spec.measure == measure else None for one in drawn
+            _drawn(one.estimate, one.spec.bounds[0]) if one.spec.measure == measure else None for one in drawn
         ]
         for measure in dict.fromkeys(one.spec.measure for one in drawn)
     }
@@ -191,6 +212,9 @@ def design(study: Study, state: State) -> list[str]:
     ]
     if declared.starts is not None:
         lines.append(f"Every method acts from the same {declared.starts.test.count} starts, others for every seed.")
+    if declared.families:
+        related = (f"{name} ({', '.join(tasks)})" for name, tasks in declared.families.items())
+        lines.append(f"Families of tasks are one unit each: {', '.join(related)}.")
     if declared.kept:
         tables = dict.fromkeys(one.table for one in declared.kept)
         text = "have data of their own studies, whose seeds may share them. They may be older than the contrasts"
@@ -209,8 +233,14 @@ def design(study: Study, state: State) -> list[str]:
                 lines.append(f"{method}: {same} of {len(found)} points gave the results of another one: no trials.")
     tests = [cell for cell in state.cells if cell.part == "test"]
     done = {cell: state.done[cell] for cell in tests if cell in state.done}
-    if len(done) < len(tests):
-        lines.append(f"{len(tests) - len(done)} of {len(tests)} cells are missing; contrasts leave their pairs out.")
+    failed, counted = sum(cell in state.failed for cell in tests), declared.failed
+    if failed and counted:
+        text = ", ".join(f"{measure} {value:g}" for measure, value in counted.items())
+        lines.append(f"{failed} of {len(tests)} cells failed. They count {text}; pairs of other measures are left out.")
+    if left_out := len(tests) - len(done) - (failed if counted else 0):
+        lines.append(f"{left_out} of {len(tests)} cells are missing; contrasts leave their pairs out.")
+    if codes := Counter(one.code for one in done.values() if one.code):
+        lines.append(f"Code: {', '.join(f'{code} ({count} cells)' for code, count in codes.items())}.")
     if rising := Counter(cell.method for cell, result in done.items() if not result.converged):
         fits = words.listed(f"{count} of {method}" for method, count in rising.items())
         lines.append(f"Fits that have not converged: {fits}. More epochs may change their results.")
@@ -270,7 +300,7 @@ def render(text: str, studies: Path, tables: Path = Path()) -> str:
     page = _Quoting({"study": studies, "table": tables})
     _QUOTED.sub(page.quoted, text)  # finds the families
     for family in page.families.values():
-        judged = verdicts([(known, 0.0) for known in family.values()])
+        judged = verdicts([known.p_value(0.0) for known in family.values()])
         page.verdicts |= {number: verdict for number, (verdict, _) in zip(family, judged, strict=True)}
     return _QUOTED.sub(page.quoted, text)
 
