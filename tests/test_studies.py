@@ -206,12 +206,12 @@ def test_an_adapter_collects_plays_and_has_methods_of_its_own(made, tmp_path):
         "world": "world_of_tests:WORLD",
         "tasks": ["there", "back"],
         "overrides": {"training.epochs": 3},
-        "methods": {"options": {}, "own": {"by": "own"}},
+        "methods": {"options": {}, "own": {"by": "own", "overrides": {"a": 1}, "grid": {"b": [2]}}},
         "demonstrations": {"counts": [5], "held_out": 2, "test": {"first": 100, "count": 7}},
         "starts": {"test": {"first": 500, "count": 4}},
         "seeds": {"test": {"count": 2}},
         "measures": ["success", "nats"],
-        "contrasts": [{"contrast": "options - own", "measure": "success"}],
+        "contrasts": [{"contrast": "options - own (b = 2)", "measure": "success"}],
     }
     folder = made(allow_code=True, **study)
     state = folder.run(HERE)
@@ -220,8 +220,10 @@ def test_an_adapter_collects_plays_and_has_methods_of_its_own(made, tmp_path):
     for (task, method, _, seed), own in found.items():
         first, start = 100 + 7 * seed, 500 + 4 * seed
         assert own["success"] == {"there": 1, "back": 0}[task] if method == "options" else start / 1000
-        assert method == "options" or own["demonstrations"] == first
+        assert method == "options" or (own["demonstrations"], own["a"], own["b"]) == (first, 1, 2)
     write(folder, state, tmp_path / "report")  # of two tasks
+    methods = {"options": {}, "own": {"by": "own", "overrides": {"a": 2}, "grid": {"b": [2]}}}
+    assert [cell.of for cell in made(allow_code=True, **study | {"methods": methods}).state().missing] == ["own"] * 4
     wrong = made(allow_code=True, **study | {"methods": {"on": {"by": "on"}}, "contrasts": []})
     with pytest.raises(BadInput, match=r"has no method 'on' \(did you mean 'own'\?\)"):
         wrong.run(HERE)
@@ -248,7 +250,7 @@ class World:
     def own(self, job):
         assert set(job.demos.masks["train"]) | set(job.demos.masks["valid"]) == set(job.demos.names)
         first = min(demo.attributes["seed"] for demo in job.demos)
-        return {"success": job.starts[0] / 1000, "demonstrations": float(first)}
+        return {"success": job.starts[0] / 1000, "demonstrations": float(first), **job.settings}
 
 WORLD = World()
 """
@@ -561,6 +563,18 @@ def test_cells_of_an_earlier_table_are_not_done(made, done, tmp_path):
     table.write_text(re.sub(r"(?m)^.*,flat,.*,1,nats,.*\n", "", table.read_text()))
     folder = made(kept=[{"table": "table.csv"}])
     assert {(cell.method, cell.seed) for cell in folder.state().missing} == {("flat", 1)}
+
+
+def test_a_fixed_sequence_goes_on_beside_equivalence(made):
+    """Differences of 3, 4, 5 and 4 with four demonstrations; with six of 0 and 1."""
+    first, last = ({**STUDY["contrasts"][0], "demonstrations": number} for number in (4, 6))
+    contrasts = [{**first, "kind": "equivalence", "margin": 0.5}, first, last, {**first, "kind": "non_inferiority"}]
+    study = made(contrasts=contrasts, correction="fixed_sequence").study
+    values = {("options", 4): [3, 4, 5, 4], ("options", 6): [0, 1, 0, 1], ("flat", 4): [0] * 4, ("flat", 6): [0] * 4}
+    rows = [("study", "", method, str(count), str(seed), "nats", value)
+            for (method, count), own in values.items() for seed, value in enumerate(own)]  # fmt: skip
+    judged = [one.verdict for one in report.tested(study, pd.DataFrame(rows, columns=tidy.COLUMNS))]
+    assert judged == ["does not hold", "holds", "inconclusive", "not reached"]
 
 
 def test_pages_quote_the_tables_by_the_names_of_the_study(made, done, tmp_path):

@@ -148,6 +148,19 @@ def test_a_fixed_sequence_ends_where_a_contrast_does_not_hold(p_values, said):
     assert [p for _, p in judged] == largest
 
 
+@pytest.mark.parametrize(
+    ("p_values", "said"),
+    [
+        ([0.01, 0.9, 0.02, 0.001], ["holds", "inconclusive", "holds", "holds"]),  # the last waits for its twin, 2
+        ([0.01, 0.01, 0.3, 0.99], ["holds", "holds", "inconclusive", "does not hold"]),
+        ([0.4, 0.01, 0.01, 0.01], ["inconclusive", "holds", "not reached", "not reached"]),
+    ],
+)
+def test_equivalence_is_read_off_the_interval_of_its_twin(p_values, said):
+    """Claims 1 and 3 are the equivalence of 0 and of 2."""
+    assert [verdict for verdict, _ in report.verdicts(p_values, "fixed_sequence", {1: 0, 3: 2})] == said
+
+
 def test_a_fixed_sequence_errs_as_often_as_its_level_says():
     """Of ten claims the first is right; another one holds in at most 2.5 % of the studies, without a correction."""
     p_values = np.random.default_rng(6).random((2000, 10)) * [1e-3, *[1.0] * 9]

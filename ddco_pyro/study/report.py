@@ -50,7 +50,15 @@ def tested(study: Study, table: pd.DataFrame) -> list[Tested]:
     asked = [(one, one.demonstrations or counts[0]) for one in contrasts]
     found = [_estimate(study, table, one.contrast, one.measure, [number]) for one, number in asked]
     p_values = [own.p_value(*one.bounds) if own else math.nan for own, one in zip(found, contrasts, strict=True)]
-    judged = verdicts(p_values, study.declared.correction)
+    places: dict[Any, int] = {
+        (one.kind, one.pair, one.measure, number): place for place, (one, number) in enumerate(asked)
+    }
+    twins = {
+        place: places["superiority", *facts]
+        for (kind, *facts), place in places.items()
+        if kind == "equivalence" and ("superiority", *facts) in places
+    }
+    judged = verdicts(p_values, study.declared.correction, twins)
     return [Tested(*one, own, *verdict) for one, own, verdict in zip(asked, found, judged, strict=True)]
 
 
@@ -67,21 +75,25 @@ def _estimate(
     )
 
 
-def verdicts(p_values: Sequence[float], correction: str = "holm") -> list[tuple[str, float]]:
+def verdicts(
+    p_values: Sequence[float], correction: str = "holm", twins: Mapping[int, int] | None = None
+) -> list[tuple[str, float]]:
     """The verdict on each claim of a family, and its adjusted p-value.
 
     ``does not hold``: the contrary does, whose p-value is one minus that of the claim. ``inconclusive``: neither does.
     ``not reached``: in a fixed sequence, a claim before it does not hold. ``not tested``: there is no p-value.
+
+    :param twins: in a fixed sequence, the place of a claim that is read off the interval of another one, and the place
+        of that one. It is reached where its twin is, and others do not wait for it.
     """
     given = np.array(p_values, float)
-    known = np.nan_to_num(given, nan=1.0)
-    before = np.zeros(len(known))
+    known, beside = np.nan_to_num(given, nan=1.0), twins or {}
     if correction == "fixed_sequence":
-        claims = np.maximum.accumulate(known)
-        before[1:] = claims[:-1]
-        contraries = np.maximum(before, 1 - known)
+        largest = np.maximum.accumulate([0.0, *(0.0 if place in beside else p for place, p in enumerate(known))])
+        before = np.array([largest[beside.get(place, place)] for place in range(len(known))])
+        claims, contraries = np.maximum(before, known), np.maximum(before, 1 - known)
     else:
-        claims, contraries = np.array(holm(given)), np.array(holm(1 - given))
+        before, claims, contraries = np.zeros(len(known)), np.array(holm(given)), np.array(holm(1 - given))
     named = {NOT_REACHED: before > LEVEL, NOT_TESTED: np.isnan(given), "holds": claims <= LEVEL,
              "does not hold": contraries <= LEVEL}  # fmt: skip
     return [*zip(np.select([*named.values()], [*named], "inconclusive").tolist(), claims.tolist(), strict=True)]
