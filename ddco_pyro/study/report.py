@@ -232,7 +232,7 @@ def design(study: Study, state: State) -> list[str]:
         text = "have data of their own studies, whose seeds may share them. They may be older than the contrasts"
         lines.append(f"This is so in new cells. Results that are kept in {', '.join(tables)} {text}.")
     if declared.choose is not None:
-        chosen = {cell.of: declared.label(cell.of, dict(cell.point), "") for cell in state.cells if cell.part == "test"}
+        chosen = {cell.of: declared.label(cell.of, cell.point, "") for cell in state.cells if cell.part == "test"}
         text = f"The point of each method has the highest {declared.choose} on the development seeds, of"
         points = len(declared.points(next(iter(declared.methods))))
         lines.append(f"{text} {points}: {', '.join(chosen.values()) or 'not yet known'}.")

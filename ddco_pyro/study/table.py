@@ -23,7 +23,7 @@ CELL = ["task", "method", "demonstrations", "seed"]
 """The columns that name a cell."""
 
 ORIGIN = ["key", "code"]
-"""Further columns of a study's table: the digest of what a cell depends on, and the commit of the code."""
+"""Further columns of a study's table: the digest of what the declaration says of a cell, and the commit of the code."""
 
 
 def read_tidy(path: Path) -> pd.DataFrame:
@@ -50,8 +50,8 @@ def earlier(study: Study) -> pd.DataFrame:
     tables = [pd.DataFrame(columns=[*COLUMNS, *ORIGIN])]
     for kept in study.declared.kept:
         table = read_tidy(study.path.parent / kept.table)
-        table = table[table.seed.isin(seeds) & table.study.isin([kept.study] if kept.study else table.study)]
-        table = table[table.method.isin(kept.methods.values() if kept.methods else table.method)]
+        of = {"seed": seeds, "study": kept.study and [kept.study], "method": [*kept.methods.values()]}
+        table = table[np.all([table[column].isin(own or table[column]) for column, own in of.items()], axis=0)]
         names = {"task": kept.tasks, "method": kept.methods, "measure": kept.measures}
         names_here = {column: {there: here for here, there in own.items()} for column, own in names.items()}
         table = table.replace(names_here).assign(study=study.name)
@@ -67,8 +67,7 @@ def values(
 
     :param demonstrations: of a method; a second number is that of ``theirs``.
     """
-    table = table[table.measure == measure]
-    table = table if task is None else table[table.task == task]
+    table = table[(table.measure == measure) & (table.task.eq(task) if task is not None else True)]
 
     def of(method: str, count: str | int) -> pd.Series:
         rows = table[(table.method == method.strip()) & (table.demonstrations == str(count))]
@@ -81,8 +80,6 @@ def values(
     seeds = found.index.get_level_values("seed")
     return found[(seeds != "") | (seeds == "").all()]  # a row without seed is the summary of the others
 
-
-# --- estimates --------------------------------------------------------------------------------------------------------
 
 LEVEL = (1 - CONFIDENCE) / 2
 """One-sided level of the tests, which corresponds to two-sided 95 % intervals."""
