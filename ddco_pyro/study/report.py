@@ -203,7 +203,7 @@ def design(study: Study, state: State) -> list[str]:
         f"{seeds.count} training seeds from {seeds.first} on. Spec: {declared.spec}.": True,
         "Each training seed has starts of its own, which all methods share.": declared.starts,
         "Kept results have data of their own studies and may be older than the contrasts. They are those of "
-        f"{', '.join(dict.fromkeys(one.table for one in declared.kept))}.": declared.kept,
+        f"{', '.join(dict.fromkeys(one.table for one in declared.kept))}.": declared.kept and not declared.pinned,
         f"{failed} of {len(tests)} cells failed. They count {as_failed}; pairs of other measures are left out.":
             failed and counted,
         f"{left_out} of {len(tests)} cells are missing; contrasts leave their pairs out.": left_out,
