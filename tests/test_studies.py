@@ -565,16 +565,24 @@ def test_cells_of_an_earlier_table_are_not_done(made, done, tmp_path):
     assert {(cell.method, cell.seed) for cell in folder.state().missing} == {("flat", 1)}
 
 
-def test_a_fixed_sequence_goes_on_beside_equivalence(made):
+def test_a_fixed_sequence_goes_on_beside_equivalence(made, tmp_path):
     """Differences of 3, 4, 5 and 4 with four demonstrations; with six of 0 and 1."""
     first, last = ({**STUDY["contrasts"][0], "demonstrations": number} for number in (4, 6))
-    contrasts = [{**first, "kind": "equivalence", "margin": 0.5}, first, last, {**first, "kind": "non_inferiority"}]
-    study = made(contrasts=contrasts, correction="fixed_sequence").study
+    turned = {**first, "contrast": "flat - options"}
+    contrasts = [{**first, "kind": "equivalence", "margin": 0.5}, first, last, turned]
+    kept, seeds = [{"table": "table.csv"}], {"test": {"count": 4}}
+    made(contrasts=contrasts, correction="fixed_sequence", kept=kept, seeds=seeds)
     values = {("options", 4): [3, 4, 5, 4], ("options", 6): [0, 1, 0, 1], ("flat", 4): [0] * 4, ("flat", 6): [0] * 4}
     rows = [("study", "", method, str(count), str(seed), "nats", value)
             for (method, count), own in values.items() for seed, value in enumerate(own)]  # fmt: skip
-    judged = [one.verdict for one in report.tested(study, pd.DataFrame(rows, columns=tidy.COLUMNS))]
-    assert judged == ["does not hold", "holds", "inconclusive", "not reached"]
+    pd.DataFrame(rows, columns=tidy.COLUMNS).to_csv(tmp_path / "table.csv", index=False)
+    for asked, said in (
+        ("options - flat; nats; 4; show=equivalence", "does not hold"),
+        ("options - flat; nats; 4; show=verdict", "holds"),
+        ("options - flat; nats; 6; show=verdict", "inconclusive"),
+        ("flat - options; nats; 4; show=verdict", "not reached"),
+    ):
+        assert f"-->{said}<!--" in render(f"<!-- study study: {asked} --><!-- / -->", tmp_path)
 
 
 def test_pages_quote_the_tables_by_the_names_of_the_study(made, done, tmp_path):

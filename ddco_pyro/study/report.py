@@ -29,7 +29,7 @@ FILES = ("table.csv", "page.md", "page.html", "contrasts.png", "methods.png")
 
 BLANK = "\n\n"
 POINTS = "Grey points: single tasks, or seeds where there is one task."
-HOLDS, FAILS, NOT_TESTED = "holds", "does not hold", "not tested"
+HOLDS, FAILS, NOT_TESTED, EQUIVALENCE = "holds", "does not hold", "not tested", "equivalence"
 CORRECTION = {
     "holm": "Holm's correction is over these contrasts.",
     "fixed_sequence": "Contrasts are tested in this order, each only where all before it hold. A p-value is the "
@@ -54,7 +54,7 @@ def tested(study: Study, table: pd.DataFrame) -> list[Tested]:
     found = [_estimate(study, table, one.contrast, one.measure, [number]) for one, number in asked]
     p_values = [own.p_value(*one.bounds) if own else math.nan for own, one in zip(found, contrasts, strict=True)]
     places: dict[Any, int] = {(one.kind, one.pair, one.measure, count): n for n, (one, count) in enumerate(asked)}
-    twins = {n: places.get(("superiority", *facts)) for (kind, *facts), n in places.items() if kind == "equivalence"}
+    twins = {n: places.get(("superiority", *facts)) for (kind, *facts), n in places.items() if kind == EQUIVALENCE}
     judged = verdicts(p_values, study.declared.correction, twins)
     return [Tested(*one, own, *verdict) for one, own, verdict in zip(asked, found, judged, strict=True)]
 
@@ -313,7 +313,11 @@ class _Quoting:
             self.tables[source] = study, table
             for one in tested(study, table) if study else ():
                 key = " - ".join(one.spec.pair), one.spec.measure, (str(one.demonstrations),), None
-                self.verdicts[source, (), key] = one.verdict
+                if one.spec.kind == EQUIVALENCE:
+                    self.verdicts[source, EQUIVALENCE, key] = one.verdict
+                    self.verdicts.setdefault((source, (), key), one.verdict)
+                else:
+                    self.verdicts[source, (), key] = one.verdict
         return self.tables[source]
 
     def quoted(self, match: re.Match[str]) -> str:
@@ -321,14 +325,14 @@ class _Quoting:
 
         :raises BadInput: it is wrong, or there is no such number.
         """
-        source, asked = match.groups()
+        (source, asked), shows = match.groups(), (*_SHOWN, "verdict", EQUIVALENCE)
         fields = [part.strip() for part in asked.split(";")]
         settings = {found[1]: found[2] for part in fields if (found := _SETTING.fullmatch(part))}
         plain = [part.split(" | ") for part in fields if not _SETTING.fullmatch(part)]
         try:
             whats, measures, *rest = plain
             (counts,) = rest or [[""]]
-            wrong = settings.get("show", "mean") not in (*_SHOWN, "verdict") or not all(
+            wrong = settings.get("show", "mean") not in shows or not all(
                 _COUNTS.fullmatch(count) or not rest for count in counts
             )
             _ = float(settings.get("times", 1)), format(0.0, settings.get("form", ""))
@@ -337,8 +341,7 @@ class _Quoting:
         if wrong:
             raise BadInput(
                 f"{source}: {asked!r}: write a method or contrast, a measure and a number of demonstrations, such as: "
-                f"options - flat; success; 50. After show= stands one of: {', '.join((*_SHOWN, 'verdict'))}; form= is "
-                "Python's"
+                f"options - flat; success; 50. After show= stands one of: {', '.join(shows)}; form= is Python's"
             )
         alone, by_task, rows = max(map(len, (*plain, counts))) == 1, settings.get("by") == "task", []
         tasks: list[Any] = sorted({*self._table(source)[1].task}) if by_task else [settings.get("task")]
@@ -374,8 +377,8 @@ class _Quoting:
         show = settings.get("show") or ("interval" if alone or difference else "mean")
         if show in ("interval", "±", "verdict") and difference and study is None:
             self.families[source, taken, measure.partition(",")[0]][source, taken, key] = known
-        if show == "verdict":
-            return verdict
+        if show in ("verdict", EQUIVALENCE):
+            return verdict if show == "verdict" else self.verdicts.get((source, EQUIVALENCE, key), NOT_TESTED)
         form = settings.get("form") or (".0%" if measure.startswith("success") else ".2f")
         form = f"+{form}" if difference and not (alone and "form" in settings) else form
         text = _SHOWN[show](known, form).replace("-", "−")
