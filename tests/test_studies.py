@@ -438,6 +438,20 @@ def test_a_pinned_study_is_of_one_commit(made, monkeypatch, tmp_path, drawn_here
     assert "was done at commit unknown, key unknown; here are commit 11aa" in said
 
 
+def test_an_unfinished_fit_goes_on_under_the_same_commit_alone(tmp_path):
+    seen = []
+
+    def work(folder):
+        (folder / "fit").mkdir(exist_ok=True)
+        seen.append(len([*(folder / "fit").iterdir()]))
+        (folder / "fit" / str(len(seen))).touch()
+        raise BadInput("stopped")
+
+    for code in ("11aa", "11aa", "22bb", "22bb"):
+        assert cells.do(tmp_path / "cells" / "a.json", {"a": 1}, work, code) == "stopped"
+    assert seen == [0, 1, 0, 1]
+
+
 def test_the_commit_of_the_code_is_that_of_library_and_study(tmp_path, monkeypatch):
     monkeypatch.setattr(cells, "__file__", str(tmp_path / "ddco_pyro" / "study" / "cells.py"))
     study, script = tmp_path / "studies" / "mine.yaml", tmp_path / "studies" / "world.py"

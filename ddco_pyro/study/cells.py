@@ -187,8 +187,10 @@ def do(
         with only_one(folder := work_of(path)):
             if (before := kept(path, depends)) is not None and not before.failed:  # another process has done it
                 return ""
-            if path.exists() and before is None:  # of other defaults
-                shutil.rmtree(folder / "fit", ignore_errors=True)
+            begun = folder / "code"
+            if (path.exists() and before is None) or not begun.exists() or begun.read_text(encoding="utf-8") != code:
+                shutil.rmtree(folder / "fit", ignore_errors=True)  # of other defaults or of another commit
+            write_text(begun, code)
             done: dict[str, Any] = {"depends": dict(depends), "key": path.stem, "code": code}
             try:
                 with one_thread():
@@ -220,17 +222,17 @@ class State:
     cells: Sequence[Cell]
     results: Mapping[Cell, Done]
 
-    @property
+    @cached_property
     def done(self) -> dict[Cell, Done]:
         """The results of the cells that are done."""
         return {cell: one for cell, one in self.results.items() if not one.failed}
 
-    @property
+    @cached_property
     def failed(self) -> dict[Cell, Done]:
         """The results of the cells that failed."""
         return {cell: one for cell, one in self.results.items() if one.failed}
 
-    @property
+    @cached_property
     def missing(self) -> list[Cell]:
         """The cells that are neither done nor failed."""
         return [cell for cell in self.cells if cell not in self.results]
