@@ -542,6 +542,10 @@ def test_a_measure_of_nothing_is_better_than_less(made):
     assert folder.chosen(cells.State(places, dict(zip(places, results, strict=True)))) == {
         "options": {"control.std": 0.5}
     }
+    results[0] = cells.Done(values={"nats": None})  # a measure that applies to no episode is the least
+    assert folder.chosen(cells.State(places, dict(zip(places, results, strict=True)))) == {
+        "options": {"control.std": 1.0}
+    }
 
 
 def test_points_that_change_nothing_are_no_trials(made):

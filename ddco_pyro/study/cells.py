@@ -280,11 +280,12 @@ class Folder:
     def chosen(self, state: State) -> dict[str, dict[str, Any]]:
         """The point of each method with the highest mean over the development cells."""
         rows = [
-            (cell.of, json.dumps(cell.point), one.values.get(str(self.study.declared.choose), -math.inf))
+            (cell.of, json.dumps(cell.point), one.values.get(str(self.study.declared.choose)))
             for cell, one in self.counted(state).items()
             if cell.part == "development"
         ]
-        means = pd.DataFrame(rows, columns=["of", "point", "value"]).groupby(["of", "point"], sort=False).value.mean()
+        scores = pd.DataFrame(rows, columns=["of", "point", "value"]).fillna(-math.inf)
+        means = scores.groupby(["of", "point"], sort=False).value.mean()
         return {str(of): json.loads(own.idxmax()[1]) for of, own in means.groupby("of")}
 
     def counted(self, state: State) -> dict[Cell, Done]:
