@@ -202,7 +202,7 @@ def killed(path, out, encoding, kind, after):
 
 
 def test_killed_again_and_again(few_dots, tmp_path, monkeypatch):
-    monkeypatch.setattr(autoencoder, "KEPT_EVERY", 2)
+    monkeypatch.setattr(autoencoder, "SHOWN_EVERY", 2)
     encoding = Encoding("camera", "autoencoder", size=4, updates=9)
     encode(few_dots, tmp_path / "whole.hdf5", encoding)
     out, seen = tmp_path / "killed.hdf5", []
@@ -211,7 +211,6 @@ def test_killed_again_and_again(few_dots, tmp_path, monkeypatch):
     killed(few_dots, out, encoding, DemonstrationsDone, 2)
     encode(few_dots, out, encoding, seen.append)
     assert [event.done for event in seen if isinstance(event, DemonstrationsDone)] == [5, 6]
-    assert not [event for event in seen if isinstance(event, UpdatesDone)]
     assert contents(out) == contents(tmp_path / "whole.hdf5")
     left = {path.name for path in tmp_path.iterdir() if "killed" in path.name}
     assert left == {"killed.hdf5", "killed.hdf5.encoder"}

@@ -9,6 +9,8 @@ import json
 import re
 import shutil
 import signal
+import subprocess
+from importlib import metadata
 from pathlib import Path
 
 import arena_playing
@@ -116,6 +118,12 @@ RECORDED = {"counts": [10], "held_out": 5, "test": {"first": 0, "count": 20}}
         ({"measures": ["nat"]}, "there is no measure 'nat' (did you mean 'nats'?)"),
         ({"contrasts": [{"contrast": "options - flat", "measure": "nats"}]}, "must be one of 4, 6"),
         ({"contrasts": [{"contrast": "options - flat", "measure": "ari", "demonstrations": 6}]}, "not among measures"),
+        ({"failed": {"success": 0.0}}, "failed.success: 'success' is not among measures"),
+        (
+            {"contrasts": [{**STUDY["contrasts"][0], "kind": "equivalence"}]},
+            "contrasts.0.margin: missing; say which differences are none",
+        ),
+        ({"families": {"door": ["open", "close"]}}, "families: must have tasks of the study, each once"),
         ({"choose": "nats"}, "choose: goes together with seeds.development"),
         (
             {**TUNED, "methods": {"options": {"grid": {"control.std": [0.1, 0.2]}}, "flat": {"baseline": "flat"}}},
@@ -198,22 +206,24 @@ def test_an_adapter_collects_plays_and_has_methods_of_its_own(made, tmp_path):
         "world": "world_of_tests:WORLD",
         "tasks": ["there", "back"],
         "overrides": {"training.epochs": 3},
-        "methods": {"options": {}, "own": {"by": "own"}},
+        "methods": {"options": {}, "own": {"by": "own", "overrides": {"a": 1}, "grid": {"b": [2]}}},
         "demonstrations": {"counts": [5], "held_out": 2, "test": {"first": 100, "count": 7}},
         "starts": {"test": {"first": 500, "count": 4}},
         "seeds": {"test": {"count": 2}},
         "measures": ["success", "nats"],
-        "contrasts": [{"contrast": "options - own", "measure": "success"}],
+        "contrasts": [{"contrast": "options - own (b = 2)", "measure": "success"}],
     }
     folder = made(allow_code=True, **study)
     state = folder.run(HERE)
     assert not state.failed
     found = {cell.row: state.done[cell].values for cell in state.cells}
     for (task, method, _, seed), own in found.items():
-        first, start = 100 + 7 * seed, 500 + 4 * seed
+        first, start = 100 + 7 * int(seed), 500 + 4 * int(seed)
         assert own["success"] == {"there": 1, "back": 0}[task] if method == "options" else start / 1000
-        assert method == "options" or own["demonstrations"] == first
+        assert method == "options" or (own["demonstrations"], own["a"], own["b"]) == (first, 1, 2)
     write(folder, state, tmp_path / "report")  # of two tasks
+    methods = {"options": {}, "own": {"by": "own", "overrides": {"a": 2}, "grid": {"b": [2]}}}
+    assert [cell.of for cell in made(allow_code=True, **study | {"methods": methods}).state().missing] == ["own"] * 4
     wrong = made(allow_code=True, **study | {"methods": {"on": {"by": "on"}}, "contrasts": []})
     with pytest.raises(BadInput, match=r"has no method 'on' \(did you mean 'own'\?\)"):
         wrong.run(HERE)
@@ -240,7 +250,7 @@ class World:
     def own(self, job):
         assert set(job.demos.masks["train"]) | set(job.demos.masks["valid"]) == set(job.demos.names)
         first = min(demo.attributes["seed"] for demo in job.demos)
-        return {"success": job.starts[0] / 1000, "demonstrations": float(first)}
+        return {"success": job.starts[0] / 1000, "demonstrations": float(first), **job.settings}
 
 WORLD = World()
 """
@@ -281,7 +291,7 @@ def test_planted_options_win_in_the_table_and_the_contrast(done, tmp_path, drawn
     assert not state.missing
     write(done, state, tmp_path)
     rows = read_tidy(tmp_path / "table.csv")
-    assert len(rows) == 2 * 2 * 2 + 2 * 2  # nats of both methods, nmi of options
+    assert len(rows[rows.measure.isin(["nats", "nmi"])]) == 2 * 2 * 2 + 2 * 2  # nats of both methods, nmi of options
     (contrast,) = report.tested(done.study, rows)
     nats = rows[(rows.measure == "nats") & (rows.demonstrations == "6")].set_index(["method", "seed"]).value
     by_hand = [nats["options", seed] - nats["flat", seed] for seed in "01"]
@@ -332,19 +342,16 @@ def test_another_key_for_whatever_a_result_depends_on(done, made):
     assert {more.key(cell) for cell in more.cells("test")} > keys
 
 
-def test_a_setting_of_a_later_version_keeps_a_cell_and_another_default_does_not(done):
-    cell = done.cells("test")[0]
-    path, text = done.place(cell), done.place(cell).read_text()
+def test_another_default_is_another_result(done):
+    path, text = done.place(cell := done.cells("test")[0]), done.place(done.cells("test")[0]).read_text()
     content = json.loads(text)
+    content["depends"]["added"]["training"]["batch_size"] += 1
     try:
-        del content["depends"]["spec"]["training"]["patience"]
-        path.write_text(json.dumps(content))
-        assert done.kept(cell)
-        content["depends"]["spec"]["training"]["batch_size"] += 1
         path.write_text(json.dumps(content))
         assert done.kept(cell) is None
     finally:
         path.write_text(text)
+    assert done.kept(cell)
 
 
 def test_a_cell_that_another_process_works_on_is_left_to_it(made):
@@ -359,10 +366,127 @@ def test_a_cell_that_another_process_works_on_is_left_to_it(made):
 def test_a_failed_cell_says_why_and_is_tried_again(made, monkeypatch):
     folder = made(demonstrations={**STUDY["demonstrations"], "counts": [6]}, seeds={"test": {"count": 1}})
     monkeypatch.setattr(cells, "fit", lambda *_, **__: 1 / 0)
-    assert set(folder.run(HERE).failed.values()) == {"unexpected ZeroDivisionError: division by zero"}
+    failed = folder.run(HERE).failed.values()
+    assert {one.failed for one in failed} == {"unexpected ZeroDivisionError: division by zero"}
     monkeypatch.undo()
     state = folder.run(HERE)
     assert (len(state.done), len(state.failed)) == (2, 0)
+
+
+SMALL = {"demonstrations": {**STUDY["demonstrations"], "counts": [6]}, "seeds": {"test": {"count": 2}}}
+
+
+def test_a_failed_cell_counts_what_is_declared(made, monkeypatch, tmp_path, drawn_here):
+    """Of flat fits none is done: each counts −50 nats, here and from the table that is kept."""
+
+    def fails(spec, *given, **named):
+        return fit(spec, *given, **named) if spec.hierarchy else 1 / 0
+
+    folder = made(**SMALL, failed={"nats": -50.0})
+    monkeypatch.setattr(cells, "fit", fails)
+    state = folder.run(HERE)
+    options = [state.done[cell].values["nats"] for cell in state.done]
+    write(folder, state, tmp_path)
+    rows = read_tidy(tmp_path / "table.csv")
+    (contrast,) = report.tested(folder.study, rows)
+    assert contrast.estimate.units == pytest.approx([own + 50 for own in options], rel=1e-8)
+    assert "2 of 4 cells failed. They count nats -50; pairs" in (tmp_path / "page.md").read_text()
+    second = made(**SMALL, failed={"nats": -50.0}, kept=[{"table": "table.csv"}])
+    elsewhere = Folder(second.study, tmp_path / "elsewhere")
+    assert (len(elsewhere.state().done), len(elsewhere.state().failed)) == (2, 2)
+    pd.testing.assert_frame_equal(
+        elsewhere.table(elsewhere.state()).sort_values(tidy.COLUMNS[:-1], ignore_index=True),
+        rows.sort_values(tidy.COLUMNS[:-1], ignore_index=True), check_dtype=False,
+    )  # fmt: skip
+    monkeypatch.undo()
+    assert len(elsewhere.run(HERE).done) == 4
+
+
+def test_a_pinned_study_is_of_one_commit(made, monkeypatch, tmp_path, drawn_here):
+    codes = iter(["11aa", "11aa", "22bb", "11aa-dirty", "11aa"])
+
+    def pinned(**changes):
+        code = next(codes)
+        monkeypatch.setattr(cells, "commit_of", lambda path: code)
+        return made(**SMALL | {"measures": ["nats"]}, pinned=True, **changes)
+
+    def refused(folder):
+        with pytest.raises(BadInput) as error:
+            folder.state()
+        return str(error.value)
+
+    first = pinned()
+    write(first, first.run(HERE), tmp_path)
+    assert "Code: 11aa (4 cells)." in (tmp_path / "page.md").read_text()
+    kept = [{"table": "table.csv"}]
+    second = pinned(kept=kept)
+    elsewhere = Folder(second.study, tmp_path / "elsewhere")
+    assert len(elsewhere.state().done) == 4
+    later = pinned(kept=kept)
+    for folder in (later, Folder(later.study, tmp_path / "elsewhere"), Folder(first.study, first.path)):
+        said = refused(folder)
+        assert "was done at commit 11aa" in said
+        assert "here are commit 22bb" in said
+        assert "\n" not in said
+    with pytest.raises(BadInput, match="pinned: the code has changes since 11aa; commit them"):
+        Folder(pinned().study, tmp_path / "third").run(HERE)
+    changed = Folder(pinned(kept=kept, in_spec={"seed": 1}, overrides={"control.std": 0.4}).study, tmp_path / "fourth")
+    assert refused(changed).count("commit 11aa") == 2
+    table = pd.read_csv(tmp_path / "table.csv")
+    table[tidy.COLUMNS].to_csv(tmp_path / "table.csv", index=False)
+    said = refused(Folder(second.study, tmp_path / "elsewhere"))
+    assert "was done at commit unknown, key unknown; here are commit 11aa" in said
+
+
+def test_an_unfinished_fit_goes_on_under_the_same_commit_alone(tmp_path):
+    seen = []
+
+    def work(folder):
+        (folder / "fit").mkdir(exist_ok=True)
+        seen.append(len([*(folder / "fit").iterdir()]))
+        (folder / "fit" / str(len(seen))).touch()
+        raise BadInput("stopped")
+
+    for code in ("11aa", "11aa", "22bb", "22bb"):
+        assert cells.do(tmp_path / "cells" / "a.json", {"a": 1}, work, code) == "stopped"
+    assert seen == [0, 1, 0, 1]
+
+
+def test_the_commit_of_the_code_is_that_of_library_and_study(tmp_path, monkeypatch):
+    monkeypatch.setattr(cells, "__file__", str(tmp_path / "ddco_pyro" / "study" / "cells.py"))
+    study, script = tmp_path / "studies" / "mine.yaml", tmp_path / "studies" / "world.py"
+    for path in (study, script, tmp_path / "ddco_pyro" / "a.py", tmp_path / "docs" / "a.csv"):
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("1")
+    assert cells.commit_of(study) == metadata.version("ddco-pyro")
+
+    def committed():
+        who = ["-c", "user.name=a", "-c", "user.email=a@b.c"]
+        for words in (["init", "-q"], ["add", "."], [*who, "commit", "-qm", "a"], ["rev-parse", "HEAD"]):
+            told = subprocess.run(["git", *words], cwd=tmp_path, capture_output=True, text=True, check=True)
+        return told.stdout[:10]
+
+    first = committed()
+    assert cells.commit_of(study) == first
+    (tmp_path / "docs" / "a.csv").write_text("2")
+    assert cells.commit_of(study) == first
+    assert committed() != first
+    assert cells.commit_of(study) == first
+    for path in (study, script, tmp_path / "ddco_pyro" / "a.py"):
+        path.write_text(f"{path} changed")
+        assert cells.commit_of(study) == f"{first}-dirty"
+        first = committed()
+        assert cells.commit_of(study) == first
+
+
+def test_cells_of_init_depend_on_its_template(made, monkeypatch, tmp_path):
+    folder = made(spec="init")
+    cell = folder.cells("test")[0]
+    depends = folder.depends(cell)
+    (tmp_path / "other.j2").write_text(cells.TEMPLATE.read_text() + "# more\n")
+    assert folder.depends(cell) == depends
+    monkeypatch.setattr(cells, "TEMPLATE", tmp_path / "other.j2")
+    assert folder.depends(cell) != depends
 
 
 @pytest.mark.slow
@@ -411,12 +535,16 @@ def test_a_measure_of_nothing_is_better_than_less(made):
     folder = made(**{**TUNED, "seeds": seeds}, grid={"control.std": [0.5, 1.0]}, methods={"options": {}})
     values = {(7, 0.5): -1.0, (8, 0.5): 0.0, (7, 1.0): -0.4, (8, 1.0): -0.4}
     places = folder.cells("development")
-    results = [cells.Done(depends={}, values={"nats": values[one.seed, one.point["control.std"]]}) for one in places]
-    state = cells.State(places, dict(zip(places, results, strict=True)), {})
+    results = [cells.Done(values={"nats": values[one.seed, one.point["control.std"]]}) for one in places]
+    state = cells.State(places, dict(zip(places, results, strict=True)))
     assert folder.chosen(state) == {"options": {"control.std": 1.0}}
-    results[0] = cells.Done(depends={}, values={"nats": -0.7})
-    assert folder.chosen(cells.State(places, dict(zip(places, results, strict=True)), {})) == {
+    results[0] = cells.Done(values={"nats": -0.7})
+    assert folder.chosen(cells.State(places, dict(zip(places, results, strict=True)))) == {
         "options": {"control.std": 0.5}
+    }
+    results[0] = cells.Done(values={"nats": None})  # a measure that applies to no episode is the least
+    assert folder.chosen(cells.State(places, dict(zip(places, results, strict=True)))) == {
+        "options": {"control.std": 1.0}
     }
 
 
@@ -424,8 +552,8 @@ def test_points_that_change_nothing_are_no_trials(made):
     folder = made(**TUNED, grid={"control.std": [0.5, 1.0, 2.0]})
     places = folder.cells("development")
     values = {"options": {0.5: -1.0, 1.0: -1.0, 2.0: -0.5}, "flat": {0.5: -3.0, 1.0: -2.0, 2.0: -1.0}}
-    done = [cells.Done(depends={}, values={"nats": values[one.of][one.point["control.std"]]}) for one in places]
-    lines = report.design(folder.study, cells.State(places, dict(zip(places, done, strict=True)), {}))
+    done = [cells.Done(values={"nats": values[one.of][one.point["control.std"]]}) for one in places]
+    lines = report.design(folder.study, cells.State(places, dict(zip(places, done, strict=True))))
     (line,) = (line for line in lines if "no trials" in line)
     assert line == "options: 1 of 3 points gave the results of another one: no trials."
 
@@ -453,6 +581,26 @@ def test_cells_of_an_earlier_table_are_not_done(made, done, tmp_path):
     table.write_text(re.sub(r"(?m)^.*,flat,.*,1,nats,.*\n", "", table.read_text()))
     folder = made(kept=[{"table": "table.csv"}])
     assert {(cell.method, cell.seed) for cell in folder.state().missing} == {("flat", 1)}
+
+
+def test_a_fixed_sequence_goes_on_beside_equivalence(made, tmp_path):
+    """Differences of 3, 4, 5 and 4 with four demonstrations; with six of 0 and 1."""
+    first, last = ({**STUDY["contrasts"][0], "demonstrations": number} for number in (4, 6))
+    turned = {**first, "contrast": "flat - options"}
+    contrasts = [{**first, "kind": "equivalence", "margin": 0.5}, first, last, turned]
+    kept, seeds = [{"table": "table.csv"}], {"test": {"count": 4}}
+    made(contrasts=contrasts, correction="fixed_sequence", kept=kept, seeds=seeds)
+    values = {("options", 4): [3, 4, 5, 4], ("options", 6): [0, 1, 0, 1], ("flat", 4): [0] * 4, ("flat", 6): [0] * 4}
+    rows = [("study", "", method, str(count), str(seed), "nats", value)
+            for (method, count), own in values.items() for seed, value in enumerate(own)]  # fmt: skip
+    pd.DataFrame(rows, columns=tidy.COLUMNS).to_csv(tmp_path / "table.csv", index=False)
+    for asked, said in (
+        ("options - flat; nats; 4; show=equivalence", "does not hold"),
+        ("options - flat; nats; 4; show=verdict", "holds"),
+        ("options - flat; nats; 6; show=verdict", "inconclusive"),
+        ("flat - options; nats; 4; show=verdict", "not reached"),
+    ):
+        assert f"-->{said}<!--" in render(f"<!-- study study: {asked} --><!-- / -->", tmp_path)
 
 
 def test_pages_quote_the_tables_by_the_names_of_the_study(made, done, tmp_path):
@@ -525,6 +673,13 @@ def test_a_table_is_quoted_as_by_hand(tmp_path, quotation, said):
     )
 
 
+def test_a_table_is_quoted_from_another_folder(tmp_path):
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "docs" / "hand.csv").write_text(HAND)
+    for place, name in ((tmp_path, "docs/hand"), (tmp_path / "docs", "../docs/hand")):
+        assert "-->−2.50<!--" in render(f"<!-- table {name}: summary; nats --><!-- / -->", ROOT, place)
+
+
 def test_a_page_has_the_bold_words_that_holm_leaves(tmp_path):
     """Two differences of one family at a one-sided p of 0.018 are inconclusive together."""
     (tmp_path / "hand.csv").write_text(HAND)
@@ -553,7 +708,7 @@ def test_a_page_has_the_bold_words_that_holm_leaves(tmp_path):
 )
 def test_both_sides_of_a_verdict_have_holms_correction(values, said):
     family = [
-        (estimate(pd.Series({("", str(seed)): float(value) for seed, value in enumerate(own)})), 0.0)
+        estimate(pd.Series({("", str(seed)): float(value) for seed, value in enumerate(own)})).p_value(0.0)
         for own in values.values()
     ]
     assert [verdict for verdict, _ in report.verdicts(family)] == said

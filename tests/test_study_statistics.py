@@ -9,6 +9,8 @@ import pandas as pd
 import pytest
 from scipy import stats
 
+from ddco_pyro.study import report
+from ddco_pyro.study.declaration import ContrastSpec
 from ddco_pyro.study.table import COLUMNS, estimate, holm, values
 
 ROOT = Path(__file__).parents[1]
@@ -126,6 +128,74 @@ def test_holm_gives_what_hand_computation_gives():
     assert holm([0.5, 0.9]) == [1.0, 1.0]
     assert holm([float("nan"), 0.01]) == pytest.approx([1.0, 0.02])
     assert holm([]) == []
+
+
+@pytest.mark.parametrize(
+    ("p_values", "said"),
+    [
+        ([0.01, 0.02, 0.3, 0.001], ["holds", "holds", "inconclusive", "not reached"]),
+        ([0.02, 0.02, 0.02], ["holds"] * 3),  # Holm's first would be 0.06
+        ([0.99, 0.001], ["does not hold", "not reached"]),
+        ([0.001, 0.99, 0.001], ["holds", "does not hold", "not reached"]),
+        ([0.001, float("nan"), 0.001], ["holds", "not tested", "not reached"]),
+        ([], []),
+    ],
+)
+def test_a_fixed_sequence_ends_where_a_contrast_does_not_hold(p_values, said):
+    judged = report.verdicts(p_values, "fixed_sequence")
+    assert [verdict for verdict, _ in judged] == said
+    largest = [max(1.0 if np.isnan(p) else p for p in p_values[: n + 1]) for n in range(len(p_values))]
+    assert [p for _, p in judged] == largest
+
+
+@pytest.mark.parametrize(
+    ("p_values", "said"),
+    [
+        ([0.01, 0.9, 0.02, 0.001], ["holds", "inconclusive", "holds", "holds"]),  # the last waits for its twin, 2
+        ([0.01, 0.01, 0.3, 0.99], ["holds", "holds", "inconclusive", "does not hold"]),
+        ([0.4, 0.01, 0.01, 0.01], ["inconclusive", "holds", "not reached", "not reached"]),
+    ],
+)
+def test_equivalence_is_read_off_the_interval_of_its_twin(p_values, said):
+    """Claims 1 and 3 are the equivalence of 0 and of 2."""
+    assert [verdict for verdict, _ in report.verdicts(p_values, "fixed_sequence", {1: 0, 3: 2})] == said
+
+
+def test_a_fixed_sequence_errs_as_often_as_its_level_says():
+    """Of ten claims the first is right; another one holds in at most 2.5 % of the studies, without a correction."""
+    p_values = np.random.default_rng(6).random((2000, 10)) * [1e-3, *[1.0] * 9]
+    found = [[verdict for verdict, _ in report.verdicts(list(own), "fixed_sequence")] for own in p_values]
+    assert all(one[0] == "holds" for one in found)
+    assert np.mean(["holds" in one[1:] for one in found]) == pytest.approx(0.025, abs=0.01)
+
+
+def test_equivalence_is_an_interval_within_the_margin():
+    random, spec = np.random.default_rng(7), {"contrast": "a - b", "measure": "nats", "kind": "equivalence"}
+    told = set()
+    for scale in (0.02, 0.1, 0.3):
+        for _ in range(20):
+            units = random.normal(random.choice([0.0, 0.3]), scale, 7)
+            known = estimate(by_seed(push=units))
+            contrast = ContrastSpec(**spec, margin=0.15)
+            sides = (stats.ttest_1samp(units, bound, alternative=way).pvalue
+                     for bound, way in ((-0.15, "greater"), (0.15, "less")))  # fmt: skip
+            assert known.p_value(*contrast.bounds) == pytest.approx(max(sides))
+            low, high = stats.ttest_1samp(units, 0).confidence_interval(0.95)
+            within, beyond = -0.15 < low < high < 0.15, high < -0.15 or low > 0.15
+            ((verdict, _),) = report.verdicts([known.p_value(*contrast.bounds)])
+            assert verdict == ("holds" if within else "does not hold" if beyond else "inconclusive")
+            told.add(verdict)
+    assert len(told) == 3
+
+
+def test_siblings_are_one_unit():
+    """Door 0.5 and 2, by hand 1.25; window 4; push 1."""
+    own = by_seed(open=[0, 1], close=[1, 2, 3], window=[4], push=[1])
+    found = estimate(own, families={"open": "door", "close": "door"})
+    test = stats.ttest_1samp([1.25, 4, 1], 0.0, alternative="greater")
+    assert found.units == (1.25, 4, 1)
+    assert found.value == pytest.approx(6.25 / 3)
+    assert found.p_value(0.0) == pytest.approx(test.pvalue)
 
 
 def test_equal_units_have_the_interval_of_their_trials_or_none():

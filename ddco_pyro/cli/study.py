@@ -84,7 +84,9 @@ def study(
         counts[0 if cell in state.done else 1 if cell in state.failed else 2] += 1
     shown = [[part, method, str(count), *map(str, counts)] for (part, method, count), counts in rows.items()]
     console.show(Table(["part", "method", "demonstrations", "done", "failed", "missing"], shown, {0, 1}))
-    for reason, count in Counter(state.failed.values()).items() if action is Action.STATUS else ():
+    for reason, count in (
+        Counter(one.failed for one in state.failed.values()).items() if action is Action.STATUS else ()
+    ):
         console.say(f"failed, {count} cells: {reason}")
     done, total = len(state.done), len(state.cells)
     again = ["--out", folder.path] if out else []

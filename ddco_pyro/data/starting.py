@@ -20,6 +20,8 @@ from ddco_pyro.errors import command
 from ddco_pyro.spec import parse_spec
 from ddco_pyro.spec.yaml import read_yaml
 
+TEMPLATE = Path(__file__).with_suffix(".yaml.j2")
+
 MANY = 100
 """From so many demonstrations on a tenth is held out, of fewer a fifth."""
 
@@ -160,7 +162,6 @@ def _filled(
     decided: Mapping[str, Any],
 ) -> str:
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("ddco_pyro.data", "."),
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -173,7 +174,7 @@ def _filled(
     batch = _batch(np.array(lengths), recipe)
     em = bool(vectors) and not images and not inspection.versions
     unusable_labels = [(field.key, why) for field in inspection.labels if (why := _unusable(inspection, field))]
-    return environment.get_template("starting.yaml.j2").render(
+    return environment.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
         path=path,
         lengths=lengths,
         excluded=inspection.excluded,

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import islice
-from pathlib import Path
+from itertools import count, islice
 
 import numpy as np
 import torch
@@ -16,8 +15,6 @@ from ddco_pyro.model.networks import Inputs, InputShape
 from ddco_pyro.model.networks.conv import SHARPNESS, Conv
 from ddco_pyro.model.seeding import seeded
 from ddco_pyro.spec import ConvolutionLayer
-from ddco_pyro.training.checkpoint import Progress, Restart, copy_of
-from ddco_pyro.training.optimizers import optimizer_state, restore_optimizer
 
 _FIRST = ConvolutionLayer(filters=16, kernel=5, stride=2, padding=2)
 BUILT_IN = {"random_conv": 64, "autoencoder": 32}
@@ -32,8 +29,8 @@ HIDDEN = 128
 UPDATES = 2000
 """Gradient steps, each on :data:`ddco_pyro.encoding.pictures.AT_ONCE` pictures."""
 
-KEPT_EVERY = 50
-"""Gradient steps between two checkpoints."""
+SHOWN_EVERY = 50
+"""Gradient steps between two events."""
 
 LEARNING_RATE = 3e-3
 
@@ -100,46 +97,27 @@ class Autoencoder(nn.Module):
         return nn.functional.mse_loss(self.decoder(self.encoder(pictures)), small.flatten(1))
 
 
-def train(
-    encoder: Convolutions, pictures: Pictures, seed: int, updates: int, checkpoint: Path, on_event: OnEvent
-) -> None:
-    """Train an encoder as the first half of an autoencoder, from the checkpoint on where there is one.
-
-    An interrupted training that is resumed ends with the same bits.
-
-    :raises Damaged: the checkpoint does not hold what was written.
-    """
+def train(encoder: Convolutions, pictures: Pictures, seed: int, updates: int, on_event: OnEvent) -> None:
+    """Train an encoder as the first half of an autoencoder; the same arguments give the same bits."""
     model = Autoencoder(encoder, pictures.shape, seed)
     optimizer = torch.optim.Adam(model.parameters(), lr=LEARNING_RATE)
-    done = 0
-    if checkpoint.exists():
-        before = Restart.read(checkpoint)
-        model.load_state_dict(before.states["model"])
-        restore_optimizer(optimizer, before.states["optimizer"])
-        done = before.progress.epoch
     on_event(TrainingBegan("the autoencoder", updates))
     errors: list[float] = []
-    for batch in islice(_batches(pictures, seed, done), updates - done):
+    for done, batch in enumerate(islice(_batches(pictures, seed), updates), 1):
         loss = model.loss(batch)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
         errors.append(loss.item())
-        done += 1
-        if done % KEPT_EVERY == 0 or done == updates:
-            states = {"model": copy_of(model), "optimizer": optimizer_state(optimizer)}
-            Restart(Progress(0, epoch=done), states).written(checkpoint)
+        if done % SHOWN_EVERY == 0 or done == updates:
             on_event(UpdatesDone(done, float(np.mean(errors))))
             errors.clear()
     on_event(TrainingEnded("the autoencoder"))
 
 
-def _batches(pictures: Pictures, seed: int, done: int) -> Iterator[Tensor]:
-    """Pictures of the gradient steps after the first ``done``, epoch after epoch without end."""
+def _batches(pictures: Pictures, seed: int) -> Iterator[Tensor]:
+    """Pictures of the gradient steps, epoch after epoch without end."""
     size = min(AT_ONCE, pictures.number)
-    each = pictures.number // size
-    epoch, skip = divmod(done, each)
-    while True:
-        frames = islice(pictures.at_random(seed, epoch), skip * size, None)
-        yield from (torch.from_numpy(np.stack(list(islice(frames, size)))) for _ in range(skip, each))
-        epoch, skip = epoch + 1, 0
+    for epoch in count():
+        frames = pictures.at_random(seed, epoch)
+        yield from (torch.from_numpy(np.stack([*islice(frames, size)])) for _ in range(pictures.number // size))

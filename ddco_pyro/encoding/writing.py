@@ -1,8 +1,8 @@
 """A file of demonstrations with features in place of pictures; an interrupted encoding can be resumed.
 
 While ``out.hdf5`` is made, its parts (:class:`~ddco_pyro.data.sources.robomimic.Parts`) hold the features of every
-demonstration before they are reduced, and the autoencoder's checkpoint stands beside them. Each picture goes through
-the encoder once. The principal components are computed from those features, and the file is written at the end.
+demonstration before they are reduced. Each picture goes through the encoder once. The principal components are
+computed from those features, and the file is written at the end.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -30,12 +30,11 @@ from ddco_pyro.data.sources.robomimic import (
     robomimic_file,
     write_recording,
 )
-from ddco_pyro.encoding.autoencoder import UPDATES, Convolutions, PictureNetwork, train
+from ddco_pyro.encoding.autoencoder import UPDATES, Convolutions, train
 from ddco_pyro.encoding.encoder import (
     NOISE,
     About,
     Encoder,
-    Projection,
     about_of,
     extractor,
     is_users,
@@ -56,13 +55,8 @@ SIZE = 64
 ROWS = 1024
 """Rows of features that are projected at once."""
 
-FEATURES, VERSIONS = "features", "versions"
-"""Of the pictures, and of shifted pictures."""
-
-_CHECKPOINT = "checkpoint.safetensors"
-
 Blocks = Callable[[str, str], Iterator[np.ndarray]]
-"""The blocks of a demonstration's :data:`FEATURES` or :data:`VERSIONS`."""
+"""The blocks of a demonstration under a key of :attr:`Encoding.keys`."""
 
 
 @dataclass(frozen=True)
@@ -103,9 +97,9 @@ class Encoding:
         return self.name or f"{self.observation}_features"
 
     @property
-    def keys(self) -> dict[str, str]:
-        """The new observations' keys, by what they hold: :data:`FEATURES` or :data:`VERSIONS`."""
-        return {FEATURES: self.key} | ({VERSIONS: f"{self.key}{MOVED}"} if self.moved else {})
+    def keys(self) -> dict[str, tuple[int, ...]]:
+        """The shapes between steps and features, by the new observations' keys."""
+        return {self.key: ()} | ({f"{self.key}{MOVED}": (self.moved,)} if self.moved else {})
 
 
 @dataclass(frozen=True)
@@ -145,7 +139,7 @@ def encode(
 
 
 class _Job:
-    """The encoding of one file; the encoder is written to ``beside``."""
+    """The encoding of one file; the encoder is written to ``beside``. Its ``identity`` decides the file's contents."""
 
     def __init__(
         self, source: Robomimic, path: Path, out: Path, encoding: Encoding, on_event: OnEvent, allow_code: bool
@@ -153,16 +147,35 @@ class _Job:
         self.source, self.out, self.encoding, self.on_event = source, out, encoding, on_event
         self.beside = encoder_folder(out)
         self.pictures = Pictures(source, encoding.observation)
-        for key in encoding.keys.values():
-            if key in source.recording(source.names[0]).observations:
-                raise DemonstrationsError(f"obs/{key} is there already; choose another name with --as")
+        for key in encoding.keys.keys() & source.recording(source.names[0]).observations.keys():
+            raise DemonstrationsError(f"obs/{key} is there already; choose another name with --as")
         if encoding.shift >= min(self.pictures.shape[:2]):
             height, width, _ = self.pictures.shape
             raise BadInput(f"--shift {encoding.shift}: would move pictures of {height} × {width} pixels out of sight")
         self.extractor = extractor(encoding.encoder, self.pictures, encoding.seed, allow_code)
-        self.about = _about(encoding, self.pictures, self.extractor)
-        self.identity = _identity(path, encoding, self.extractor)
+        self.about = self._about()
+        stat, code = path.stat(), hashlib.sha256(self.extractor.code).hexdigest()
+        file = {"file": [str(path.resolve()), stat.st_size, stat.st_mtime_ns], "code": code}
+        self.identity = json.dumps(file | asdict(encoding))
         self.digest = hashlib.sha256(self.identity.encode()).hexdigest()
+
+    def _about(self) -> About:
+        """The facts of the encoder, before it is known how many components are noise.
+
+        :raises BadInput: there are fewer features, or training pictures, than the size that is asked for.
+        """
+        own, pictures, source = self.encoding, self.pictures, self.extractor
+        number = source.encode(next(pictures.of(pictures.training[0]))).shape[1]
+        reader = source.about if isinstance(source, FittedReader) else None
+        size = own.size or (number if reader else min(number, SIZE, pictures.number))
+        if size > number:
+            raise BadInput(f"--size {size}: encoder {own.encoder!r} gives {number} features; take at most as many")
+        if size > pictures.number:
+            raise BadInput(f"--size {size}: there are {pictures.number} training pictures; take at most as many")
+        return About(
+            encoder=own.encoder, reader=reader, observation=own.observation, picture=pictures.shape,
+            features=number, size=size, seed=own.seed,
+        )  # fmt: skip
 
     def run(self) -> Encoded:
         """Encode every demonstration, reduce the features, and write both results, unless they are there."""
@@ -181,95 +194,56 @@ class _Job:
         """Encode what is not encoded yet, and write the encoder and the file."""
         if self.beside.exists() and not parts.done:
             raise BadInput(f"{self.beside}: is there already; remove it, or choose another --out")
-        encoding, about = self.encoding, self.about
-        if encoding.encoder == "autoencoder" and isinstance(self.extractor, Convolutions):
-            checkpoint = parts.folder / _CHECKPOINT
-            train(self.extractor, self.pictures, encoding.seed, encoding.updates, checkpoint, self.on_event)
+        if isinstance(self.extractor, Convolutions) and self.encoding.encoder == "autoencoder":
+            train(self.extractor, self.pictures, self.encoding.seed, self.encoding.updates, self.on_event)
         for name in self.source.names[len(parts.done) :]:
-            parts.add(self._recording(name, about.features, self._features, {kind: kind for kind in encoding.keys}))
+            whole = self.source.recording(name)
+            parts.add(Recording(name, self._columns(whole, self.about.features, self._features), whole.actions))
             self.on_event(DemonstrationsDone(len(parts.done), len(self.source.names)))
-        projection = self._projection(parts)
-        if projection is not None:
-            facts = {"explained": projection.explained, "size": len(projection.components)}
-            about = about.model_copy(update=facts)
-        encoder = Encoder(about, self.extractor, projection)
+
+        def stored(name: str, key: str) -> Iterator[np.ndarray]:
+            with parts.column(name, f"obs/{key}") as column:
+                yield from batches(column, max(1, ROWS // math.prod(column.shape[1:-1])))
+
+        encoder = self._reducing(stored)
         encoder.write(self.beside)
         attributes = {**self.source.attributes, MADE: self.digest}
         with one_thread(), robomimic_file(self.out, attributes, self.source.masks) as data:
             for name in self.source.names:
-                encoded = self._recording(name, about.size, partial(self._reduced, encoder, parts), encoding.keys)
                 whole = self.source.recording(name)
                 others = {key: column for key, column in whole.observations.items() if key != self.pictures.key}
-                write_recording(data, replace(whole, observations=others | dict(encoded.observations)))
+                reduced = self._columns(whole, encoder.about.size, lambda *at: map(encoder.reduced, stored(*at)))
+                write_recording(data, replace(whole, observations=others | reduced))
 
-    def _recording(self, name: str, features: int, of: Blocks, keys: Mapping[str, str]) -> Recording:
-        """A demonstration with features [T, F], or [T, moved, F] of shifted pictures, by key.
-
-        :param of: their blocks.
-        :param keys: by what they hold.
-        """
-        actions = self.source.recording(name).actions
-        moved = {FEATURES: (), VERSIONS: (self.encoding.moved,)}
-        columns = {
-            key: Column((actions.shape[0], *moved[kind], features), np.dtype(np.float32), partial(of, name, kind))
-            for kind, key in keys.items()
+    def _columns(self, whole: Recording, features: int, of: Blocks) -> dict[str, Column]:
+        """Features [T, F] of a demonstration, and [T, moved, F] of shifted pictures, by key."""
+        return {
+            key: Column((whole.actions.shape[0], *moved, features), np.dtype(np.float32), partial(of, whole.name, key))
+            for key, moved in self.encoding.keys.items()
         }
-        return Recording(name, columns, actions)
 
-    def _features(self, name: str, kind: str) -> Iterator[np.ndarray]:
+    def _features(self, name: str, key: str) -> Iterator[np.ndarray]:
         """Features of a demonstration's pictures, blocks [M, F], or of pictures shifted at random, [M, moved, F]."""
-        most = self.encoding.shift
+        most, moved = self.encoding.shift, self.encoding.keys[key]
         random = np.random.default_rng((self.encoding.seed, self.source.names.index(name)))
-        moves = random.integers(-most, most + 1, (self.encoding.moved, 2)).tolist()
+        moves = random.integers(-most, most + 1, (*moved, 2)).tolist() if moved else []
         for block in self.pictures.of(name):
-            each = [block] if kind == FEATURES else [shifted(block, *by) for by in moves]
+            each = [shifted(block, *by) for by in moves] or [block]
             values = [self.extractor.encode(one).astype(np.float32) for one in each]
             if numbers := {own.shape[1] for own in values} - {self.about.features}:
                 raise BadInput(
                     f"encoder {self.about.encoder!r} gives {numbers.pop()} features in {name}, and "
                     f"{self.about.features} in {self.pictures.training[0]}; it has to give as many of every picture"
                 )
-            yield values[0] if kind == FEATURES else np.stack(values, axis=1)
+            yield np.stack(values, axis=1) if moves else values[0]
 
-    def _reduced(self, encoder: Encoder, parts: Parts, name: str, kind: str) -> Iterator[np.ndarray]:
-        return map(encoder.reduced, self._unreduced(parts, name, kind))
-
-    def _unreduced(self, parts: Parts, name: str, kind: str = FEATURES) -> Iterator[np.ndarray]:
-        with parts.column(name, f"obs/{kind}") as column:
-            yield from batches(column, max(1, ROWS // math.prod(column.shape[1:-1])))
-
-    def _projection(self, parts: Parts) -> Projection | None:
-        if self.encoding.size is None and self.about.size == self.about.features:
-            return None
+    def _reducing(self, stored: Blocks) -> Encoder:
+        """The encoder, with the projection of the training demonstrations' features where one is wanted."""
+        size, about = self.encoding.size, self.about
+        if size is None and about.size == about.features:
+            return Encoder(about, self.extractor, None)
         with one_thread():
-            rows = (block for name in self.pictures.training for block in self._unreduced(parts, name))
-            return principal_components(rows, self.about.size, NOISE if self.encoding.size is None else 0.0)
-
-
-def _about(encoding: Encoding, pictures: Pictures, source: PictureNetwork) -> About:
-    """The facts of the encoder.
-
-    :raises BadInput: there are fewer features, or training pictures, than the size that is asked for.
-    """
-    number = source.encode(next(pictures.of(pictures.training[0]))).shape[1]
-    reader = source.about if isinstance(source, FittedReader) else None
-    size = encoding.size or (number if reader else min(number, SIZE, pictures.number))
-    if size > number:
-        raise BadInput(f"--size {size}: encoder {encoding.encoder!r} gives {number} features; take at most as many")
-    if size > pictures.number:
-        raise BadInput(f"--size {size}: there are {pictures.number} training pictures; take at most as many")
-    return About(
-        encoder=encoding.encoder,
-        reader=reader,
-        observation=encoding.observation,
-        picture=pictures.shape,
-        features=number,
-        size=size,
-        seed=encoding.seed,
-    )
-
-
-def _identity(path: Path, encoding: Encoding, source: PictureNetwork) -> str:
-    """Everything that decides the contents of the file."""
-    stat, code = path.stat(), hashlib.sha256(source.code).hexdigest()
-    return json.dumps({"file": [str(path.resolve()), stat.st_size, stat.st_mtime_ns], "code": code} | asdict(encoding))
+            rows = (block for name in self.pictures.training for block in stored(name, self.encoding.key))
+            projection = principal_components(rows, about.size, NOISE if size is None else 0.0)
+        facts = {"explained": projection.explained, "size": len(projection.components)}
+        return Encoder(about.model_copy(update=facts), self.extractor, projection)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,15 +22,19 @@ other repetitions, and is empty where there is one value."""
 CELL = ["task", "method", "demonstrations", "seed"]
 """The columns that name a cell."""
 
+ORIGIN = ["key", "code"]
+"""Further columns of a study's table: the digest of what the declaration says of a cell, and the commit of the code."""
+
 
 def read_tidy(path: Path) -> pd.DataFrame:
-    """A tidy table with :data:`COLUMNS`.
+    """A tidy table with :data:`COLUMNS`, and with :data:`ORIGIN` where it has them.
 
     :raises BadInput: the file cannot be read.
     """
     remedy = "write it with: ddco-pyro study report"
     try:
-        return pd.read_csv(path, dtype=str, keep_default_na=False)[COLUMNS].astype({"value": float})
+        table = pd.read_csv(path, dtype=str, keep_default_na=False).astype({"value": float})
+        return table[[*COLUMNS, *(column for column in ORIGIN if column in table)]]
     except OSError as error:
         raise BadInput(f"{path}: cannot be read: {error.strerror}; {remedy}") from error
     except (KeyError, ValueError) as error:
@@ -43,16 +47,17 @@ def earlier(study: Study) -> pd.DataFrame:
     Rows of other cells, and of several seeds together, are left out. The first of several values decides.
     """
     seeds = [str(seed) for block in study.declared.ranges("seeds").values() for seed in block]
-    tables = [pd.DataFrame(columns=COLUMNS)]
+    tables = [pd.DataFrame(columns=[*COLUMNS, *ORIGIN])]
     for kept in study.declared.kept:
         table = read_tidy(study.path.parent / kept.table)
-        table = table[table.seed.isin(seeds) & table.study.isin([kept.study] if kept.study else table.study)]
-        table = table[table.method.isin(kept.methods.values() if kept.methods else table.method)]
+        of = {"seed": seeds, "study": kept.study and [kept.study], "method": [*kept.methods.values()]}
+        table = table[np.all([table[column].isin(own or table[column]) for column, own in of.items()], axis=0)]
         names = {"task": kept.tasks, "method": kept.methods, "measure": kept.measures}
         names_here = {column: {there: here for here, there in own.items()} for column, own in names.items()}
         table = table.replace(names_here).assign(study=study.name)
         tables.append(table[table.task.isin(study.tasks)])
-    return pd.concat(tables).drop_duplicates([*CELL, "measure"]).astype({"value": float})
+    whole = pd.concat(tables).drop_duplicates([*CELL, "measure"]).astype({"value": float})
+    return whole.fillna(dict.fromkeys(ORIGIN, ""))
 
 
 def values(
@@ -62,8 +67,7 @@ def values(
 
     :param demonstrations: of a method; a second number is that of ``theirs``.
     """
-    table = table[table.measure == measure]
-    table = table if task is None else table[table.task == task]
+    table = table[(table.measure == measure) & (table.task.eq(task) if task is not None else True)]
 
     def of(method: str, count: str | int) -> pd.Series:
         rows = table[(table.method == method.strip()) & (table.demonstrations == str(count))]
@@ -77,8 +81,6 @@ def values(
     return found[(seeds != "") | (seeds == "").all()]  # a row without seed is the summary of the others
 
 
-# --- estimates --------------------------------------------------------------------------------------------------------
-
 LEVEL = (1 - CONFIDENCE) / 2
 """One-sided level of the tests, which corresponds to two-sided 95 % intervals."""
 
@@ -89,7 +91,7 @@ class Estimate:
 
     :param error: the standard error; NaN, as the interval is, where the units have no spread or there is one.
     :param interval: the 95 % t interval.
-    :param units: the means of the tasks, or the values of the seeds of a single task.
+    :param units: the means of the tasks or of their families, or the values of the seeds of a single one.
     """
 
     value: float
@@ -106,17 +108,21 @@ class Estimate:
         ends = quantile_test(self.units, q=middle, p=0.5).confidence_interval(CONFIDENCE)
         return middle, (float(ends.low), float(ends.high))
 
-    def p_value(self, bound: float) -> float:
-        """The one-sided p-value of the t test of "the mean is at most ``bound``"; NaN without a standard error.
+    def p_value(self, low: float, high: float = math.inf) -> float:
+        """The larger p-value of two one-sided t tests, of "the mean is at most ``low``" and of "at least ``high``".
 
-        Superiority by a margin has the bound +margin, non-inferiority −margin.
+        NaN without a standard error. One minus it is the p-value of the contrary claim.
         """
         from scipy.stats import t
 
-        return float(t.sf((self.value - bound) / self.error, len(self.units) - 1))
+        freedom = len(self.units) - 1
+        below, above = t.sf((self.value - low) / self.error, freedom), t.cdf((self.value - high) / self.error, freedom)
+        return float(max(below, above))
 
 
-def estimate(values: pd.Series, trials: int = 0, lowest: float = -1.0) -> Estimate:
+def estimate(
+    values: pd.Series, trials: int = 0, lowest: float = -1.0, families: Mapping[str, str] | None = None
+) -> Estimate:
     """The mean and its t interval.
 
     >>> found = estimate(pd.Series({("push", 0): 1.0, ("push", 1): 2.0, ("push", 2): 3.0}))
@@ -127,8 +133,11 @@ def estimate(values: pd.Series, trials: int = 0, lowest: float = -1.0) -> Estima
     :param trials: of each fit, where the values are rates or their differences. Equal units have Wilson's interval of
         all trials, a difference that of as many trials with different outcomes.
     :param lowest: the least possible value of a rate: 0, or -1 of a difference.
+    :param families: the name of the family of a task, whose mean is one unit; tasks that are left out are units.
     """
-    means = np.array([of_task.to_numpy().mean() for _, of_task in values.groupby(level=0, sort=False)])
+    of_task = {task: own.to_numpy().mean() for task, own in values.groupby(level=0, sort=False)}
+    related = families or {}
+    means = pd.Series(of_task).groupby(lambda task: related.get(task, task), sort=False).mean().to_numpy()
     units = means if len(means) > 1 else values.to_numpy()
     value, error, interval = float(means.mean()), math.nan, (math.nan, math.nan)
     if len(units) > 1 and not np.allclose(units, units[0], rtol=1e-9, atol=1e-12):
@@ -143,7 +152,7 @@ def estimate(values: pd.Series, trials: int = 0, lowest: float = -1.0) -> Estima
     return Estimate(value, error, interval, tuple(map(float, units)))
 
 
-def holm(p_values: Sequence[float]) -> list[float]:
+def holm(p_values: Sequence[float] | np.ndarray) -> list[float]:
     """Holm's adjusted p-values, in the given order; a NaN counts as 1.
 
     >>> [round(p, 6) for p in holm([0.01, 0.04, 0.03])]
