@@ -16,7 +16,9 @@ Observation = Mapping[str, np.ndarray]
 
 
 class Environment(Protocol):
-    """An episode's world."""
+    """An episode's world; ``outcome`` is what else is measured of an episode, by name."""
+
+    outcome: Mapping[str, float]
 
     def reset(self, seed: int) -> Observation:
         """Begin the episode of this seed."""
@@ -116,7 +118,7 @@ def play(controller: Any, environment: Environment, seed: int) -> dict[str, Any]
     while not (success or ended):
         observation, success, ended = environment.step(controller.act(observation))
         steps += 1
-    return {"success": success, "steps": steps}
+    return {"success": success, "steps": steps, **environment.outcome}
 
 
 def controls(controller: Any, seen: Iterable[Observation], seed: int) -> np.ndarray:

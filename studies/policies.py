@@ -56,7 +56,7 @@ class Settings:
     executed: int = 1
     history: int = 1
     power: int = 2
-    steps: int = 3000
+    steps: int = 2000
     batch: int = 128
     rate: float = 1e-3
     decay: float = 1e-4
