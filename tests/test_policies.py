@@ -5,11 +5,14 @@ from __future__ import annotations
 import arena_playing
 import numpy as np
 import policies
+import pusht
 import pytest
 import torch
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.errors import BadInput
+from ddco_pyro.spec import parse_spec
+from ddco_pyro.study.cells import Cell, Job
 
 BRIEF = {"steps": 400, "hidden": [32, 32], "rate": 5e-3}
 
@@ -121,11 +124,6 @@ def test_held_out_demonstrations_have_no_part(curved):
     assert np.array_equal(acted(part, curved[5].observations), acted(alone, curved[5].observations))
 
 
-def test_a_setting_that_there_is_not_is_named():
-    with pytest.raises(BadInput, match=r"no setting 'chunck' \(did you mean 'chunk'"):
-        policies.KINDS["bc"].given({"chunck": 3})
-
-
 class Told:
     """A controller of chunks of three: at time t it gives 10 t, 10 t + 1 and 10 t + 2 for three steps."""
 
@@ -152,3 +150,43 @@ def test_a_part_of_a_chunk_is_executed_before_the_next_one():
     for _ in range(2):
         chunks.reset(0)
         assert [float(chunks.act({})[0]) for _ in range(5)] == [0, 1, 20, 21, 40]
+
+
+class Here:
+    """A simulator in this process: an episode sees the first demonstration and misses its controls by ``error``."""
+
+    def __init__(self, demo, folder):
+        self.demo, self.folder = demo, folder
+
+    def played(self, task, methods, first, episodes):
+        methods["policy"].write(self.folder)
+        errors = [
+            np.abs(acted(arena_playing.exported(self.folder), self.demo.observations, seed) - self.demo.actions).max()
+            for seed in range(first, first + episodes)
+        ]
+        return {"episodes": {"policy": [{"error": error, "seed": first + n} for n, error in enumerate(errors)]}}
+
+
+def test_a_world_trains_with_the_settings_of_a_cell_and_plays_what_it_wrote(tmp_path):
+    """Linear controls, which linear options with chunks as their control follow, as chunks of a perceptron do."""
+    rng = np.random.default_rng(0)
+    places = (np.cumsum(rng.normal(size=(20, 1)), 0) for _ in range(6))
+    demos = demonstrations(*(({"x": x}, x * [[1.0, -2.0]]) for x in places))
+    spec = parse_spec({
+        "demonstrations": {"path": "none.hdf5"},
+        "observations": ["x"],
+        "control": {"kind": "gaussian", "std": 0.1},
+        "hierarchy": {"levels": [{"count": 2, "policy": {"network": "linear"}}], "meta_policy": {"network": "linear"}},
+        "training": {"epochs": 60, "optimizer": {"name": "em"}},
+    })  # fmt: skip
+    world, cell = pusht.PushT(Here(demos[0], tmp_path)), Cell("test", "PushT", "", 6, 0)
+
+    def measured(method, **settings):
+        return world.methods[method](Job(cell, spec, demos, range(5, 8), tmp_path / method, settings))
+
+    exact = measured("chunked", chunk=2, executed=1, **{"hierarchy.levels.0.count": 1})
+    assert exact["seed"] == 6
+    assert exact["error"] < 0.2 < 10 < np.abs(demos[0].actions).max()
+    assert measured("chunks", **BRIEF, chunk=2, executed=1)["error"] < 1
+    with pytest.raises(BadInput, match="no setting 'chunck'"):
+        measured("chunks", chunck=2)
