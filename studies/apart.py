@@ -12,19 +12,22 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import h5py
 import numpy as np
+from policies import KINDS, Settings, fit
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import only_one, write_text
 from ddco_pyro.errors import BadInput, Failed
 from ddco_pyro.exporting import write_numpy
 from ddco_pyro.fitting.fitted import Fit
+from ddco_pyro.study.cells import Job
 
 HERE = Path(__file__).parent
 INSTALLED = ".made"
@@ -36,6 +39,13 @@ BAD_INPUT = 2
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 HELD_OUT = 20
 """The first demonstrations of a file are held out, whatever the others are used for."""
+
+
+class Written(Protocol):
+    """What an environment with numpy alone can play, beside a fit."""
+
+    def write(self, folder: Path) -> None:
+        """Write it for :func:`arena_playing.exported`."""
 
 
 @dataclass(frozen=True)
@@ -76,16 +86,12 @@ class Apart:
         """Record demonstrations of a task into a file, with options as :meth:`collected`."""
         run(self.made(), HERE / self.script, "collect", task, path, *_words(options))
 
-    def played(self, task: str, methods: dict[str, Fit], chunk: int = 1, **options: Any) -> dict[str, Any]:
-        """What the script's command ``play`` writes about exported methods.
-
-        :param chunk: steps that a control of every method has.
-        """
+    def played(self, task: str, methods: Mapping[str, Fit | Written], **options: Any) -> dict[str, Any]:
+        """What the script's command ``play`` writes about exported methods."""
         with tempfile.TemporaryDirectory() as folder:
             for name, one in methods.items():
                 (Path(folder) / name).mkdir()
-                write_numpy(one, Path(folder) / name)
-                (Path(folder) / name / "chunk.json").write_text(json.dumps(chunk))
+                write_numpy(one, Path(folder) / name) if isinstance(one, Fit) else one.write(Path(folder) / name)
             out, named = Path(folder) / "played.json", [f"{name}={folder}/{name}" for name in methods]
             run(self.made(), HERE / self.script, "play", task, out, *named, *_words(options))
             return dict(json.loads(out.read_text()))
@@ -103,6 +109,29 @@ class Apart:
             for name, one in methods.items()
         }
         return played
+
+
+class World:
+    """A simulator apart as the world of a study. Its own methods are the policies of ``policies.py``."""
+
+    def __init__(self, simulator: Apart) -> None:
+        self.simulator = simulator
+        self.methods = {name: partial(self._policy, settings) for name, settings in KINDS.items()}
+
+    def play(self, task: str, fitted: Fit | Written, starts: range, folder: Path) -> Sequence[Mapping[str, float]]:
+        """Episodes of the exported policy: success, steps, and what else the simulator measures."""
+        played = self.simulator.played(task, {"policy": fitted}, first=starts.start, episodes=len(starts))
+        return [{name: float(value) for name, value in one.items()} for one in played["episodes"]["policy"]]
+
+    def _policy(self, settings: Settings, job: Job) -> dict[str, float]:
+        """Train a policy and let it act; the cell may have other settings."""
+        policy = fit(job.demos, settings.given(job.settings), job.cell.seed, job.spec.observed)
+        return means(self.play(job.cell.task, policy, job.starts, job.folder))
+
+
+def means(episodes: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """The mean of each measure."""
+    return {name: float(np.mean([episode[name] for episode in episodes])) for name in episodes[0]}
 
 
 def _words(options: Mapping[str, Any]) -> list[str]:

@@ -63,6 +63,7 @@ class Sawyer:
     def __init__(self, task: str, **drawing: Any) -> None:
         self._make = ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE[f"{task}-goal-observable"]
         self._drawing = drawing
+        self.outcome: dict[str, float] = {}
         self.world: Any = None
         self.seen = np.zeros(39)
 

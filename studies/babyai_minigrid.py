@@ -47,6 +47,7 @@ class Level:
     def __init__(self, name: str) -> None:
         self._made = gymnasium.make(f"BabyAI-{name}-v0", max_episode_steps=LIMIT)
         self.world: Any = self._made.unwrapped
+        self.outcome: dict[str, float] = {}
 
     def reset(self, seed: int) -> Observation:
         """The mission of this seed."""

@@ -29,7 +29,7 @@ class World:
 
     def __init__(self, goal):
         self.goal = goal
-        self.received = []
+        self.received, self.outcome = [], {}
 
     def reset(self, seed):
         self.state, self.time, self.received = np.random.default_rng(seed).normal(size=3), 0, []
@@ -39,6 +39,7 @@ class World:
         self.received.append(control)
         self.state = self.state + np.array([0.1, *0.2 * control])
         self.time += 1
+        self.outcome = {"time": self.time}
         return {"state": self.state}, bool(self.state[0] > self.goal), self.time == 30
 
 
@@ -72,7 +73,7 @@ def test_an_exported_controller_plays_as_its_fit_does(fitted, runner, goal, succ
             expected.append(controller.act(observation))
             observation, done, ended = world.step(expected[-1])
         played = World(goal)
-        assert play(runner, played, seed) == {"success": success, "steps": len(expected)}
+        assert play(runner, played, seed) == {"success": success, "steps": len(expected), "time": len(expected)}
         assert (len(expected) < 30) == success
         np.testing.assert_allclose(played.received, expected, atol=1e-5)
         np.testing.assert_allclose(controls(runner, observed, seed), expected, atol=1e-5)

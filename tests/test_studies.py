@@ -13,12 +13,11 @@ import subprocess
 from importlib import metadata
 from pathlib import Path
 
-import arena_playing
 import labelling
 import numpy as np
 import pandas as pd
+import policies
 import pytest
-import sawyer
 import toy_task
 import yaml
 from killing import struck
@@ -149,7 +148,7 @@ def test_a_declaration_that_cannot_be_meant_is_refused_in_words(made, changes, s
 
 def test_the_examples_of_the_docstrings_run(done, monkeypatch):
     monkeypatch.chdir(done.study.path.parent)
-    for module in (declaration, tidy, sawyer):
+    for module in (declaration, tidy, policies):
         found = doctest.testmod(module)
         assert (found.failed, found.attempted > 0) == (0, True)
 
@@ -712,27 +711,6 @@ def test_both_sides_of_a_verdict_have_holms_correction(values, said):
         for own in values.values()
     ]
     assert [verdict for verdict, _ in report.verdicts(family)] == said
-
-
-class Told:
-    """A controller of chunks of three: at time t it gives 10 t, 10 t + 1 and 10 t + 2 for three steps."""
-
-    def reset(self, seed):
-        self.time = -1
-
-    def act(self, observation):
-        self.time += 1
-        return 10.0 * self.time + np.arange(3.0)
-
-
-def test_chunks_of_actions_are_averaged_over_what_was_given_for_a_step():
-    """By hand: step 2 was given 2 at time 0, 11 at time 1 and 20 at time 2; the oldest has the largest weight."""
-    chunks, weights = arena_playing.Chunks(Told(), 3), np.exp([0, -0.01, -0.02])
-    given = [[0.0], [1.0, 10.0], [2.0, 11.0, 20.0], [12.0, 21.0, 30.0]]
-    for _ in range(2):  # nothing is left of an episode
-        chunks.reset(0)
-        acted = [float(chunks.act({})[0]) for _ in given]
-        assert acted == pytest.approx([np.average(one, weights=weights[: len(one)]) for one in given])
 
 
 def edited(shown, command):
