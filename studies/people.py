@@ -36,7 +36,7 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.inspection import inspect
 from ddco_pyro.data.starting import starting_spec
 from ddco_pyro.errors import BadInput
-from ddco_pyro.evaluation.agreement import confusion, equal_lengths
+from ddco_pyro.evaluation.agreement import agreement, confusion, equal_lengths
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.model.batch import encode
@@ -69,14 +69,23 @@ class PeopleCell(Cell):
         """Of its files."""
         return f"{self.task}-{self.fold}-{self.labelled}"
 
+    @property
+    def further(self) -> dict[str, dict[str, Any]]:
+        """Further fits without labels: what they change in the spec."""
+        return {"options, β = 1": USUAL}
+
+    def demonstrations(self, settings: Settings) -> tuple[Path, Demonstrations]:
+        """The file, and its demonstrations with the masks of the fold and the true labels as :data:`LABELS`."""
+        path = Path(self.data) / f"{self.task}.hdf5"
+        return path, divided(labelled_demonstrations(path), self.fold)
+
     def depends(self, settings: Settings) -> dict[str, Any]:
         """What decides its results; the place of the data does not."""
         return {key: value for key, value in asdict(self).items() if key != "data"} | settings.kept()
 
     def results(self, settings: Settings, folder: Path) -> dict[str, Any]:
         """Fit, and compare with the gestures of the held-out demonstrations."""
-        path = Path(self.data) / f"{self.task}.hdf5"
-        demos = divided(labelled_demonstrations(path), self.fold)
+        path, demos = self.demonstrations(settings)
         train, valid = (demos.select(demos.masks[part]) for part in ("train", "valid"))
         facts = inspect(path, exclude=[name for name in Demonstrations.read(path).names if name not in train.names])
         plain = parse_spec(read_yaml(starting_spec(replace(facts, excluded=(), masks={}), path).text))
@@ -89,7 +98,8 @@ class PeopleCell(Cell):
             kinds = {"options": list(found.segment(valid)[0]), "windowed k-means": clusters(found, train, valid, count)}
             kinds |= {name: segment(key, train, valid, count, 0, spec.observations) for name, key in BASELINES.items()}
             kinds |= dict(zip(("AR-HMM", "AR-HMM, sticky"), autoregressive(train, valid, count, typical), strict=True))
-            kinds["options, β = 1"] = list(fit(with_overrides(spec, USUAL), demos).segment(valid)[0])
+            for name, changes in self.further.items():
+                kinds[name] = list(fit(with_overrides(spec, changes), demos).segment(valid)[0])
             asked = decide(plain, replace(train, masks={}), demos.frequency, typical)
             as_asked = starting_spec(replace(facts, excluded=(), masks={}), path, decided=asked).text
             longer = with_overrides(parse_spec(read_yaml(as_asked)), ALONE | {"seed": settings.values["seed"]})
@@ -296,17 +306,23 @@ def matched(kinds: Sequence[np.ndarray], truth: Sequence[np.ndarray]) -> list[np
 
 
 def scored(named: Sequence[np.ndarray], kinds: Sequence[np.ndarray], truth: Sequence[np.ndarray]) -> dict[str, float]:
-    """Over labelled steps: the share that is right, the mean edit score, the NMI, and segments in a demonstration."""
+    """Over labelled steps: the share that is right, the mean edit score, the NMI, segments in a demonstration, and F1
+    of segments and of boundaries.
+    """
     known = [label >= 0 for label in truth]
     right = np.concatenate([(own == label)[at] for own, label, at in zip(named, truth, known, strict=True)])
     edits = [edit_score(own[at], label[at]) for own, label, at in zip(named, truth, known, strict=True)]
     ours, theirs = (np.concatenate([own[at] for own, at in zip(part, known, strict=True)]) for part in (kinds, truth))
     segments = [1 + int((np.diff(own[at]) != 0).sum()) for own, at in zip(kinds, known, strict=True)]
+    found = agreement(named, truth)
+    assert found is not None  # there are labels
     return {
         "accuracy": float(right.mean()),
         "edit": float(np.mean(edits)),
         "NMI": float(normalized_mutual_info_score(theirs, ours)),
         "segments": float(np.mean(segments)),
+        "F1@50": found.matched_globally.f1_50,
+        "boundary F1": found.boundary_f1_3,
     }
 
 

@@ -1,0 +1,105 @@
+"""Phases and objects of OGBench's manipulation tasks: options, with and without labels, beside what else segments.
+
+    python studies/ogbench_segments.py [--tasks cube-single scene ...] [--levels phase object] [--labelled 0 1 3]
+        [--seeds 3] [--noise 0.0] [--jobs 2] [--summarize]
+
+The demonstrations are those of OGBench's own scripted oracles (Park and others, 2025), recorded in an environment of
+its own from ``ogbench_requirements.txt`` by ``ogbench_manipspace.py``, which says what labels are. ``phase`` is what an
+oracle does, ``object`` what it does it to. A training seed draws 40 of 100 demonstrations; the held-out twenty are the
+same. The spec is what ``ddco-pyro init`` writes for a file with the labels of one level. A cell that was done is not
+done again. Adds its numbers to ``docs/results/ogbench.csv``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import people
+import study
+from apart import HELD_OUT, Apart
+from people import LABELS, PeopleCell
+from study import Row, Settings, described
+
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.files import only_one
+
+RECORDED, TRAINED = 120, 40
+TASKS = ("cube-single", "scene", "cube-double", "puzzle-3x3")
+"""The last two are those on which nothing was chosen."""
+OBJECTS = TASKS[1:]
+"""Tasks with several objects."""
+DEFAULTS = Settings({"seed": 0, "noise": 0.0}, Path("runs/ogbench"))
+FLOOR = 0.3
+"""The least standard deviation of controls, in units of their spread, that is tried beside init's."""
+
+
+def simulator(settings: Settings) -> Apart:
+    """OGBench in its environment."""
+    return Apart("ogbench_manipspace.py", "ogbench_requirements.txt", settings.runs)
+
+
+@dataclass(frozen=True)
+class OGBenchCell(PeopleCell):
+    """A task, a training seed, how many demonstrations have labels, and which of the two levels is compared."""
+
+    level: str = "phase"
+
+    @property
+    def name(self) -> str:
+        """Of its files."""
+        return f"{self.task}-{self.level}-{self.fold}-{self.labelled}"
+
+    @property
+    def further(self) -> dict[str, dict[str, Any]]:
+        """A larger least deviation of the controls."""
+        return {"options, σ ≥ 0.3": {"control.std": {"learn": True, "floor": FLOOR, "per_option": True}}}
+
+    def demonstrations(self, settings: Settings) -> tuple[Path, Demonstrations]:
+        """A file with the labels of the level alone, and the demonstrations of the seed."""
+        noise = settings.values["noise"]
+        source = simulator(settings).collected(self.task, number=RECORDED, held_out=HELD_OUT, noise=noise)
+        path = settings.runs / "levels" / f"{self.task}-{self.level}-{noise}.hdf5"
+        with only_one(path.parent, wait=True):
+            if not path.exists():
+                Demonstrations.read(source, labels=[self.level]).write(path)
+        demos = Demonstrations.read(path, labels=[self.level])
+        train, valid = (list(demos.masks[part]) for part in ("train", "valid"))
+        drawn = np.random.default_rng(int(self.fold.removeprefix("seed-"))).permutation(len(train))[:TRAINED]
+        masks = {"train": tuple(train[place] for place in sorted(drawn)), "valid": tuple(valid)}
+        each = (replace(demo, labels={**demo.labels, LABELS: demo.labels[self.level]}) for demo in demos)
+        return path, replace(replace(demos, demonstrations=tuple(each)).select(sum(masks.values(), ())), masks=masks)
+
+    def rows(self, results: Mapping[str, Any]) -> Iterator[Row]:
+        """Agreement of each method, and what cross-validation chose."""
+        for row in super().rows(results):
+            yield row._replace(study=self.level)
+
+
+def cells(own: argparse.Namespace) -> list[OGBenchCell]:
+    """All of a seed before another."""
+    return [
+        OGBenchCell("", task, f"seed-{seed}", labelled, level)
+        for seed, labelled, level, task in itertools.product(range(own.seeds), own.labelled, own.levels, own.tasks)
+        if level == "phase" or task in OBJECTS
+    ]
+
+
+def main() -> None:
+    """Run the study."""
+    people.BASELINES = {"k-means": "kmeans", **people.BASELINES}
+    parser = described(__doc__)
+    parser.add_argument("--tasks", nargs="+", default=list(TASKS), choices=TASKS)
+    parser.add_argument("--levels", nargs="+", default=["phase", "object"], choices=["phase", "object"])
+    parser.add_argument("--labelled", nargs="+", default=["0", "1", "3"])
+    parser.add_argument("--seeds", type=int, default=3)
+    study.main("ogbench", parser, DEFAULTS, cells, lambda settings: simulator(settings).made())
+
+
+if __name__ == "__main__":
+    main()
