@@ -51,19 +51,16 @@ class UserEncoder(PictureNetwork):
     def encode(self, pictures: np.ndarray) -> np.ndarray:
         """Features of each picture, floats [N, F]."""
         try:
-            values = np.asarray(self._call(pictures))
+            values, count = np.asarray(self._call(pictures)), len(pictures)
         except Exception as error:
             raise BadInput(f"encoder {self.name!r} fails on pictures {[*pictures.shape]}: {_message(error)}") from error
-        problem = ""
         if values.dtype.kind != "f":
-            problem = f"{values.dtype}; it has to give floats"
-        elif values.ndim != 2 or len(values) != len(pictures) or not values.shape[1]:
-            count = len(pictures)
-            problem = f"shape {values.shape} for {count} pictures; it has to be ({count}, features)"
-        elif not np.isfinite(values.astype(np.float32)).all():
-            problem = "features that are NaN or infinite in float32"
-        if problem:
-            raise BadInput(f"encoder {self.name!r} gives {problem}")
+            raise BadInput(f"encoder {self.name!r} gives {values.dtype}; it has to give floats")
+        if values.ndim != 2 or len(values) != count or not values.shape[1]:
+            had = f"shape {values.shape} for {count} pictures; it has to be ({count}, features)"
+            raise BadInput(f"encoder {self.name!r} gives {had}")
+        if not np.isfinite(values.astype(np.float32)).all():
+            raise BadInput(f"encoder {self.name!r} gives features that are NaN or infinite in float32")
         return values
 
     def try_out(self, pictures: np.ndarray) -> None:
@@ -71,16 +68,14 @@ class UserEncoder(PictureNetwork):
 
         :raises BadInput: they differ, or the encoder fails.
         """
-        first = self.encode(pictures)
-        allowed, other = TOLERANCE * np.abs(first).max(), f"encoder {self.name!r} gives other features"
-        if not _close(first, self.encode(pictures), allowed):
-            raise BadInput(f"{other} when it is called again; switch off dropout and noise")
-        if not _close(first[:1], self.encode(pictures[:1]), allowed):
-            raise BadInput(f"{other} of a picture among others than alone; switch to evaluation mode")
-
-
-def _close(some: np.ndarray, other: np.ndarray, allowed: float) -> bool:
-    return some.shape == other.shape and bool((np.abs(some - other) <= allowed).all())
+        first, again, alone = self.encode(pictures), self.encode(pictures), self.encode(pictures[:1])
+        for values, other, when in (
+            (first, again, "when it is called again; switch off dropout and noise"),
+            (first[:1], alone, "of a picture among others than alone; switch to evaluation mode"),
+        ):
+            same = values.shape == other.shape and np.abs(values - other).max() <= TOLERANCE * np.abs(first).max()
+            if not same:
+                raise BadInput(f"encoder {self.name!r} gives other features {when}")
 
 
 def _message(error: Exception) -> str:
@@ -92,24 +87,24 @@ AGAIN = "write it again with ddco-pyro encode"
 
 
 class About(Model):
-    """The facts of an encoder, beside its weights."""
+    """The facts of an encoder, beside its weights.
+
+    :param encoder: ``random_conv``, ``autoencoder``, ``module:Class``, or the folder of a fit.
+    :param reader: the network that was taken out of a fit.
+    :param observation: the key of the pictures [H, W, C] it was made for.
+    :param features: their number before they are reduced to ``size``.
+    :param explained: the share of their variance in the training demonstrations that is kept.
+    """
 
     version: Literal[1] = 1
     encoder: str
-    """``random_conv``, ``autoencoder``, ``module:Class``, or the folder of a fit."""
     reader: Reader | None = None
-    """The network that was taken out of a fit."""
     observation: str
-    """The key of the pictures it was made for."""
     picture: Items[Count]
-    """[H, W, C]."""
     features: Count
-    """Features of a picture before they are reduced."""
     size: Count
-    """Features that come out."""
     seed: Seed
     explained: float = 1.0
-    """Share of the features' variance in the training demonstrations that is kept."""
 
 
 def is_users(name: str, allow_code: bool) -> bool:

@@ -62,71 +62,49 @@ class FittedReader(PictureNetwork):
 
 
 def from_folder(folder: str, key: str, picture: Sequence[int], allow_code: bool = False) -> FittedReader:
-    """:func:`from_fit` of the fit in a run folder.
-
-    :raises BadInput: there is no finished fit, or as :func:`from_fit`.
-    """
-    reader = from_fit(load(Path(folder), allow_code), key, picture)
-    reader.code = (Path(folder) / "model.safetensors").read_bytes()  # the folder may change later
-    return reader
-
-
-def from_fit(fit: Fit, key: str, picture: Sequence[int]) -> FittedReader:
-    """The convolutions in a fit that read the pictures under ``key`` and nothing else.
+    """The convolutions in the fit of a run folder that read the pictures under ``key`` and nothing else.
 
     They are the network of a flat policy or of the lowest options, a branch of it, or the network under its LSTM. The
     options have to share them.
 
     :param picture: [H, W, C] of the pictures that are to be encoded.
-    :raises BadInput: the fit observed other pictures, or stacks of several, or has no such network.
+    :raises BadInput: there is no finished fit; it observed other pictures, or stacks of several, or has no such
+        network.
     """
-    transform = _transform(fit, key, picture)
-    found = next(_readers(_lowest(fit), key), None)
-    if found is None:
-        raise BadInput(f"{fit.place}: its lowest policy has no convolutions that read {key} alone; make them a branch")
-    spec, network, _ = found
-    if network.copies != 1:
-        raise BadInput(
-            f"{fit.place}: each option has a network of its own for {key}; take a flat policy, or one with shared: true"
-        )
-    about = Reader(
-        network=spec.model_copy(update={"inputs": (key,), "shared": False}),
-        crop=transform.crop,
-        resize=transform.resize,
-        grey=transform.grey,
-    )
-    reader, weights = FittedReader(about, picture), network.state_dict()
-    reader.network.load_state_dict({name: weights[name] for name in reader.network.state_dict()})
-    return reader
-
-
-def _transform(fit: Fit, key: str, picture: Sequence[int]) -> Transform:
-    """How a fit crops and scales such pictures."""
-    encoder = fit.hierarchy.encoder
-    if key not in encoder.transforms:
+    fit = load(Path(folder), allow_code)
+    encoder, shape = fit.hierarchy.encoder, tuple(picture)
+    found, transform = next(_readers(_lowest(fit), key), None), encoder.transforms.get(key)
+    problem = ""
+    if transform is None:
         there = ", ".join(encoder.transforms) or "none"
-        raise BadInput(f"{fit.place}: this fit observes no pictures {key!r}; the pictures it observes: {there}")
-    if encoder.shapes[key] != tuple(picture):
-        raise BadInput(f"{fit.place}: this fit observed {key} of {encoder.shapes[key]}, and these are {tuple(picture)}")
-    transform = encoder.transforms[key]
-    if transform.frames > 1:
-        raise BadInput(f"{fit.place}: this fit sees {transform.frames} pictures at once; take one with frames: 1")
-    return transform
+        problem = f"this fit observes no pictures {key!r}; the pictures it observes: {there}"
+    elif encoder.shapes[key] != shape:
+        problem = f"this fit observed {key} of {encoder.shapes[key]}, and these are {shape}"
+    elif transform.frames > 1:
+        problem = f"this fit sees {transform.frames} pictures at once; take one with frames: 1"
+    elif found is None:
+        problem = f"its lowest policy has no convolutions that read {key} alone; make them a branch"
+    elif found[1].copies != 1:
+        problem = f"each option has a network of its own for {key}; take a flat policy, or one with shared: true"
+    if problem or transform is None or found is None:
+        raise BadInput(f"{fit.place}: {problem}")
+    network = found[0].model_copy(update={"inputs": (key,), "shared": False})
+    about = Reader(network=network, crop=transform.crop, resize=transform.resize, grey=transform.grey)
+    reader, weights = FittedReader(about, picture), found[1].state_dict()
+    reader.network.load_state_dict({name: weights[name] for name in reader.network.state_dict()})
+    reader.code = (Path(folder) / "model.safetensors").read_bytes()  # the folder may change later
+    return reader
 
 
 def _lowest(fit: Fit) -> Part:
     """The network of a flat policy; else the hierarchy's trunk, the lowest level's trunk, or that level's policy."""
     networks, encoder = fit.hierarchy.networks(), fit.hierarchy.encoder
-    baseline, hierarchy = fit.spec.baseline, fit.spec.hierarchy
-    spec: NetworkSpec
-    if baseline is not None:
-        spec, place = baseline.policy, "meta_policy"
-    else:
-        assert hierarchy is not None  # one of both is there
-        lowest = hierarchy.levels[0]
-        trunks = ("trunk", hierarchy.trunk), ("levels.0.trunk", lowest.trunk)
-        own = ("levels.0.policy", lowest.policy)
-        place, spec = next(((place, trunk) for place, trunk in trunks if trunk is not None), own)
+    whole, flat = fit.spec.hierarchy, fit.spec.baseline
+    places: dict[str, NetworkSpec | None] = {"meta_policy": flat.policy if flat else None}
+    if whole is not None and flat is None:
+        lowest = whole.levels[0]
+        places = {"trunk": whole.trunk, "levels.0.trunk": lowest.trunk, "levels.0.policy": lowest.policy}
+    place, spec = next((place, spec) for place, spec in places.items() if spec is not None)
     return spec, networks[place], spec.inputs or [*encoder.keys, *encoder.images]
 
 

@@ -25,45 +25,40 @@ BUFFER_BYTES = 16 * 2**20
 class Pictures:
     """The pictures [H, W, C] under one observation key of an open file.
 
+    ``training`` names the demonstrations to train with: ``mask/train``, else those not in ``mask/valid``.
+
     :param source: an open file of demonstrations.
     :param key: the observation.
     :raises DemonstrationsError: the observation is missing or no picture, or the demonstrations are refused or differ.
     """
 
     def __init__(self, source: Robomimic, key: str) -> None:
-        self._source, self.key, self.names = source, key, source.names
-        first = source.recording(self.names[0])
+        self._source, self.key = source, key
+        first, self._lengths = source.recording(source.names[0]), dict[str, int]()
         if key not in first.observations:
             known = [name for name, column in first.observations.items() if column.image]
             there = ", ".join(known) or "none"
             raise DemonstrationsError(f"there is no observation {key!r}{nearest(key, known)}; pictures are: {there}")
-        if not first.observations[key].image:
-            column = first.observations[key]
+        column = first.observations[key]
+        if not column.image:
             had = f"{column.dtype} {[*column.shape]}"
             raise DemonstrationsError(f"obs/{key} is {had}; pictures are uint8 [steps, height, width, channels]")
-        self._lengths: dict[str, int] = {}
-        for name in self.names:
+        for name in source.names:
             recording = source.recording(name)
             check(recording)
             check_alike(recording, first)
             if not recording.observations[key].image:
                 raise DemonstrationsError(f"{name}: obs/{key} is no picture, in {first.name} it is")
             self._lengths[name] = recording.actions.shape[0]
-        self.shape = first.observations[key].shape[1:]
-        if not math.prod(self.shape):
-            raise DemonstrationsError(f"obs/{key}: pictures of shape {self.shape} are empty")
-        self.training = self._training()
-
-    def _training(self) -> tuple[str, ...]:
-        """Names of the demonstrations to train with: of ``mask/train``, else those not in ``mask/valid``."""
-        masks = self._source.masks
-        for problem in problems_of_masks(masks, self.names):
+        self.shape, masks = column.shape[1:], source.masks
+        for problem in problems_of_masks(masks, source.names):
             raise DemonstrationsError(problem)
         held_out = set(masks.get("valid", ()))
-        names = masks["train"] if "train" in masks else tuple(name for name in self.names if name not in held_out)
-        if not names:
+        self.training = tuple(masks.get("train", (name for name in source.names if name not in held_out)))
+        if not self.training:
             raise DemonstrationsError("no demonstration is left to train with; change the masks")
-        return tuple(names)
+        if not math.prod(self.shape):
+            raise DemonstrationsError(f"obs/{key}: pictures of shape {self.shape} are empty")
 
     @property
     def number(self) -> int:
