@@ -10,7 +10,7 @@ from ddco_pyro.labelling.document import FREE
 from ddco_pyro.labelling.proposals import Shown
 
 USUAL = 0.1
-"""ε before anything is accepted."""
+"""ε before anything is accepted: demonstrations that the posterior is sure of count, too."""
 
 
 def first_wrong(first: Shown, accepted: Shown) -> tuple[float, int]:
