@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 import threading
 import time
 
@@ -16,7 +17,7 @@ PATIENCE = 20
 
 @pytest.fixture
 def background():
-    begun = Background(threading.RLock(), lambda: None)
+    begun = Background(threading.RLock(), lambda: None, "colorsys")
     yield begun
     begun.close()
 
@@ -29,7 +30,10 @@ def until(holds):
 
 
 def training(folder, epochs=10, stop=True):
-    """A call that says so many epochs of ten, waits to be ended unless it is told to stop, and gives its process."""
+    """A call that says so many epochs of ten, and waits to be ended unless it is told to stop.
+
+    Its process, and whether that is ready.
+    """
 
     def train(on_event):
         (folder / "pid").write_text(str(os.getpid()))
@@ -38,7 +42,7 @@ def training(folder, epochs=10, stop=True):
             on_event(EpochEnded(0, "options", epoch, 0.0, 0.0))
         while not stop:
             time.sleep(0.01)
-        return os.getpid()
+        return os.getpid(), "colorsys" in sys.modules
 
     return train
 
@@ -61,8 +65,9 @@ def test_work_says_how_far_it_is_and_ends_at_once_when_it_is_cancelled(backgroun
     background.begin("fitting", two, calls=2)
     background.begin("waits", lambda away: begun.append(away))
     until(lambda: background.progress == 0.75)  # one of two calls, and half of the other
-    (pid,) = found
+    ((pid, ready),) = found
     assert alive(pid)
+    assert not ready
     before = time.monotonic()
     background.cancel()
     assert time.monotonic() - before < 1
@@ -70,7 +75,8 @@ def test_work_says_how_far_it_is_and_ends_at_once_when_it_is_cancelled(backgroun
     until(lambda: not alive(pid))
     background.begin("fitting again", lambda away: found.append(away(training(tmp_path))))
     until(lambda: background.work is None)
-    assert found[1] != pid
+    assert found[1][0] != pid
+    assert found[1][1]
     assert (len(found), begun, background.error) == (2, [], "")
 
 

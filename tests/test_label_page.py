@@ -175,7 +175,7 @@ def starts(session, demo):
 def test_the_question_comes_first_and_can_be_answered_again_once_something_is_named(tabs, session, run, monkeypatch):
     turned, come = replace(run, named={}), threading.Event()  # another way to cut; that it is another model is enough
 
-    def coming():
+    def coming(on_event):
         assert come.wait(SOON)
         return turned
 

@@ -571,7 +571,7 @@ def test_another_way_to_cut_keeps_the_labels_and_learns_from_them(begin, run, de
     """The other way has two options for four."""
     coarse = fit(with_overrides(run.spec, {"hierarchy.levels.0.count": 2}), demos)
     session = begin()
-    monkeypatch.setattr(Ways, "calls", {"coarse": lambda: coarse})
+    monkeypatch.setattr(Ways, "calls", {"coarse": lambda on_event: coarse})
     label(session, 0, demos[0].labels["phase"])
     before = session.document.labels["demo_0"].copy()
     session.ask()

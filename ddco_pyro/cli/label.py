@@ -62,7 +62,9 @@ def label(
     listening = Listening.at(port)
     session = Session(load(run, allow_code), file, place, level, _exporters(run, file))
     session.journal.at(listening.address)
-    if not session.document.done:
+    if session.document.done:
+        session.background.ready()
+    else:
         session.ask()
 
     def ready() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import tempfile
 import threading
 from collections.abc import Callable
@@ -47,16 +48,23 @@ class Background:
 
     :param lock: held while anything here changes.
     :param changed: called, with the lock, when work has ended.
+    :param modules: what the process imports before it is asked for anything.
     :ivar work: None where nothing is under way.
     :ivar error: what failed at last, and why; empty where nothing did.
     """
 
-    def __init__(self, lock: threading.RLock, changed: Callable[[], None]) -> None:
-        self.lock, self.changed, self.error = lock, changed, ""
+    def __init__(self, lock: threading.RLock, changed: Callable[[], None], *modules: str) -> None:
+        self.lock, self.changed, self.modules, self.error = lock, changed, modules, ""
         self.work: Work | None = None
         self._after: Work | None = None
         self._process, self._folder = ExitStack(), tempfile.TemporaryDirectory(prefix="ddco-pyro-")
         self._told = Path(self._folder.name) / "done"
+
+    def ready(self) -> None:
+        """Start the process, which takes seconds, before it is asked for anything."""
+        with self.lock:
+            for module in self.modules:
+                self._submit(partial(importlib.import_module, module))
 
     def begin(self, message: str, do: Callable[[Away], None], calls: int = 1) -> None:
         """Begin a piece of work, or do so when what is under way has ended."""
@@ -74,6 +82,7 @@ class Background:
             if self.work is not None:
                 self.work = self._after = None
                 self._process.close()
+                self.ready()
                 self.changed()
 
     def close(self) -> None:
@@ -121,7 +130,7 @@ class Background:
         with self.lock:
             self._refuse_cancelled(work)
             self._told.unlink(missing_ok=True)
-            future = self._submit(call)
+            future = self._submit(partial(_telling, call, self._told))
         try:
             result = future.result()
         except BrokenProcessPool as error:
@@ -136,10 +145,10 @@ class Background:
         if self.work is not work:
             raise Failed("cancelled")
 
-    def _submit(self, call: Call[Result]) -> Future[Result]:
+    def _submit(self, call: Callable[[], Result]) -> Future[Result]:
         """Have a call made by the process, which stays for the next call."""
         submit, _ = self._process.enter_context(processes(1))
-        return submit(partial(_telling, call, self._told))
+        return submit(call)
 
 
 def _telling(call: Call[Result], file: Path) -> Result:

@@ -83,7 +83,7 @@ class Session:
         self.lock, self.revision, self.edits, self.saved, self.changed = threading.RLock(), 0, 0, 0, set[int]()
         self.ways: Ways | None = None
         self.refits, self.turn, self.chosen = 0, 0, ""
-        self.background = Background(self.lock, self._changed)
+        self.background = Background(self.lock, self._changed, "ddco_pyro.labelling.refitting", "sklearn.linear_model")
         self.first, self.shown = dict[str, Shown](), dict[str, Shown]()
         self.following = Following(path, self.demos, fit.spec.report.trajectory)
         self.take(fit)
