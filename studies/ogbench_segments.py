@@ -35,8 +35,8 @@ TASKS = ("cube-single", "scene", "cube-double", "puzzle-3x3")
 OBJECTS = TASKS[1:]
 """Tasks with several objects."""
 DEFAULTS = Settings({"seed": 0, "noise": 0.0}, Path("runs/ogbench"))
-FLOOR = 0.3
-"""The least standard deviation of controls, in units of their spread, that is tried beside init's."""
+STICKINESS = (0.0, 1e3, 1e5)
+"""Pseudo-counts of staying that are tried for an AR-HMM."""
 
 
 def simulator(settings: Settings) -> Apart:
@@ -57,8 +57,8 @@ class OGBenchCell(PeopleCell):
 
     @property
     def further(self) -> dict[str, dict[str, Any]]:
-        """A larger least deviation of the controls."""
-        return {"options, σ ≥ 0.3": {"control.std": {"learn": True, "floor": FLOOR, "per_option": True}}}
+        """Controls that are Gaussian, and not clipped."""
+        return {"options, Gaussian": {"control.kind": "gaussian"}}
 
     def demonstrations(self, settings: Settings) -> tuple[Path, Demonstrations]:
         """A file with the labels of the level alone, and the demonstrations of the seed."""
@@ -93,6 +93,7 @@ def cells(own: argparse.Namespace) -> list[OGBenchCell]:
 def main() -> None:
     """Run the study."""
     people.BASELINES = {"k-means": "kmeans", **people.BASELINES}
+    people.STICKINESS = STICKINESS
     parser = described(__doc__)
     parser.add_argument("--tasks", nargs="+", default=list(TASKS), choices=TASKS)
     parser.add_argument("--levels", nargs="+", default=["phase", "object"], choices=["phase", "object"])
