@@ -15,7 +15,7 @@ import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
@@ -25,6 +25,9 @@ from ddco_pyro.data.files import only_one, write_text
 from ddco_pyro.errors import BadInput, Failed
 from ddco_pyro.exporting import write_numpy
 from ddco_pyro.fitting.fitted import Fit
+
+if TYPE_CHECKING:
+    from policies import Policy
 
 HERE = Path(__file__).parent
 INSTALLED = ".made"
@@ -76,16 +79,12 @@ class Apart:
         """Record demonstrations of a task into a file, with options as :meth:`collected`."""
         run(self.made(), HERE / self.script, "collect", task, path, *_words(options))
 
-    def played(self, task: str, methods: dict[str, Fit], chunk: int = 1, **options: Any) -> dict[str, Any]:
-        """What the script's command ``play`` writes about exported methods.
-
-        :param chunk: steps that a control of every method has.
-        """
+    def played(self, task: str, methods: Mapping[str, Fit | Policy], **options: Any) -> dict[str, Any]:
+        """What the script's command ``play`` writes about exported methods."""
         with tempfile.TemporaryDirectory() as folder:
             for name, one in methods.items():
                 (Path(folder) / name).mkdir()
-                write_numpy(one, Path(folder) / name)
-                (Path(folder) / name / "chunk.json").write_text(json.dumps(chunk))
+                write_numpy(one, Path(folder) / name) if isinstance(one, Fit) else one.write(Path(folder) / name)
             out, named = Path(folder) / "played.json", [f"{name}={folder}/{name}" for name in methods]
             run(self.made(), HERE / self.script, "play", task, out, *named, *_words(options))
             return dict(json.loads(out.read_text()))

@@ -56,7 +56,7 @@ def named_controllers(named: Iterable[str]) -> dict[str, Any]:
 def exported(folder: str | Path) -> Any:
     """The ``Runner`` of an exported controller, by the ``runner.py`` that was exported beside it.
 
-    With a number above 1 in ``chunk.json`` beside it, the controller gives chunks of actions (:class:`Chunks`).
+    With a ``chunk.json`` beside it (:func:`write_chunk`), the controller gives chunks of actions (:class:`Chunks`).
     """
     path = Path(folder) / "runner.py"
     spec = importlib.util.spec_from_file_location("exported_runner", path)
@@ -65,26 +65,42 @@ def exported(folder: str | Path) -> Any:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     beside = path.with_name("chunk.json")
-    chunk = json.loads(beside.read_text()) if beside.exists() else 1
-    return Chunks(module.Runner(folder), chunk) if chunk > 1 else module.Runner(folder)
+    return Chunks(module.Runner(folder), **json.loads(beside.read_text())) if beside.exists() else module.Runner(folder)
+
+
+def write_chunk(folder: Path, chunk: int, executed: int) -> None:
+    """Say of a controller in a folder that it gives chunks of actions."""
+    (folder / "chunk.json").write_text(json.dumps({"chunk": chunk, "executed": executed}))
 
 
 class Chunks:
-    """Acts by chunks of actions: the mean of what the last chunks say of this step, the older the heavier."""
+    """Acts by a controller of chunks of actions, which sees every observation.
+
+    :param chunk: steps of a chunk.
+    :param executed: steps of a chunk that are executed before another one. 0: each step has the mean of what the last
+        chunks say of it, the older the heavier (temporal ensembling: ACT, Zhao et al. 2023).
+    """
 
     DECAY = 0.01
 
-    def __init__(self, controller: Any, chunk: int) -> None:
-        self.controller, self.chunk = controller, chunk
+    def __init__(self, controller: Any, chunk: int, executed: int = 0) -> None:
+        self.controller, self.chunk, self.executed = controller, chunk, executed
 
-    def reset(self, seed: int) -> None:
+    def reset(self, seed: int = 0) -> None:
         """Forget the last episode."""
         self.controller.reset(seed)
         self.chunks: list[np.ndarray] = []
+        self.steps = 0
 
     def act(self, observation: Observation) -> np.ndarray:
         """The control for this observation, [A]."""
-        self.chunks = [*self.chunks, self.controller.act(observation).reshape(self.chunk, -1)][-self.chunk :]
+        given, step = self.controller.act(observation).reshape(self.chunk, -1), self.steps
+        self.steps += 1
+        if self.executed:
+            place = step % self.executed
+            self.chunks = self.chunks if place else [given]
+            return np.asarray(self.chunks[0][place])
+        self.chunks = [*self.chunks, given][-self.chunk :]
         newest = len(self.chunks) - 1
         said = np.stack([own[newest - number] for number, own in enumerate(self.chunks)])
         weights = np.exp(-self.DECAY * np.arange(len(said)))

@@ -11,12 +11,11 @@ import shutil
 import signal
 from pathlib import Path
 
-import arena_playing
 import labelling
 import numpy as np
 import pandas as pd
+import policies
 import pytest
-import sawyer
 import toy_task
 import yaml
 from killing import struck
@@ -141,7 +140,7 @@ def test_a_declaration_that_cannot_be_meant_is_refused_in_words(made, changes, s
 
 def test_the_examples_of_the_docstrings_run(done, monkeypatch):
     monkeypatch.chdir(done.study.path.parent)
-    for module in (declaration, tidy, sawyer):
+    for module in (declaration, tidy, policies):
         found = doctest.testmod(module)
         assert (found.failed, found.attempted > 0) == (0, True)
 
@@ -198,12 +197,12 @@ def test_an_adapter_collects_plays_and_has_methods_of_its_own(made, tmp_path):
         "world": "world_of_tests:WORLD",
         "tasks": ["there", "back"],
         "overrides": {"training.epochs": 3},
-        "methods": {"options": {}, "own": {"by": "own"}},
+        "methods": {"options": {}, "own": {"by": "own", "overrides": {"a": 1}, "grid": {"b": [2]}}},
         "demonstrations": {"counts": [5], "held_out": 2, "test": {"first": 100, "count": 7}},
         "starts": {"test": {"first": 500, "count": 4}},
         "seeds": {"test": {"count": 2}},
         "measures": ["success", "nats"],
-        "contrasts": [{"contrast": "options - own", "measure": "success"}],
+        "contrasts": [{"contrast": "options - own (b = 2)", "measure": "success"}],
     }
     folder = made(allow_code=True, **study)
     state = folder.run(HERE)
@@ -212,8 +211,10 @@ def test_an_adapter_collects_plays_and_has_methods_of_its_own(made, tmp_path):
     for (task, method, _, seed), own in found.items():
         first, start = 100 + 7 * seed, 500 + 4 * seed
         assert own["success"] == {"there": 1, "back": 0}[task] if method == "options" else start / 1000
-        assert method == "options" or own["demonstrations"] == first
+        assert method == "options" or (own["demonstrations"], own["a"], own["b"]) == (first, 1, 2)
     write(folder, state, tmp_path / "report")  # of two tasks
+    methods = {"options": {}, "own": {"by": "own", "overrides": {"a": 2}, "grid": {"b": [2]}}}
+    assert [cell.of for cell in made(allow_code=True, **study | {"methods": methods}).state().missing] == ["own"] * 4
     wrong = made(allow_code=True, **study | {"methods": {"on": {"by": "on"}}, "contrasts": []})
     with pytest.raises(BadInput, match=r"has no method 'on' \(did you mean 'own'\?\)"):
         wrong.run(HERE)
@@ -240,7 +241,7 @@ class World:
     def own(self, job):
         assert set(job.demos.masks["train"]) | set(job.demos.masks["valid"]) == set(job.demos.names)
         first = min(demo.attributes["seed"] for demo in job.demos)
-        return {"success": job.starts[0] / 1000, "demonstrations": float(first)}
+        return {"success": job.starts[0] / 1000, "demonstrations": float(first), **job.settings}
 
 WORLD = World()
 """
@@ -557,27 +558,6 @@ def test_both_sides_of_a_verdict_have_holms_correction(values, said):
         for own in values.values()
     ]
     assert [verdict for verdict, _ in report.verdicts(family)] == said
-
-
-class Told:
-    """A controller of chunks of three: at time t it gives 10 t, 10 t + 1 and 10 t + 2 for three steps."""
-
-    def reset(self, seed):
-        self.time = -1
-
-    def act(self, observation):
-        self.time += 1
-        return 10.0 * self.time + np.arange(3.0)
-
-
-def test_chunks_of_actions_are_averaged_over_what_was_given_for_a_step():
-    """By hand: step 2 was given 2 at time 0, 11 at time 1 and 20 at time 2; the oldest has the largest weight."""
-    chunks, weights = arena_playing.Chunks(Told(), 3), np.exp([0, -0.01, -0.02])
-    given = [[0.0], [1.0, 10.0], [2.0, 11.0, 20.0], [12.0, 21.0, 30.0]]
-    for _ in range(2):  # nothing is left of an episode
-        chunks.reset(0)
-        acted = [float(chunks.act({})[0]) for _ in given]
-        assert acted == pytest.approx([np.average(one, weights=weights[: len(one)]) for one in given])
 
 
 def edited(shown, command):

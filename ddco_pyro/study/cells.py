@@ -84,6 +84,7 @@ class Job:
     :param demos: with the masks ``train`` and ``valid``.
     :param starts: seeds of initial states.
     :param folder: keeps files of the fit.
+    :param settings: of the method, by name.
     """
 
     cell: Cell
@@ -91,6 +92,7 @@ class Job:
     demos: Demonstrations
     starts: range
     folder: Path
+    settings: Mapping[str, Any]
 
 
 class World(Protocol):
@@ -301,6 +303,7 @@ class Folder:
         facts = {
             "baseline": baseline and baseline.model_dump(exclude_unset=True, mode="json"),
             "by": method.by,
+            **({"settings": settings} if (settings := self.study.settings(cell.of, dict(cell.point))) else {}),
             "world": declared.world,
             "data": self._drawn(cell),
             "seed": cell.seed,
@@ -395,7 +398,8 @@ class Folder:
         spec, demos = self._prepared(cell, world)
         starts = self._starts(cell)
         if method.by is not None:
-            return {"values": dict(world.methods[method.by](Job(cell, spec, demos, starts, folder)))}
+            job = Job(cell, spec, demos, starts, folder, self.study.settings(cell.of, dict(cell.point)))
+            return {"values": dict(world.methods[method.by](job))}
         fitted = fit(spec, demos, out=folder / "fit", keep=False)
         found = fitted.metrics.agreement
         values: dict[str, float | None] = {NATS: fitted.metrics.log_likelihood_per_step.valid}

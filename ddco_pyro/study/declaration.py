@@ -95,9 +95,9 @@ class MethodSpec(Model):
     by: Text | None = None
     """Name of a method of the simulator's adapter, which trains and acts instead; null: the spec is fitted."""
     overrides: dict[str, Any] = Field(default={})
-    """Key path in the spec to a value."""
+    """Key path in the spec to a value; with ``by``, a setting of the adapter's method to a value."""
     grid: Grid = Field(default={})
-    """Key path in the spec to values, beside those of the study's grid."""
+    """The same to values, beside those of the study's grid."""
 
 
 class ContrastSpec(Model):
@@ -331,7 +331,13 @@ class Study:
             "demonstrations.hold_out_by": None,
             "selection.grid": {},
         }
-        return {**alone, **self.declared.overrides, **self.declared.methods[method].overrides, **point}
+        own, settings = {**self.declared.methods[method].overrides, **point}, self.settings(method, point)
+        return {**alone, **self.declared.overrides, **{key: own[key] for key in own if key not in settings}}
+
+    def settings(self, method: str, point: dict[str, Any]) -> dict[str, Any]:
+        """What an adapter's own method is told, by name: its overrides and its part of a point."""
+        own = self.declared.methods[method]
+        return {} if own.by is None else {**own.overrides, **{key: point[key] for key in own.grid}}
 
     def overridden_code(self) -> dict[str, str]:
         """The user code that the spec of a method names, by method.
