@@ -38,6 +38,7 @@ class Cued(Pushing):
 
     def __init__(self, random: int | None = None) -> None:
         super().__init__(STEPS, single=True, random=random)
+        self._steps = 0  # observations are described before the first episode
 
     def get_observation(self, physics: Physics) -> OrderedDict[str, np.ndarray]:
         """That of pushing, where ``goal`` tells the goal at all steps; and ``cue`` [1]: it as long as it is shown, then 0."""
