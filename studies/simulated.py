@@ -1,6 +1,4 @@
-"""The registered tasks as the world of a study (``world: simulated:WORLD``), with the policies of ``policies.py`` as methods
-of its own.
-"""
+"""The registered tasks as the world of a study (``world: simulated:WORLD``), with the methods of ``policies.py``."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Pushing whose goal is shown once: the box comes long after the goal has gone out of sight.
 
-For a quarter of a second the goal is seen, on the left or on the right, while the arm goes home, above the middle. Two to
-three seconds later a box comes to the middle, and has to be pushed over the line on the goal's side. Until then arm and box
-move alike whichever side it is: what is seen after the cue does not tell the goal.
+For a quarter of a second the goal is seen, on the left or on the right, while the arm goes home, above the middle. Two
+to three seconds later a box comes to the middle, and has to be pushed over the line on the goal's side. Until then arm
+and box move alike whichever side it is: what is seen after the cue does not tell the goal.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Cued(Pushing):
         self._steps = 0  # observations are described before the first episode
 
     def get_observation(self, physics: Physics) -> OrderedDict[str, np.ndarray]:
-        """That of pushing, where ``goal`` tells the goal at all steps; and ``cue`` [1]: it as long as it is shown, then 0."""
+        """That of pushing, where ``goal`` is told at all steps; ``cue`` [1] is ``goal`` while it is shown, then 0."""
         observation = super().get_observation(physics)
         observation["cue"] = observation["goal"] if self._steps < CUE else np.zeros(1)
         return observation
