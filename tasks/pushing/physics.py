@@ -8,6 +8,7 @@ from mujoco import mj_step, mj_step1
 from ..rendering import mujoco
 from .geometry import BOX_HEIGHT
 
+OUT_OF_SIGHT = -5.0  # m: far below the surface
 RAMP = 5  # parts of a control step in which the servos' velocities change
 
 # Where the model has them, in the order of pushing.xml; a name looked up takes as long as a time step.
@@ -83,3 +84,7 @@ class Physics(mujoco.Physics):
     def place_goal(self, x: float) -> None:
         """Put the goal somewhere."""
         self.data.mocap_pos[GOAL] = [x, 0.0, 0.0]
+
+    def hide_goal(self) -> None:
+        """Put the goal out of sight; :meth:`goal` goes on to tell where it is."""
+        self.data.mocap_pos[GOAL, 2] = OUT_OF_SIGHT
