@@ -20,7 +20,7 @@ from typing import Any, Protocol
 
 import h5py
 import numpy as np
-from policies import KINDS, Settings, fit
+from policies import KINDS, Policy, Settings, fit
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import only_one, write_text
@@ -111,22 +111,32 @@ class Apart:
         return played
 
 
-class World:
-    """A simulator apart as the world of a study. Its own methods are the policies of ``policies.py``."""
+class Peers:
+    """A simulator whose methods are the policies of ``policies.py``; a cell may have other settings than their kind."""
+
+    def __init__(self) -> None:
+        self.methods = {name: partial(self._policy, settings) for name, settings in KINDS.items()}
+
+    def play(self, task: str, fitted: Fit | Policy, starts: range, folder: Path) -> Sequence[Mapping[str, float]]:
+        """Episodes of a policy: success, and what else the simulator measures."""
+        raise NotImplementedError
+
+    def _policy(self, settings: Settings, job: Job) -> dict[str, float]:
+        policy = fit(job.demos, settings.given(job.settings), job.cell.seed, job.spec.observed)
+        return means(self.play(job.cell.task, policy, job.starts, job.folder))
+
+
+class World(Peers):
+    """A simulator apart as the world of a study."""
 
     def __init__(self, simulator: Apart) -> None:
+        super().__init__()
         self.simulator = simulator
-        self.methods = {name: partial(self._policy, settings) for name, settings in KINDS.items()}
 
     def play(self, task: str, fitted: Fit | Written, starts: range, folder: Path) -> Sequence[Mapping[str, float]]:
         """Episodes of the exported policy: success, steps, and what else the simulator measures."""
         played = self.simulator.played(task, {"policy": fitted}, first=starts.start, episodes=len(starts))
         return [{name: float(value) for name, value in one.items()} for one in played["episodes"]["policy"]]
-
-    def _policy(self, settings: Settings, job: Job) -> dict[str, float]:
-        """Train a policy and let it act; the cell may have other settings."""
-        policy = fit(job.demos, settings.given(job.settings), job.cell.seed, job.spec.observed)
-        return means(self.play(job.cell.task, policy, job.starts, job.folder))
 
 
 def means(episodes: Sequence[Mapping[str, float]]) -> dict[str, float]:
