@@ -1,4 +1,4 @@
-"""The figures of "memory, or several policies": ``docs/results/memory.png``, and ``docs/images/worth.png`` of README.
+"""The figure of "memory, or several policies": ``docs/results/memory.png``.
 
     python studies/memory.py
 
@@ -8,7 +8,7 @@ Both differences of every comparison, by the tables that ``needle.yaml``, ``push
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
@@ -28,9 +28,6 @@ NAMED = {
     "arena": "Meta-World",
     "bins": "bin picking",
 }
-WORTH = (("arena", "nmi"), ("needle", "success"), ("arena", "success"), ("bins", "success"), ("pushing_test", "goals"))
-"""The studies and measures of README's figure, with most demonstrations."""
-
 Line = tuple[str, int, str]
 """A study, a number of demonstrations and a measure."""
 
@@ -40,26 +37,23 @@ def read() -> dict[str, pd.DataFrame]:
     return {name: earlier(Study.load(ROOT / "studies" / f"{name}.yaml", allow_code=True)) for name in NAMED}
 
 
-def lines(rows: dict[str, pd.DataFrame], of: Iterable[tuple[str, str]] | None = None) -> list[Line]:
-    """Every comparison; of pairs of study and measure those with most demonstrations."""
-    found = list(dict.fromkeys(
+def lines(rows: dict[str, pd.DataFrame]) -> list[Line]:
+    """Every comparison."""
+    return list(dict.fromkeys(
         (study, int(row.demonstrations), row.measure)
         for study, table in rows.items() for row in table.itertuples()
         if row.method == "mixture" and row.measure in ("nats", "nmi", "success", "goals")
     ))  # fmt: skip
-    return found if of is None else [max(line for line in found if (line[0], line[2]) == pair) for pair in of]
 
 
-def draw(rows: dict[str, pd.DataFrame], chosen: Sequence[Line], path: Path, columns: int = 2) -> None:
-    """Both differences of every comparison, a panel for each measure; in one column on half the width."""
+def draw(rows: dict[str, pd.DataFrame], chosen: Sequence[Line], path: Path) -> None:
+    """Both differences of every comparison, a panel for each measure."""
     groups = {one: [line for line in chosen if line[2] == one] for one in ("nats", "nmi", "success", "goals")}
     groups = {name: group for name, group in groups.items() if group}
     with style():
-        sizes = [len(group) for group in groups.values()]
-        heights = sizes if columns == 1 else [max(sizes)] * -(-len(sizes) // columns)
-        figure = blank(1.2 + 0.24 * sum(heights) + (columns == 1) * 0.5 * len(heights))
-        figure.set_figwidth(figure.get_figwidth() * columns / 2)
-        panels = figure.subplots(len(heights), columns, squeeze=False, height_ratios=heights).flatten()
+        high = max(len(group) for group in groups.values())
+        figure = blank(1.2 + 0.24 * high * -(-len(groups) // 2))
+        panels = figure.subplots(-(-len(groups) // 2), 2, squeeze=False).flatten()
         for axes, (measure, group) in zip(panels, groups.items(), strict=False):
             _panel(axes, measure, group, rows)
         for axes in panels[len(groups) :]:
@@ -93,4 +87,3 @@ def _panel(axes: Axes, measure: str, group: Sequence[Line], rows: dict[str, pd.D
 if __name__ == "__main__":
     known = read()
     draw(known, lines(known), RESULTS / "memory.png")
-    draw(known, lines(known, WORTH), ROOT / "docs" / "images" / "worth.png", columns=1)

@@ -281,12 +281,19 @@ def autoregressive(
         model = LinearAutoregressiveHMM(count, DIRECTIONS, transition_matrix_stickiness=stickiness)
         start = model.initialize(jax.random.PRNGKey(0), method="kmeans", emissions=after)
         learned, _ = model.fit_em(*start, after, inputs=before, num_iters=50, verbose=False)
-        states = [np.asarray(model.most_likely_states(learned, row[1:], inputs=row[:-1])) + 1 for row in rows]
-        states = [np.insert(own, 0, own[0]) for own in states]
+        states = [*_states(model, learned, rows[: len(train)]), *_states(model, learned, rows[len(train) :])]
         median = typical_length(states[: len(train)])
         tried.append((abs(math.log(median / typical)), stickiness, states[len(train) :]))
     yield tried[0][-1]
     yield min(tried)[-1]
+
+
+def _states(model: Any, learned: Any, rows: list[np.ndarray]) -> list[np.ndarray]:
+    """The states of each demonstration, from 1, of all as one sequence, as in the fit; the first is as the second."""
+    after, before = (np.concatenate([row[part] for row in rows]) for part in (slice(1, None), slice(-1)))
+    states = np.asarray(model.most_likely_states(learned, after, inputs=before)) + 1
+    own = np.split(states, np.cumsum([len(row) - 1 for row in rows])[:-1])
+    return [np.insert(one, 0, one[0]) for one in own]
 
 
 DIRECTIONS, STICKINESS = 10, (0.0, *(10.0**power for power in range(3, 9)))
