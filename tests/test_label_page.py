@@ -455,8 +455,8 @@ def test_the_picture_is_that_of_the_step_at_the_cursor(tabs, run, tmp_path):
     def shows(index, step):
         def holds():
             size, colour = np.split(np.array(tab.locator("#look img").evaluate(PIXEL)), [2])
-            assert size.tolist() == [320, 240]
-            return np.abs(colour[:3] - [4 * step, 60 + 20 * index, 250]).max() <= 3
+            near = np.abs(colour[:3] - [4 * step, 60 + 20 * index, 250]).max() <= 3
+            return size.tolist() == [320, 240] and near  # a picture on its way has no size
 
         until(holds)
 

@@ -62,16 +62,24 @@ class FittedReader(PictureNetwork):
 
 
 def from_folder(folder: str, key: str, picture: Sequence[int], allow_code: bool = False) -> FittedReader:
-    """The convolutions in the fit of a run folder that read the pictures under ``key`` and nothing else.
+    """:func:`from_fit` of the fit in a run folder.
+
+    :raises BadInput: there is no finished fit, or as :func:`from_fit`.
+    """
+    reader = from_fit(load(Path(folder), allow_code), key, picture)
+    reader.code = (Path(folder) / "model.safetensors").read_bytes()  # the folder may change later
+    return reader
+
+
+def from_fit(fit: Fit, key: str, picture: Sequence[int]) -> FittedReader:
+    """The convolutions in a fit that read the pictures under ``key`` and nothing else.
 
     They are the network of a flat policy or of the lowest options, a branch of it, or the network under its LSTM. The
     options have to share them.
 
     :param picture: [H, W, C] of the pictures that are to be encoded.
-    :raises BadInput: there is no finished fit; it observed other pictures, or stacks of several, or has no such
-        network.
+    :raises BadInput: the fit observed other pictures, or stacks of several, or has no such network.
     """
-    fit = load(Path(folder), allow_code)
     encoder, shape = fit.hierarchy.encoder, tuple(picture)
     found, transform = next(_readers(_lowest(fit), key), None), encoder.transforms.get(key)
     problem = ""
@@ -92,7 +100,6 @@ def from_folder(folder: str, key: str, picture: Sequence[int], allow_code: bool 
     about = Reader(network=network, crop=transform.crop, resize=transform.resize, grey=transform.grey)
     reader, weights = FittedReader(about, picture), found[1].state_dict()
     reader.network.load_state_dict({name: weights[name] for name in reader.network.state_dict()})
-    reader.code = (Path(folder) / "model.safetensors").read_bytes()  # the folder may change later
     return reader
 
 
