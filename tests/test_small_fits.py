@@ -16,7 +16,8 @@ import ddco_pyro
 from ddco_pyro.acting.monitor import run_lengths
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.options import segments_of
-from ddco_pyro.selection.small import heavy_tails, in_steps, lasting, overrides
+from ddco_pyro.metrics import Segments
+from ddco_pyro.selection.small import Lasting, heavy_tails, in_steps, lasting, overrides, unasked
 from ddco_pyro.spec import load_spec, parse_spec, with_overrides
 
 SLOW = 30
@@ -122,3 +123,24 @@ def test_heavy_tails_are_found_where_they_predict_better():
         noise = [0.3 * own * random.normal(size=(60, 2)) for own in scale]
         demos = numbered(({"state": x}, x + e) for x, e in zip(observed, noise, strict=True))
         assert heavy_tails(spec, demos) == dims
+
+
+@pytest.mark.parametrize(
+    ("segments", "power"),
+    [
+        ({0.5: (20, 4)}, 0.5),  # long enough at once
+        ({0.5: (3, 20), 0.05: (15, 4)}, 0.05),
+        ({0.5: (3, 20), 0.05: (4, 15), 0.02: (15, 4)}, 0.02),
+        ({0.5: (3, 20), 0.05: (40, 2), 0.16: (12, 5)}, 0.16),  # nearly whole demonstrations are no skills
+        ({0.5: (3, 20), 0.05: (60, 1), 0.16: (60, 1)}, 0.5),
+        ({0.5: (60, 1)}, 0.5),
+    ],
+)
+def test_options_last_long_enough_and_do_not_become_one(segments, power):
+    """``segments``: the median steps and the segments in a demonstration that each power gives."""
+
+    def tried(power, constant):
+        median, number = segments[power]
+        return Lasting(power, constant, 10, Segments(median=median, number=10 * number, demonstrations=10))
+
+    assert unasked(tried, None).power == power

@@ -34,6 +34,8 @@ NEAR, FAR = 1.15, 1.5
 second."""
 LADDER = (0.5, 0.05, 0.02)
 """Powers that are tried in this order where no length is asked for, at last with constant gates."""
+FEW = 3
+"""Segments of a demonstration, in the mean, below which they are few."""
 USUAL = 0.5
 """Below this power gates and terminations have ridges of :data:`RIDGE`, and options begin from windows."""
 RIDGE = 100.0
@@ -108,8 +110,7 @@ def lasting(spec: Spec, demos: Demonstrations, steps: float | None, on_event: On
 
     Fits are of the model alone, to some of the training demonstrations.
 
-    :param steps: the length, in steps; None for the first of :data:`LADDER` whose segments are not
-        :meth:`~ddco_pyro.metrics.Segments.brief`.
+    :param steps: the length, in steps; None for any that is not too short for a skill.
     :raises BadInput: the spec has no options that last.
     """
     if spec.hierarchy is None or not spec.hierarchy.levels[0].lasts:
@@ -124,13 +125,7 @@ def lasting(spec: Spec, demos: Demonstrations, steps: float | None, on_event: On
         on_event(LengthTried(power, constant, segments.median))
         return Lasting(power, constant, window, segments)
 
-    if steps is not None:
-        return _searched(tried, steps)
-    for power in LADDER:
-        found = tried(power, power == LADDER[-1])
-        if not found.segments.brief(demos.frequency):
-            break
-    return found
+    return unasked(tried, demos.frequency) if steps is None else _searched(tried, steps)
 
 
 def _sketch(spec: Spec) -> Spec:
@@ -213,6 +208,27 @@ def in_steps(place: str, length: str, frequency: float | None) -> float:
     if seconds and not frequency:
         raise BadInput(f"{place} {length}: the demonstrations do not say how many steps a second has; give steps")
     return value * frequency if seconds and frequency else value
+
+
+def unasked(tried: Callable[[float, bool], Lasting], frequency: float | None) -> Lasting:
+    """The first power of :data:`LADDER` whose segments are not :meth:`~ddco_pyro.metrics.Segments.brief`.
+
+    Where that leaves few segments in a demonstration, options are about to become one. Then it is a power between this
+    one and the one before, and where that leaves few segments, too, the one before.
+    """
+    found = before = tried(LADDER[0], False)
+    for power in LADDER[1:]:
+        if not found.segments.brief(frequency):
+            break
+        before, found = found, tried(power, power == LADDER[-1])
+    if before is found or not _few(found):
+        return found
+    between = tried(float(f"{math.sqrt(before.power * found.power):.2g}"), before.constant)
+    return before if _few(between) else between
+
+
+def _few(found: Lasting) -> bool:
+    return found.segments.number < FEW * found.segments.demonstrations
 
 
 def _searched(tried: Callable[[float, bool], Lasting], steps: float) -> Lasting:
