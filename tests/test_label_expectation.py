@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ddco_pyro.labelling.expectation import USUAL, excess, expected_wrong, ranking, unforeseen
+from ddco_pyro.labelling.expectation import USUAL, excess, expected_wrong, first_wrong, ranking, unforeseen
 from ddco_pyro.labelling.proposals import Shown
 
 
@@ -40,6 +40,14 @@ def test_steps_without_a_name_say_nothing_of_a_proposal():
     shown = Shown(np.array([1, 2, 2, 3]), np.array([0.9, 0.8, 0.7, 0.6]))
     assert excess(shown, np.array([1, 1, -1, -2])) == pytest.approx(1 / 2 - (0.1 + 0.2) / 2)
     assert excess(shown, np.full(4, -1)) == 0.0
+
+
+def test_segments_under_other_numbers_are_no_wrong_steps():
+    proposed = Shown(np.array([1, 1, 2, 2, 3, 3]), np.full(6, 0.9))
+    named = Shown(np.array([2, 2, 3, 3, 1, 1]), np.ones(6))
+    moved = Shown(np.array([2, 2, 2, 3, 1, 1]), np.ones(6))
+    assert first_wrong(proposed, named) == (pytest.approx(0.6), 0)
+    assert first_wrong(proposed, moved) == (pytest.approx(0.6), 1)
 
 
 def order_of(wrong, edits, centres, accepted=()):

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ddco_pyro.evaluation.agreement import agreement
 from ddco_pyro.labelling.document import FREE
 from ddco_pyro.labelling.proposals import Shown
 
@@ -14,8 +15,13 @@ USUAL = 0.1
 
 
 def first_wrong(first: Shown, accepted: Shown) -> tuple[float, int]:
-    """The steps of a demonstration whose first proposal was expected to be wrong, and those in which it was."""
-    return float((1 - first.probability).sum()), int((first.options != accepted.options).sum())
+    """The steps of a demonstration whose first proposal was expected to be wrong, and those in which it was.
+
+    Other numbers of the same segments are not wrong: a person gives options their numbers.
+    """
+    found = agreement([first.options], [accepted.options])
+    assert found is not None  # there are steps
+    return float((1 - first.probability).sum()), round((1 - found.matched_globally.accuracy) * len(first.options))
 
 
 def excess(proposed: Shown, labels: np.ndarray) -> float:
