@@ -12,6 +12,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -111,15 +112,15 @@ class Apart:
         return played
 
 
-class Peers:
+class Peers(ABC):
     """A simulator whose methods are the policies of ``policies.py``; a cell may have other settings than their kind."""
 
     def __init__(self) -> None:
         self.methods = {name: partial(self._policy, settings) for name, settings in KINDS.items()}
 
+    @abstractmethod
     def play(self, task: str, fitted: Fit | Policy, starts: range, folder: Path) -> Sequence[Mapping[str, float]]:
         """Episodes of a policy: success, and what else the simulator measures."""
-        raise NotImplementedError
 
     def _policy(self, settings: Settings, job: Job) -> dict[str, float]:
         policy = fit(job.demos, settings.given(job.settings), job.cell.seed, job.spec.observed)

@@ -75,10 +75,15 @@ class OGBenchCell(PeopleCell):
         each = (replace(demo, labels={**demo.labels, LABELS: demo.labels[self.level]}) for demo in demos)
         return path, replace(replace(demos, demonstrations=tuple(each)).select(sum(masks.values(), ())), masks=masks)
 
+    def results(self, settings: Settings, folder: Path) -> dict[str, Any]:
+        """Fit, and compare with the labels of the held-out demonstrations."""
+        return {**super().results(settings, folder), "noise": settings.values["noise"]}
+
     def rows(self, results: Mapping[str, Any]) -> Iterator[Row]:
-        """Agreement of each method, and what cross-validation chose."""
+        """Agreement of each method, and what cross-validation chose; noise on the controls is another study."""
+        noise = f" with noise {results['noise']:g}" if results.get("noise") else ""
         for row in super().rows(results):
-            yield row._replace(study=self.level)
+            yield row._replace(study=f"{self.level}{noise}")
 
 
 def cells(own: argparse.Namespace) -> list[OGBenchCell]:

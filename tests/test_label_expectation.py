@@ -8,9 +8,7 @@ from ddco_pyro.labelling.proposals import Shown
 
 
 def proposed(generator, steps, sure):
-    """Proposals whose posterior p is true but for a share ``sure`` of steps, which are wrong whatever p says; and the
-    true options.
-    """
+    """Proposals and true options. A share ``sure`` of the steps is wrong; others are right with probability p."""
     truth, p = generator.integers(1, 4, steps), generator.beta(8, 1, steps)
     wrong = (generator.random(steps) > p) | (generator.random(steps) < sure)
     return Shown(np.where(wrong, truth % 3 + 1, truth), p), truth

@@ -38,7 +38,6 @@ REFIT, LOOK = "fitting the labels", "looking for other ways to cut"
 NEAREST = 5
 """Segments elsewhere that are shown for one."""
 
-
 UNCERTAIN = 20
 """Boundaries that are named as the most uncertain ones."""
 
