@@ -23,12 +23,12 @@ from ddco_pyro.spec import load_spec, parse_spec, with_overrides
 SLOW = 30
 
 
-def skills_within_which_speed_varies(number=6, steps=150, seed=0):
-    """Skills of about 30 steps, each a direction; the speed along it changes every three or four steps."""
+def skills_within_which_speed_varies(number=6, steps=150, seed=0, long=SLOW):
+    """Skills of about ``long`` steps, each a direction; the speed along it changes every three or four steps."""
     random = np.random.default_rng(seed)
     found = []
     for _ in range(number):
-        skill = np.repeat(np.arange(steps // SLOW + 1) % 2, SLOW)[random.integers(0, SLOW) :][:steps]
+        skill = np.repeat(np.arange(steps // long + 2) % 2, long)[random.integers(0, long) :][:steps]
         fast = np.cumsum(random.random(len(skill)) < 0.3) % 2
         turned = np.stack([np.where(skill, 1.0, -1.0), np.where(skill, -1.0, 1.0)], 1)
         controls = turned * np.where(fast, 1.2, 0.8)[:, None] + 0.6 * random.normal(size=(len(skill), 2))
@@ -49,16 +49,22 @@ training: {initialize: vq_controls, optimizer: {name: em}, epochs: 60}
 """
 
 
-def test_options_last_as_long_as_is_asked():
-    demos = skills_within_which_speed_varies()
+@pytest.mark.parametrize("long", [SLOW, 8])
+def test_options_last_as_long_as_is_asked(long):
+    """Windows as wide as two short skills would mix them; long ones are not found without windows."""
+    demos = skills_within_which_speed_varies(long=long)
     spec = parse_spec(yaml.safe_load(SPEC))
     assert segments_of(ddco_pyro.fit(spec, demos).segment(demos)[0]).median < 6  # the speed
-    found = lasting(spec, demos, SLOW)
-    assert SLOW / 1.5 < found.segments.median < 1.5 * SLOW
+    found = lasting(spec, demos, long)
+    assert long / 1.5 < found.segments.median < 1.5 * long
     fit = ddco_pyro.fit(with_overrides(spec, overrides(spec, found.power, found.constant, found.window)), demos)
     options = np.concatenate(fit.segment(demos)[0])
     assert normalized_mutual_info_score(np.concatenate([demo.labels["skill"] for demo in demos]), options) > 0.7
-    assert not lasting(spec, demos, None).segments.brief(None)
+
+
+def test_long_options_are_found_where_no_length_is_asked():
+    demos = skills_within_which_speed_varies()
+    assert not lasting(parse_spec(yaml.safe_load(SPEC)), demos, None).segments.brief(None)
 
 
 @pytest.mark.parametrize(
@@ -141,6 +147,6 @@ def test_options_last_long_enough_and_do_not_become_one(segments, power):
 
     def tried(power, constant):
         median, number = segments[power]
-        return Lasting(power, constant, 10, Segments(median=median, number=10 * number, demonstrations=10))
+        return Lasting(power, constant, 10, Segments(median=median, number=10 * number, demonstrations=10), 0.0)
 
     assert unasked(tried, None).power == power

@@ -74,9 +74,9 @@ HEAVY = "one Student t predicts left-out demonstrations better than Gaussians"
 class Decided(NamedTuple):
     """What small fits decide.
 
-    :param power: β of the control's log-density.
+    :param power: β of the control's log-density; below 1/2, gates have larger ridges too.
     :param constant: whether gates and terminations are constant.
-    :param window: ``training.window``; above 0, gates have larger ridges too.
+    :param window: ``training.window``; 0 for none.
     :param why: the length of segments that came of it, in words.
     :param heavy: control dimensions for one Student t.
     """

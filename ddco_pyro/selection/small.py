@@ -17,7 +17,7 @@ from ddco_pyro.data.starting import Decided
 from ddco_pyro.drawing.words import duration
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.options import segments_of
-from ddco_pyro.events import LengthTried, OnEvent, ignore
+from ddco_pyro.events import EpochEnded, Event, LengthTried, OnEvent, ignore
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.fitted import Fit, load
 from ddco_pyro.fitting.run import is_finished
@@ -37,13 +37,15 @@ LADDER = (0.5, 0.05, 0.02)
 FEW = 3
 """Segments of a demonstration, in the mean, below which they are few."""
 USUAL = 0.5
-"""Below this power gates and terminations have ridges of :data:`RIDGE`, and options begin from windows."""
+"""Below this power gates and terminations have ridges of :data:`RIDGE`, and options may begin from windows."""
 RIDGE = 100.0
 """What gates and terminations read of observations costs nothing else."""
 GRANULARITIES = {"coarse": 2.0, "medium": 1.0, "fine": 0.5}
 """Median segments in units of a run's own."""
 STEPS_A_SECOND = 10
-"""The half width of windows where the frequency is unknown; else it is one second."""
+"""Where the frequency is unknown."""
+PARTS = (1, 3)
+"""The half widths of the windows that are tried are one second over these; no window is tried, too."""
 STEPS = 6000
 """Steps of the demonstrations that are used, about."""
 FEWEST = 4
@@ -59,12 +61,14 @@ class Lasting(NamedTuple):
     :param constant: whether gates and terminations are constant.
     :param window: ``training.window`` of options that last long.
     :param segments: of the lowest level.
+    :param value: log-likelihood per step of the tuning demonstrations with that power, nats.
     """
 
     power: float
     constant: bool
     window: int
     segments: Segments
+    value: float
 
 
 def overrides(spec: Spec, power: float, constant: bool, window: int) -> dict[str, Any]:
@@ -100,15 +104,15 @@ def decide(
     heavy = heavy_tails(spec, demos)
     found = lasting(with_heavy_tails(spec, heavy), demos, steps, on_event)
     asked = "" if steps is None else f"; asked: {duration(frequency, steps)}"
-    window = found.window if found.power < USUAL else 0
     why = f"median segment {duration(frequency, found.segments.median)} in small fits{asked}"
-    return Decided(found.power, found.constant, window, why, heavy)
+    return Decided(found.power, found.constant, found.window, why, heavy)
 
 
 def lasting(spec: Spec, demos: Demonstrations, steps: float | None, on_event: OnEvent = ignore) -> Lasting:
     """The power, and gates, with which a fit's median segment has a length that is asked for.
 
-    Fits are of the model alone, to some of the training demonstrations.
+    Fits are of the model alone, to some of the training demonstrations. Below :data:`USUAL` several windows are tried,
+    and the one with the best tuning log-likelihood is kept, since windows that are longer than skills mix them.
 
     :param steps: the length, in steps; None for any that is not too short for a skill.
     :raises BadInput: the spec has no options that last.
@@ -117,13 +121,24 @@ def lasting(spec: Spec, demos: Demonstrations, steps: float | None, on_event: On
         raise BadInput("lengths of segments are of a spec whose lowest level has options that last")
     some, sketch = _some(parts(spec, demos)["train"]), _sketch(spec)
 
-    window = max(1, round(demos.frequency or STEPS_A_SECOND))
+    second = demos.frequency or STEPS_A_SECOND
+    windows = [max(1, round(second / part)) for part in PARTS]
+
+    def begun(power: float, constant: bool, window: int) -> Lasting:
+        values = [-math.inf]
+
+        def heard(event: Event) -> None:
+            if isinstance(event, EpochEnded):
+                values.append(event.tune)
+
+        found = fit(with_overrides(sketch, overrides(spec, power, constant, window)), some, on_event=heard)
+        return Lasting(power, constant, window, segments_of(found.segment(some)[0]), values[-1])
 
     def tried(power: float, constant: bool) -> Lasting:
-        settings = overrides(spec, power, constant, window)
-        segments = segments_of(fit(with_overrides(sketch, settings), some).segment(some)[0])
-        on_event(LengthTried(power, constant, segments.median))
-        return Lasting(power, constant, window, segments)
+        tries = [begun(power, constant, window) for window in ([*windows, 0] if power < USUAL else [0])]
+        found = max(tries, key=lambda one: one.value)
+        on_event(LengthTried(power, constant, found.segments.median))
+        return found
 
     return unasked(tried, demos.frequency) if steps is None else _searched(tried, steps)
 
