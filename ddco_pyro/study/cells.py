@@ -237,6 +237,11 @@ class State:
         """The cells that are neither done nor failed."""
         return [cell for cell in self.cells if cell not in self.results]
 
+    @property
+    def codes(self) -> list[str]:
+        """The commits of the results, each once."""
+        return [*dict.fromkeys(one.code for one in self.results.values())]
+
 
 @dataclass(frozen=True)
 class Folder:
@@ -266,7 +271,7 @@ class Folder:
         """The state of all cells; those of the test are unknown until development has chosen the points.
 
         :raises Damaged: the file of a cell is damaged.
-        :raises BadInput: the study is pinned, and results are of another commit or of other settings.
+        :raises BadInput: the study is pinned, and results are of several commits or of other settings.
         """
         choose = self.study.declared.choose
         state = self._state(self.cells(PARTS[choose is not None]))
@@ -275,7 +280,10 @@ class Folder:
         return self._state([*state.cells, *self.cells("test", self.chosen(state))])
 
     def _state(self, cells: Sequence[Cell]) -> State:
-        return State(cells, {cell: one for cell in cells if (one := self.kept(cell))})
+        state = State(cells, {cell: one for cell in cells if (one := self.kept(cell))})
+        if self.study.declared.pinned and len(codes := state.codes) > 1:
+            raise BadInput(f"{self.study.path}: pinned: results are of commits {', '.join(codes)}; keep those of one")
+        return state
 
     def chosen(self, state: State) -> dict[str, dict[str, Any]]:
         """The point of each method with the highest mean over the development cells."""
@@ -304,11 +312,11 @@ class Folder:
             known = Done(values=values, key=key, code=code, failed=failed, converged=converged)
         if known is None or known.failed:  # such a cell is tried again
             known = kept(self.place(cell), None if pinned else self.depends(cell)) or known
-        if known and pinned and (known.code, known.key) != (self.code, self.key(cell)):
-            there = f"was done at commit {known.code or 'unknown'}, key {known.key or 'unknown'}"
-            here = f"here are commit {self.code}, key {self.key(cell)}"
+        if known and pinned and known.key != self.key(cell):
+            there, here = known.key or "unknown", self.key(cell)
             raise BadInput(
-                f"{self.study.path}: pinned: {cell}: {there}; {here}; go back to that, or remove its results"
+                f"{self.study.path}: pinned: {cell}: was done with key {there}, here is {here}; go back to what was "
+                "declared then, or remove its results"
             )
         return known
 
@@ -426,7 +434,7 @@ class Folder:
         """Do all cells that are not done; failed ones are tried again. Returns the state afterwards.
 
         :raises BadInput: the file of demonstrations, the adapter or a task cannot be used; a pinned study's code has
-            changes that are not committed.
+            changes that are not committed, or other results are of another commit.
         :raises Failed: a process died.
         """
         self.study.world()  # or something is wrong with it
@@ -438,6 +446,15 @@ class Folder:
         there = Folder(replace(self.study, path=self.study.path.resolve()), self.path.resolve())  # wherever workers are
         vars(there)["code"] = self.code  # of when the run began
         state, tried = self.state(), set[Cell]()
+        if (
+            self.study.declared.pinned
+            and len(state.done) < len(state.cells)
+            and (others := [*{*state.codes} - {self.code}])
+        ):
+            raise BadInput(
+                f"{self.study.path}: pinned: results are of commit {others[0]}, here is {self.code}; run it at that "
+                "commit, or remove them"
+            )
         with processes(workers.number(len(state.cells))):
             while cells := [cell for cell in state.cells if cell not in state.done and cell not in tried]:
                 calls = {str(cell): partial(there.do, cell) for cell in cells}
