@@ -5,9 +5,9 @@
     python arena_metaworld.py film TASK OUT.png NAME=EXPORTED [--frames 8]
 
 ``collect`` records the scripted expert, executed with normal noise on every control; of each step its phase is the
-return statement by which the expert's ``_desired_pos`` ended. ``play`` lets exported controllers act from initial
-states that were never demonstrated, the same for all, and on the observations of a demonstration. ``film`` draws an
-episode.
+return statement by which the expert's ``_desired_pos`` ended, or the assignment of ``delta_pos`` where it has none.
+``play`` lets exported controllers act from initial states that were never demonstrated, the same for all, and on the
+observations of a demonstration. ``film`` draws an episode.
 """
 
 from __future__ import annotations
@@ -105,7 +105,8 @@ def collect(
 ) -> None:
     """Record the first successful episodes from seed ``first`` on."""
     world, expert = Sawyer(task), ENV_POLICY_MAP[task]()
-    phases = Phases(type(expert)._desired_pos)
+    places = getattr(type(expert), "_desired_pos", None)
+    phases = Phases(places) if places else Phases(type(expert).get_action, "delta_pos")
 
     def demonstration(seed: int) -> Recorded | None:
         steps = demonstrate(world, expert, phases, seed, noise)

@@ -1,4 +1,4 @@
-"""Which return statement of a function ended its call: the phase that a scripted policy was in. Needs no package."""
+"""Which statement of a function decided what it returns: the phase that a scripted policy was in. Needs no package."""
 
 from __future__ import annotations
 
@@ -17,16 +17,18 @@ class Phases:
     The function is not changed: while it runs it is traced, and what returns is told by its line.
 
     :param function: a Python function whose source can be read.
-    :raises ValueError: it has no return statement.
+    :param key: the assignments to this key, as ``value[key] = ...``, count in place of return statements.
+    :raises ValueError: it has no such statement.
     """
 
-    def __init__(self, function: Callable[..., Any]) -> None:
+    def __init__(self, function: Callable[..., Any], key: str | None = None) -> None:
+        self._event, kind = ("return", "return statement") if key is None else ("line", f"assignment to {key!r}")
         self._code: CodeType = inspect.unwrap(function).__code__
         lines, first = inspect.getsourcelines(self._code)
         tree = ast.parse(textwrap.dedent("".join(lines)))
-        returns = sorted((node.lineno, node.end_lineno or node.lineno) for node in _returns(tree.body[0]))
+        returns = sorted((node.lineno, node.end_lineno or node.lineno) for node in _decisive(tree.body[0], key))
         if not returns:
-            raise ValueError(f"{function.__qualname__} has no return statement")
+            raise ValueError(f"{function.__qualname__} has no {kind}")
         self.lines = [first + start - 1 for start, _ in returns]
         self._phase = {
             first + line - 1: number for number, (start, end) in enumerate(returns) for line in range(start, end + 1)
@@ -52,14 +54,16 @@ class Phases:
         return self._inside if frame.f_code is self._code else None
 
     def _inside(self, frame: FrameType, event: str, _: Any) -> Callable[..., Any]:
-        if event == "return":
+        if event == self._event and (event == "return" or frame.f_lineno in self._phase):
             self._last = frame.f_lineno
         return self._inside
 
 
-def _returns(node: ast.AST) -> list[ast.Return]:
-    """The return statements of a function, without those of functions inside it."""
+def _decisive(node: ast.AST, key: str | None) -> list[ast.stmt]:
+    """The return statements of a function, or its assignments to a key, without those of functions inside it."""
     inner = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda, ast.ClassDef)
     children = [child for child in ast.iter_child_nodes(node) if not isinstance(child, inner)]
-    own = [child for child in children if isinstance(child, ast.Return)]
-    return own + [found for child in children for found in _returns(child)]
+    own = [child for child in children if isinstance(child, ast.Return if key is None else ast.Assign)]
+    if key is not None:
+        own = [one for one in own if isinstance(one, ast.Assign) and ast.unparse(one.targets[0]).endswith(f"[{key!r}]")]
+    return [*own, *(found for child in children for found in _decisive(child, key))]

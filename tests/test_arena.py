@@ -183,6 +183,27 @@ def test_a_phase_is_the_return_statement_that_was_reached(x, phase):
     assert (value, reached) == (expert.get_action(x), phase)
 
 
+def test_or_the_assignment_to_a_key():
+    def get_action(x):
+        action = {"move": 0, "grab": 0}
+        if x < 0:
+            action["move"] = 1
+        elif x < 1:
+            action["move"] = max(
+                x,
+                2,
+            )
+        action["grab"] = 1
+        return action
+
+    phases = Phases(get_action, "move")
+    assert [phases.of(get_action, x)[1] for x in (-1, 0)] == [0, 1]
+    with pytest.raises(LookupError):
+        phases.of(get_action, 2)
+    with pytest.raises(ValueError, match="has no assignment to 'other'"):
+        Phases(get_action, "other")
+
+
 def test_a_decorated_function_is_seen_through():
     @twice
     def desired(x):
