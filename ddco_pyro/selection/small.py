@@ -45,7 +45,7 @@ GRANULARITIES = {"coarse": 2.0, "medium": 1.0, "fine": 0.5}
 STEPS_A_SECOND = 10
 """Where the frequency is unknown."""
 PARTS = (1, 3)
-"""The half widths of the windows that are tried are one second over these; no window is tried, too."""
+"""The half widths of windows are one second over these: the first, and all and none where a length is asked for."""
 STEPS = 6000
 """Steps of the demonstrations that are used, about."""
 FEWEST = 4
@@ -111,8 +111,9 @@ def decide(
 def lasting(spec: Spec, demos: Demonstrations, steps: float | None, on_event: OnEvent = ignore) -> Lasting:
     """The power, and gates, with which a fit's median segment has a length that is asked for.
 
-    Fits are of the model alone, to some of the training demonstrations. Below :data:`USUAL` several windows are tried,
-    and the one with the best tuning log-likelihood is kept, since windows that are longer than skills mix them.
+    Fits are of the model alone, to some of the training demonstrations. Where a length is asked for, several windows
+    are tried below :data:`USUAL`, and the one with the best tuning log-likelihood is kept: windows that are longer
+    than skills mix them.
 
     :param steps: the length, in steps; None for any that is not too short for a skill.
     :raises BadInput: the spec has no options that last.
@@ -123,6 +124,7 @@ def lasting(spec: Spec, demos: Demonstrations, steps: float | None, on_event: On
 
     second = demos.frequency or STEPS_A_SECOND
     windows = [max(1, round(second / part)) for part in PARTS]
+    windows = windows[:1] if steps is None else [*windows, 0]
 
     def begun(power: float, constant: bool, window: int) -> Lasting:
         values = [-math.inf]
@@ -135,7 +137,7 @@ def lasting(spec: Spec, demos: Demonstrations, steps: float | None, on_event: On
         return Lasting(power, constant, window, segments_of(found.segment(some)[0]), values[-1])
 
     def tried(power: float, constant: bool) -> Lasting:
-        tries = [begun(power, constant, window) for window in ([*windows, 0] if power < USUAL else [0])]
+        tries = [begun(power, constant, window) for window in (windows if power < USUAL else [0])]
         found = max(tries, key=lambda one: one.value)
         on_event(LengthTried(power, constant, found.segments.median))
         return found
