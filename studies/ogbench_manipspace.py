@@ -1,11 +1,15 @@
 """What is done with OGBench's manipulation tasks, by the Python of an environment of its own (``apart.py``).
 
-    python ogbench_manipspace.py collect TASK OUT.hdf5 [--number 60] [--held-out 20] [--noise 0.0]
+    python ogbench_manipspace.py collect TASK OUT.hdf5 [--number 60] [--held-out 20] [--noise 0.0] [--goal 0]
+    python ogbench_manipspace.py play TASK OUT.json NAME=EXPORTED... [--episodes 50] [--first 0]
 
 ``collect`` records OGBench's scripted Markov oracles as OGBench's "noisy" data sets were: an episode has several
 targets one after another, drawn by the environment, and normal noise on every control, whose level is drawn for each
 episode. An episode counts where every target was reached. Labels are OGBench's own: the ``phase`` that the oracle
-announces, numbered over all oracles, and the ``object`` of the target.
+announces, numbered over all oracles, and the ``object`` of the target. With ``--goal 1`` the observation ``goal`` is
+where all objects are at the end of the episode, as OGBench represents goals to an oracle.
+
+``play`` lets exported controllers reach OGBench's own five goals of the task, one after another by the seed.
 """
 
 from __future__ import annotations
@@ -20,7 +24,7 @@ import arena_recording
 import gymnasium
 import numpy as np
 import ogbench.manipspace  # noqa: F401  registers the environments
-from arena_playing import arguments
+from arena_playing import Observation, arguments, named_controllers, play_all
 from arena_recording import Recorded
 from ogbench.manipspace.oracles.markov.button_markov import ButtonMarkovOracle
 from ogbench.manipspace.oracles.markov.cube_markov import CubeMarkovOracle
@@ -74,7 +78,7 @@ def announcing(kind: str, env: Any) -> Any:
 class Collector:
     """Episodes of a task."""
 
-    def __init__(self, task: str, noise: float) -> None:
+    def __init__(self, task: str, noise: float, goal: bool) -> None:
         self.objects, self.targets, self.number = TASKS[task]
         self.env = gymnasium.make(
             f"{task}-v0", mode="data_collection", terminate_at_goal=False, max_episode_steps=10_000
@@ -84,7 +88,7 @@ class Collector:
         self.first = dict(zip(kinds, np.cumsum([0, *counts]).tolist(), strict=False))
         self.labels = {"phase": sum(counts), "object": len(self.targets)}
         self.oracles = {kind: announcing(kind, self.env) for kind in kinds}
-        self.task, self.noise = task, noise
+        self.task, self.noise, self.goal = task, noise, goal
 
     def episode(self, seed: int) -> Recorded | None:
         """The episode of a seed; None where a target was not reached, or the cube left what cameras see."""
@@ -108,11 +112,13 @@ class Collector:
             if not told["success"] or self._hidden(told):
                 return None
         seen, controls, phases, targets = (np.array(part) for part in zip(*rows, strict=True))
-        sizes = ROBOT | self.objects
-        parts = np.split(seen.astype(np.float32), np.cumsum(list(sizes.values())), axis=1)
+        observations = named(self.task, seen)
+        if self.goal:
+            reached = self.env.compute_oracle_observation().astype(np.float32)
+            observations |= {"goal": np.tile(reached, (len(seen), 1))}
         return {
             "actions": controls,
-            **{f"obs/{key}": part for key, part in zip(sizes, parts, strict=False)},
+            **{f"obs/{key}": part for key, part in observations.items()},
             "labels/phase": phases.astype(np.int8),
             "labels/object": targets.astype(np.int8),
         }
@@ -129,19 +135,52 @@ class Collector:
         return bool(y >= 0.29 or (y <= -0.3 and not 0.06 <= z <= 0.08))
 
 
+class Goals:
+    """OGBench's own goals of a task. A seed has the goal of its remainder, and small random displacements."""
+
+    def __init__(self, task: str) -> None:
+        self.task, made = task, gymnasium.make(f"{task}-v0", use_oracle_rep=True)
+        self.env, self.limit = made.unwrapped, made.spec.max_episode_steps
+        self.outcome: dict[str, float] = {}
+
+    def reset(self, seed: int) -> Observation:
+        """The initial state of this seed."""
+        seen, told = self.env.reset(seed=seed, options={"task_id": 1 + seed % self.env.num_tasks})
+        self.goal, self.time = told["goal"].astype(np.float32), 0
+        return {**named(self.task, seen), "goal": self.goal}
+
+    def step(self, control: np.ndarray) -> tuple[Observation, bool, bool]:
+        """The next observation, whether the goal is reached, and whether OGBench's time is up."""
+        seen, _, _, _, told = self.env.step(np.clip(control, -1, 1))
+        self.time += 1
+        return {**named(self.task, seen), "goal": self.goal}, bool(told["success"]), self.time == self.limit
+
+
+def named(task: str, seen: np.ndarray) -> dict[str, np.ndarray]:
+    """Observations by key, as precise as they are recorded, of OGBench's vectors [..., D]."""
+    sizes = ROBOT | TASKS[task][0]
+    parts = np.split(seen.astype(np.float32), np.cumsum(list(sizes.values())), axis=-1)
+    return dict(zip(sizes, parts, strict=False))
+
+
 def main() -> None:
-    """Collect."""
-    parser = arguments(__doc__, ("collect",), 60)
+    """Collect, or let controllers act."""
+    parser = arguments(__doc__, ("collect", "play"), 60)
     parser.add_argument("--noise", type=float, default=0.0)
+    parser.add_argument("--goal", type=int, default=0, choices=(0, 1))
     own = parser.parse_args()
     if own.task not in TASKS:
         print(f"there is no task {own.task!r}; there is: {', '.join(TASKS)}", file=sys.stderr)
         raise SystemExit(2)
-    collector = Collector(own.task, own.noise)
+    first = own.first or 0
+    if own.what == "play":
+        seeds = range(first, first + own.episodes)
+        return play_all(Goals(own.task), own.out, named_controllers(own.controllers), seeds, own.recorded)
+    collector = Collector(own.task, own.noise, bool(own.goal))
     about = {"noise": own.noise, "objects": collector.targets}
     arena_recording.collect(
-        own.out, f"{own.task}-v0", collector.episode, own.number, own.held_out, collector.labels, own.first or 0,
-        own.attempts, **about,
+        own.out, f"{own.task}-v0", collector.episode, own.number, own.held_out, collector.labels, first, own.attempts,
+        **about,
     )  # fmt: skip
 
 

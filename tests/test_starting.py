@@ -304,22 +304,23 @@ def test_few_demonstrations_all_train(path: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("labels", "count"), [({}, 4), ({"one": 1}, 4), ({"many": 21}, 4), ({"coarse": 2, "fine": 6, "one": 1}, 6)]
+    ("labels", "count"),
+    [({}, 4), ({"one": 1}, 4), ({"many": 31}, 4), ({"phase": 23}, 23), ({"coarse": 2, "fine": 6, "one": 1}, 6)],
 )
 @pytest.mark.usefixtures("undecided")
 def test_there_are_as_many_options_as_labels(labels: dict[str, int], count: int, path: Path, tmp_path: Path) -> None:
     """Of the labelling that knows most; ``coarse`` knows no label in the first step."""
     records = []
     for number in range(9):
-        seen, actions = {"pose": np.random.default_rng(number).normal(size=(24, 2))}, np.arange(24.0)[:, None] % 5
-        given = {name: (np.arange(24) * most // 24) - 10 * (name == "fine") for name, most in labels.items()}
+        seen, actions = {"pose": np.random.default_rng(number).normal(size=(40, 2))}, np.arange(40.0)[:, None] % 5
+        given = {name: (np.arange(40) * most // 40) - 10 * (name == "fine") for name, most in labels.items()}
         if "coarse" in given:
             given["coarse"][0] = -1
         records.append((seen, actions, given))
     numbered(records).write(path)
     ended = call("init", path, "--out", tmp_path / "spec.yaml")
     assert load_spec(tmp_path / "spec.yaml").hierarchy.levels[0].count == count
-    said = [] if count == 4 else [f"{count} options, as many as the values of labels/fine"]
+    said = [f"{count} options, as many as the values of labels/{name}" for name in labels if labels[name] == count]
     assert ended.out.splitlines()[:-1] == said
 
 

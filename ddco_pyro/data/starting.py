@@ -28,7 +28,7 @@ MANY = 100
 OPTIONS = 4
 """Options where no labels say how many."""
 
-MOST_OPTIONS = 20
+MOST_OPTIONS = 30
 """Labels with more values than that do not decide the number of options."""
 
 MOST_EPOCHS = 2000

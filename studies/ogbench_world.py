@@ -1,0 +1,33 @@
+"""OGBench's manipulation tasks as worlds of a study: the goal is observed (``SHOWN``), or it is not (``HIDDEN``).
+
+The environment is made in ``runs/ogbench/venv`` from ``ogbench_requirements.txt``; ``ogbench_manipspace.py`` runs in it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from apart import Apart, World
+
+RUNS = Path(__file__).parents[1] / "runs" / "ogbench"
+NOISE = 0.1
+"""Up to which an episode draws the level of the noise on its controls, as in OGBench's script."""
+
+
+class ManipSpace(World):
+    """Tasks with their scripted oracles, and OGBench's own five goals of each.
+
+    :param goal: whether policies observe where all objects are at the end.
+    """
+
+    def __init__(self, goal: bool) -> None:
+        super().__init__(Apart("ogbench_manipspace.py", "ogbench_requirements.txt", RUNS))
+        self.goal = goal
+
+    def collect(self, task: str, seeds: range, count: int, path: Path) -> None:
+        """Record the first episodes in which the oracle reaches all its targets."""
+        options = {"number": count, "held_out": 1, "first": seeds.start, "attempts": len(seeds)}
+        self.simulator.collect(task, path, **options, noise=NOISE, goal=int(self.goal))
+
+
+SHOWN, HIDDEN = ManipSpace(goal=True), ManipSpace(goal=False)
