@@ -1,6 +1,7 @@
 """OGBench's manipulation tasks as worlds of a study: the goal is observed (``SHOWN``), or it is not (``HIDDEN``).
 
-The environment is made in ``runs/ogbench/venv`` from ``ogbench_requirements.txt``; ``ogbench_manipspace.py`` runs in it.
+The environment is made in ``runs/ogbench/venv`` from ``ogbench_requirements.txt``, and
+``ogbench_manipspace.py`` runs in it.
 """
 
 from __future__ import annotations
