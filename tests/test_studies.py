@@ -269,12 +269,9 @@ def test_the_frozen_test_is_fresh():
         if other.name != "frozen":
             assert not {*frozen.tasks} & {*other.tasks}
             for key in ("seeds", "demonstrations", "starts"):
-                ours, theirs = (
-                    {n for numbers in one.declared.ranges(key).values() for n in numbers}
-                    for one in (frozen, other)
-                    if getattr(one.declared, key)
-                )
-                assert not ours & theirs
+                ranges = [one.declared.ranges(key) for one in (frozen, other) if getattr(one.declared, key)]
+                ours, *theirs = ({n for numbers in one.values() for n in numbers} for one in ranges)
+                assert not any(ours & numbers for numbers in theirs)
 
 
 def test_a_training_seed_draws_its_own_demonstrations(done):
