@@ -69,7 +69,7 @@ class Apart:
         """
         return environment(self.runs / "venv", HERE / self.pins)
 
-    def collected(self, task: str, **options: float) -> Path:
+    def collected(self, task: str, **options: float | str) -> Path:
         """The task's demonstrations, recorded where they are not there, or were by other code or options.
 
         :param options: of the script's command ``collect``.
@@ -83,7 +83,7 @@ class Apart:
                 self.collect(task, path, **options)
         return path
 
-    def collect(self, task: str, path: Path, **options: float) -> None:
+    def collect(self, task: str, path: Path, **options: float | str) -> None:
         """Record demonstrations of a task into a file, with options as :meth:`collected`."""
         run(self.made(), HERE / self.script, "collect", task, path, *_words(options))
 

@@ -1,6 +1,6 @@
 """What is done with OGBench's manipulation tasks, by the Python of an environment of its own (``apart.py``).
 
-    python ogbench_manipspace.py collect TASK OUT.hdf5 [--number 60] [--held-out 20] [--noise 0.0] [--goal 0]
+    python ogbench_manipspace.py collect TASK OUT.hdf5 [--number 60] [--noise 0.0] [--goal 0] [--labels phase]
     python ogbench_manipspace.py play TASK OUT.json NAME=EXPORTED... [--episodes 50] [--first 0]
 
 ``collect`` records OGBench's scripted Markov oracles as OGBench's "noisy" data sets were: an episode has several
@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Collection
 from typing import Any
 
 os.environ.setdefault("MUJOCO_GL", "egl")
@@ -55,6 +56,9 @@ TASKS: dict[str, tuple[dict[str, int], list[str], int]] = {
 }
 """The objects in the vector of observations, those that can be a target, and the targets of an episode."""
 
+LABELS = ("phase", "object")
+"""What the oracle does, and what it does it to."""
+
 STACKED = 0.25
 """The chance that a cube is to be put on another one is drawn up to here for each episode."""
 
@@ -78,7 +82,7 @@ def announcing(kind: str, env: Any) -> Any:
 class Collector:
     """Episodes of a task."""
 
-    def __init__(self, task: str, noise: float, goal: bool) -> None:
+    def __init__(self, task: str, noise: float, goal: bool, labels: Collection[str]) -> None:
         self.objects, self.targets, self.number = TASKS[task]
         self.env = gymnasium.make(
             f"{task}-v0", mode="data_collection", terminate_at_goal=False, max_episode_steps=10_000
@@ -87,6 +91,7 @@ class Collector:
         counts = [ORACLES[kind][1] for kind in kinds]
         self.first = dict(zip(kinds, np.cumsum([0, *counts]).tolist(), strict=False))
         self.labels = {"phase": sum(counts), "object": len(self.targets)}
+        self.labels = {name: values for name, values in self.labels.items() if name in labels}
         self.oracles = {kind: announcing(kind, self.env) for kind in kinds}
         self.task, self.noise, self.goal = task, noise, goal
 
@@ -112,15 +117,14 @@ class Collector:
             if not told["success"] or self._hidden(told):
                 return None
         seen, controls, phases, targets = (np.array(part) for part in zip(*rows, strict=True))
-        observations = named(self.task, seen)
+        observations, said = named(self.task, seen), {"phase": phases, "object": targets}
         if self.goal:
             reached = self.env.compute_oracle_observation().astype(np.float32)
             observations |= {"goal": np.tile(reached, (len(seen), 1))}
         return {
             "actions": controls,
             **{f"obs/{key}": part for key, part in observations.items()},
-            "labels/phase": phases.astype(np.int8),
-            "labels/object": targets.astype(np.int8),
+            **{f"labels/{name}": said[name].astype(np.int8) for name in self.labels},
         }
 
     def _which(self, kind: str, told: dict[str, Any]) -> list[str]:
@@ -168,6 +172,7 @@ def main() -> None:
     parser = arguments(__doc__, ("collect", "play"), 60)
     parser.add_argument("--noise", type=float, default=0.0)
     parser.add_argument("--goal", type=int, default=0, choices=(0, 1))
+    parser.add_argument("--labels", nargs="+", default=LABELS, choices=LABELS)
     own = parser.parse_args()
     if own.task not in TASKS:
         print(f"there is no task {own.task!r}; there is: {', '.join(TASKS)}", file=sys.stderr)
@@ -176,7 +181,7 @@ def main() -> None:
     if own.what == "play":
         seeds = range(first, first + own.episodes)
         return play_all(Goals(own.task), own.out, named_controllers(own.controllers), seeds, own.recorded)
-    collector = Collector(own.task, own.noise, bool(own.goal))
+    collector = Collector(own.task, own.noise, bool(own.goal), own.labels)
     about = {"noise": own.noise, "objects": collector.targets}
     arena_recording.collect(
         own.out, f"{own.task}-v0", collector.episode, own.number, own.held_out, collector.labels, first, own.attempts,

@@ -27,7 +27,6 @@ from people import LABELS, PeopleCell
 from study import Row, Settings, described
 
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.data.files import only_one
 
 RECORDED, TRAINED = 120, 40
 TASKS = ("cube-single", "scene", "cube-double", "puzzle-3x3")
@@ -62,13 +61,9 @@ class OGBenchCell(PeopleCell):
 
     def demonstrations(self, settings: Settings) -> tuple[Path, Demonstrations]:
         """A file with the labels of the level alone, and the demonstrations of the seed."""
-        noise = settings.values["noise"]
-        source = simulator(settings).collected(self.task, number=RECORDED, held_out=HELD_OUT, noise=noise)
-        path = settings.runs / "levels" / f"{self.task}-{self.level}-{noise}.hdf5"
-        with only_one(path.parent, wait=True):
-            if not path.exists():
-                Demonstrations.read(source, labels=[self.level]).write(path)
-        demos = Demonstrations.read(path, labels=[self.level])
+        noise, level = settings.values["noise"], self.level
+        path = simulator(settings).collected(self.task, number=RECORDED, held_out=HELD_OUT, noise=noise, labels=level)
+        demos = Demonstrations.read(path, labels=[level])
         train, valid = (list(demos.masks[part]) for part in ("train", "valid"))
         drawn = np.random.default_rng(int(self.fold.removeprefix("seed-"))).permutation(len(train))[:TRAINED]
         masks = {"train": tuple(train[place] for place in sorted(drawn)), "valid": tuple(valid)}

@@ -16,7 +16,7 @@ NOISE = 0.1
 
 
 class ManipSpace(World):
-    """Tasks with their scripted oracles, and OGBench's own five goals of each.
+    """Tasks with their scripted oracles, whose phases are labels, and OGBench's own five goals of each.
 
     :param goal: whether policies observe where all objects are at the end.
     """
@@ -28,7 +28,7 @@ class ManipSpace(World):
     def collect(self, task: str, seeds: range, count: int, path: Path) -> None:
         """Record the first episodes in which the oracle reaches all its targets."""
         options = {"number": count, "held_out": 1, "first": seeds.start, "attempts": len(seeds)}
-        self.simulator.collect(task, path, **options, noise=NOISE, goal=int(self.goal))
+        self.simulator.collect(task, path, **options, noise=NOISE, goal=int(self.goal), labels="phase")
 
 
 SHOWN, HIDDEN = ManipSpace(goal=True), ManipSpace(goal=False)
