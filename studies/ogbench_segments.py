@@ -34,6 +34,8 @@ TASKS = ("cube-single", "scene", "cube-double", "puzzle-3x3")
 OBJECTS = TASKS[1:]
 """Tasks with several objects."""
 DEFAULTS = Settings({"seed": 0, "noise": 0.0}, Path("runs/ogbench"))
+GRIPPER, LEARNED = 4, {"learn": True, "floor": 0.01, "per_option": True}
+"""The control dimension, and ``control.std`` as init writes it."""
 STICKINESS = (0.0, 1e3, 1e5)
 """Pseudo-counts of staying that are tried for an AR-HMM."""
 
@@ -56,8 +58,12 @@ class OGBenchCell(PeopleCell):
 
     @property
     def further(self) -> dict[str, dict[str, Any]]:
-        """Controls that are Gaussian, and not clipped."""
-        return {"options, Gaussian": {"control.kind": "gaussian"}}
+        """Controls that are Gaussian, and not clipped or a switch: all, or the gripper's alone."""
+        gripper = {"name": "gripper", "dims": [GRIPPER], "kind": "gaussian", "std": LEARNED}
+        return {
+            "options, Gaussian": {"control.kind": "gaussian"},
+            "options, Gaussian gripper": {"control.parts": [gripper]},
+        }
 
     def demonstrations(self, settings: Settings) -> tuple[Path, Demonstrations]:
         """A file with the labels of the level alone, and the demonstrations of the seed."""
