@@ -31,11 +31,13 @@ from ddco_pyro.data.demonstrations import Demonstrations
 RECORDED, TRAINED = 120, 40
 TASKS = ("cube-single", "scene", "cube-double", "puzzle-3x3")
 """The last two are those on which nothing was chosen."""
-OBJECTS = TASKS[1:]
-"""Tasks with several objects."""
+OBJECTS = {"scene": 5, "cube-double": 2, "puzzle-3x3": 9}
+"""Of tasks with several."""
 DEFAULTS = Settings({"seed": 0, "noise": 0.0}, Path("runs/ogbench"))
 GRIPPER, LEARNED = 4, {"learn": True, "floor": 0.01, "per_option": True}
 """The control dimension, and ``control.std`` as init writes it."""
+LINEAR = {"policy": {"network": "linear"}, "termination": {"network": "linear"}}
+"""A level, as init writes it."""
 STICKINESS = (0.0, 1e3, 1e5)
 """Pseudo-counts of staying that are tried for an AR-HMM."""
 
@@ -58,7 +60,10 @@ class OGBenchCell(PeopleCell):
 
     @property
     def further(self) -> dict[str, dict[str, Any]]:
-        """Controls that are Gaussian, and not clipped or a switch: all, or the gripper's alone."""
+        """Controls that are Gaussian, and not clipped or a switch: all, or the gripper's alone. Objects: two levels."""
+        if self.level == "object":
+            below, above = {**LINEAR, "count": 4}, {**LINEAR, "count": OBJECTS[self.task], "name": "object"}
+            return {"options, two levels": {"hierarchy.levels": [below, above], "demonstrations.labels": None}}
         gripper = {"name": "gripper", "dims": [GRIPPER], "kind": "gaussian", "std": LEARNED}
         return {
             "options, Gaussian": {"control.kind": "gaussian"},

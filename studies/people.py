@@ -71,7 +71,7 @@ class PeopleCell(Cell):
 
     @property
     def further(self) -> dict[str, dict[str, Any]]:
-        """Further fits without labels: what they change in the spec."""
+        """Further fits without labels, of which the highest level counts: what they change in the spec."""
         return {"options, β = 1": USUAL}
 
     def demonstrations(self, settings: Settings) -> tuple[Path, Demonstrations]:
@@ -99,7 +99,7 @@ class PeopleCell(Cell):
             kinds |= {name: segment(key, train, valid, count, 0, spec.observations) for name, key in BASELINES.items()}
             kinds |= dict(zip(("AR-HMM", "AR-HMM, sticky"), autoregressive(train, valid, count, typical), strict=True))
             for name, changes in self.further.items():
-                kinds[name] = list(fit(with_overrides(spec, changes), demos).segment(valid)[0])
+                kinds[name] = list(fit(with_overrides(spec, changes), demos).segment(valid)[-1])
             asked = decide(plain, replace(train, masks={}), demos.frequency, typical)
             as_asked = starting_spec(replace(facts, excluded=(), masks={}), path, decided=asked).text
             longer = with_overrides(parse_spec(read_yaml(as_asked)), ALONE | {"seed": settings.values["seed"]})
