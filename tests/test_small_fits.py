@@ -17,7 +17,7 @@ from ddco_pyro.acting.monitor import run_lengths
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.options import segments_of
 from ddco_pyro.metrics import Segments
-from ddco_pyro.selection.small import Lasting, heavy_tails, in_steps, lasting, overrides, unasked
+from ddco_pyro.selection.small import Lasting, asked, heavy_tails, in_steps, lasting, overrides, unasked
 from ddco_pyro.spec import load_spec, parse_spec, with_overrides
 
 SLOW = 30
@@ -129,6 +129,16 @@ def test_heavy_tails_are_found_where_they_predict_better():
         noise = [0.3 * own * random.normal(size=(60, 2)) for own in scale]
         demos = numbered(({"state": x}, x + e) for x, e in zip(observed, noise, strict=True))
         assert heavy_tails(spec, demos) == dims
+
+
+def test_a_step_less_than_is_asked_is_near_enough():
+    """Less power would trade a step less for a step more, and options that hardly differ."""
+    medians = {0.5: 4, 0.25: 8, 0.35: 7}
+
+    def tried(power, constant):
+        return Lasting(power, constant, 0, Segments(median=medians[power], number=30, demonstrations=1), 0.0)
+
+    assert [asked(tried, steps).power for steps in (5, 6, 8)] == [0.5, 0.35, 0.25]
 
 
 @pytest.mark.parametrize(

@@ -30,8 +30,8 @@ FIRST, LEAST = 0.5, 0.005
 HALVINGS = 2
 """Powers that are tried between two with gates of one kind."""
 NEAR, FAR = 1.15, 1.5
-"""Factors between the median and what is asked: a search ends within the first; gates stay as they are within the
-second."""
+"""Factors between the median and what is asked: a search ends within the first, or a step; gates stay as they are
+within the second."""
 LADDER = (0.5, 0.05, 0.02)
 """Powers that are tried in this order where no length is asked for, at last with constant gates."""
 FEW = 3
@@ -103,8 +103,8 @@ def decide(
     """
     heavy = heavy_tails(spec, demos)
     found = lasting(with_heavy_tails(spec, heavy), demos, steps, on_event)
-    asked = "" if steps is None else f"; asked: {duration(frequency, steps)}"
-    why = f"median segment {duration(frequency, found.segments.median)} in small fits{asked}"
+    wanted = "" if steps is None else f"; asked: {duration(frequency, steps)}"
+    why = f"median segment {duration(frequency, found.segments.median)} in small fits{wanted}"
     return Decided(found.power, found.constant, found.window, why, heavy)
 
 
@@ -142,7 +142,7 @@ def lasting(spec: Spec, demos: Demonstrations, steps: float | None, on_event: On
         on_event(LengthTried(power, constant, found.segments.median))
         return found
 
-    return unasked(tried, demos.frequency) if steps is None else _searched(tried, steps)
+    return unasked(tried, demos.frequency) if steps is None else asked(tried, steps)
 
 
 def _sketch(spec: Spec) -> Spec:
@@ -248,7 +248,7 @@ def _few(found: Lasting) -> bool:
     return found.segments.number < FEW * found.segments.demonstrations
 
 
-def _searched(tried: Callable[[float, bool], Lasting], steps: float) -> Lasting:
+def asked(tried: Callable[[float, bool], Lasting], steps: float) -> Lasting:
     """The largest power whose median is about as long as is asked for: down in halves, then between the last two.
 
     Too small a power makes segments short again, since options then hardly differ.
@@ -258,13 +258,13 @@ def _searched(tried: Callable[[float, bool], Lasting], steps: float) -> Lasting:
         shorter, power = 1.0, FIRST
         while power >= LEAST:
             found.append(tried(power, constant))
-            if found[-1].segments.median >= steps:
+            if found[-1].segments.median >= steps or _near(found[-1], steps):
                 break
             shorter, power = power, power / 2
         else:
             power = 0.0
         for _ in range(HALVINGS if power else 0):
-            if _off(min(found, key=lambda one: _off(one, steps)), steps) < NEAR:
+            if any(_near(one, steps) for one in found):
                 break
             found.append(tried(float(f"{math.sqrt(shorter * power):.2g}"), constant))
             longer = found[-1].segments.median >= steps
@@ -273,6 +273,10 @@ def _searched(tried: Callable[[float, bool], Lasting], steps: float) -> Lasting:
         if _off(best, steps) < FAR:
             break
     return best
+
+
+def _near(found: Lasting, steps: float) -> bool:
+    return _off(found, steps) < NEAR or abs(found.segments.median - steps) <= 1
 
 
 def _off(found: Lasting, steps: float) -> float:
