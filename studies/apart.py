@@ -21,13 +21,16 @@ from typing import Any, Protocol
 
 import h5py
 import numpy as np
-from policies import KINDS, Policy, Settings, fit
+from arena_playing import write_chunk
+from policies import KINDS, Policy, Settings, chunked, fit
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import only_one, write_text
 from ddco_pyro.errors import BadInput, Failed
 from ddco_pyro.exporting import write_numpy
+from ddco_pyro.fitting.fit import fit as fit_spec
 from ddco_pyro.fitting.fitted import Fit
+from ddco_pyro.spec import with_overrides
 from ddco_pyro.study.cells import Job
 
 HERE = Path(__file__).parent
@@ -127,12 +130,34 @@ class Peers(ABC):
         return means(self.play(job.cell.task, policy, job.starts, job.folder))
 
 
+@dataclass(frozen=True)
+class Chunked:
+    """A fit whose control is a chunk of controls, as :class:`arena_playing.Chunks` executes it."""
+
+    fitted: Fit
+    chunk: int
+    executed: int
+
+    def write(self, folder: Path) -> None:
+        """Write it for :func:`arena_playing.exported`."""
+        write_numpy(self.fitted, folder)
+        write_chunk(folder, self.chunk, self.executed)
+
+
 class World(Peers):
-    """A simulator apart as the world of a study."""
+    """A simulator apart as the world of a study; of its method ``chunked``, options emit chunks of controls."""
 
     def __init__(self, simulator: Apart) -> None:
         super().__init__()
         self.simulator = simulator
+        self.methods["chunked"] = self._chunked
+
+    def _chunked(self, job: Job) -> dict[str, float]:
+        """Settings are ``chunk``, ``executed``, and key paths of the spec."""
+        spec = {key: value for key, value in job.settings.items() if "." in key}
+        chunk, executed = job.settings["chunk"], job.settings["executed"]
+        fitted = fit_spec(with_overrides(job.spec, spec), chunked(job.demos, chunk), out=job.folder / "fit", keep=False)
+        return means(self.play(job.cell.task, Chunked(fitted, chunk, executed), job.starts, job.folder))
 
     def play(self, task: str, fitted: Fit | Written, starts: range, folder: Path) -> Sequence[Mapping[str, float]]:
         """Episodes of the exported policy: success, steps, and what else the simulator measures."""
