@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import apart
 import arena_playing
 import numpy as np
 import policies
-import pusht
 import pytest
 import torch
 
@@ -179,7 +179,7 @@ def test_a_world_trains_with_the_settings_of_a_cell_and_plays_what_it_wrote(tmp_
         "hierarchy": {"levels": [{"count": 2, "policy": {"network": "linear"}}], "meta_policy": {"network": "linear"}},
         "training": {"epochs": 60, "optimizer": {"name": "em"}},
     })  # fmt: skip
-    world, cell = pusht.PushT(Here(demos[0], tmp_path)), Cell("test", "PushT", "", 6, 0)
+    world, cell = apart.World(Here(demos[0], tmp_path)), Cell("test", "PushT", "", 6, 0)
 
     def measured(method, **settings):
         return world.methods[method](Job(cell, spec, demos, range(5, 8), tmp_path / method, settings))

@@ -266,14 +266,13 @@ def test_calls_are_made_here_or_in_other_processes_that_end_with_them() -> None:
 def test_processes_that_are_there_make_the_calls_of_a_block(modules) -> None:
     with processes(2, *modules):
         with run_all(dict.fromkeys(range(9), os.getpid), Workers(2), "worked") as results:
-            first = {process for _, process in results}
+            there = {process for _, process in results}
         with run_all({0: os.getpid}, Workers(2), "worked", beside=1) as results:
-            ((_, again),) = results
-        assert again in first
-        assert len(first) <= 2
-        assert all(alive(process) for process in first)
-        assert not {*places(3, 9).values()} & first  # too few of them are there
-    assert not any(alive(process) for process in first)
+            there |= {process for _, process in results}  # the second one may have begun late
+        assert len(there) <= 2
+        assert all(alive(process) for process in there)
+        assert not {*places(3, 9).values()} & there  # too few of them are there
+    assert not any(alive(process) for process in there)
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
