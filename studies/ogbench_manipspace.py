@@ -90,8 +90,8 @@ class Collector:
         kinds = dict.fromkeys(target.split()[0] for target in self.targets)
         counts = [ORACLES[kind][1] for kind in kinds]
         self.first = dict(zip(kinds, np.cumsum([0, *counts]).tolist(), strict=False))
-        self.labels = {"phase": sum(counts), "object": len(self.targets)}
-        self.labels = {name: values for name, values in self.labels.items() if name in labels}
+        values = {"phase": sum(counts), "object": len(self.targets)}
+        self.labels = {name: values[name] for name in labels}
         self.oracles = {kind: announcing(kind, self.env) for kind in kinds}
         self.task, self.noise, self.goal = task, noise, goal
 
