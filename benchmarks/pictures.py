@@ -162,7 +162,7 @@ def trainer(demos: Demonstrations, workers: int = 0) -> Trainer:
             "demonstrations": {"path": "unused.hdf5"},
             "observations": ["pose", "camera"],
             "hierarchy": {"levels": [level], "meta_policy": FF},
-            "training": {"initialize": "random", "layerwise": False, "workers": workers, **budget},
+            "training": {"starts": ["random"], "layerwise": False, "workers": workers, **budget},
         }
     )
     return Trainer(spec, Dimensions.of(demos), train, tune)

@@ -15,6 +15,7 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.starting import STARTS
 from ddco_pyro.errors import BadInput, check_whole
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.inference.engines import log_likelihood
@@ -58,7 +59,7 @@ class OptionSegmenter(BaseEstimator):
     :param differences: whether networks read x_t − x_{t−1}, too.
     :param control: the distribution of the controls, as ``control.kind`` in a spec.
     :param random_state: the seed of the fit, a ``RandomState``, or None for another seed in each fit.
-    :param settings: other settings by their key path in a spec, such as ``{"training.restarts": 5}``.
+    :param settings: other settings by their key path in a spec, such as ``{"training.layerwise": False}``.
 
     ``fit_`` is the :class:`~ddco_pyro.Fit`, ``spec_`` its spec, ``n_features_in_`` the number of columns of X.
     """
@@ -148,7 +149,7 @@ class OptionSegmenter(BaseEstimator):
         settings = {} if self.settings is None else self.settings
         if not isinstance(settings, Mapping) or not all(isinstance(path, str) for path in settings):
             raise BadInput(
-                f"settings={settings!r}: has to be a mapping of key paths, such as {{'training.restarts': 5}}"
+                f"settings={settings!r}: has to be a mapping of key paths, such as {{'training.layerwise': False}}"
             )
         network = {"network": "linear"}
         data = {
@@ -160,7 +161,7 @@ class OptionSegmenter(BaseEstimator):
                 "meta_policy": network,
             },
             "training": {
-                "initialize": "vq_controls",
+                "starts": STARTS,
                 "optimizer": {"name": "em", "lr": 3e-3},
                 "patience": 50,
                 "tune_fraction": 0 if linear else 0.1,

@@ -55,7 +55,7 @@ class UpdatesDone(Event):
 
 @dataclass(frozen=True)
 class RestartStopped(Event):
-    """Successive halving stopped a restart after ``epochs`` epochs of its last stage."""
+    """A restart far behind the likeliest was stopped after ``epochs`` epochs of its last stage."""
 
     restart: int
     epochs: int

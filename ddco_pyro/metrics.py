@@ -9,7 +9,7 @@ import csv
 import io
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Generic, TypeVar
+from typing import Annotated, Any, ClassVar, Generic, TypeVar
 
 from pydantic import (
     BaseModel,
@@ -150,8 +150,10 @@ class Restart(Record):
     epochs: int
     stopped: int | None
     diverged: LeftOut[bool] = False
-    initialize: LeftOut[str | None] = None
-    """The kind of initialisation (``training.initialize``); left out for a policy without options."""
+    start: str
+    """What it began from (``training.starts``)."""
+    objective: Finite | None
+    """As of the model; None where it diverged or was stopped."""
     nmi: LeftOut[Finite | None] = None
     """NMI of its segments with the best restart's: of the training demonstrations, at the lowest level."""
 
@@ -192,6 +194,9 @@ class Training(Record):
     stages: Annotated[list[Stage], Field(min_length=1)]
     converged: bool
     restarts: Restarts
+    objective: Finite
+    """What the best restart has: the log-likelihood of the training demonstrations (``control.power``) with the
+    log-prior of EM's ridges, nats per step."""
     device: str
     by_em: bool
     """Whether the gradient steps are EM steps over all training demonstrations."""
@@ -209,6 +214,26 @@ class Compared(Record):
     difference: Difference
     parameters: int
     training: Training
+
+
+class Below(Record):
+    """By how much training demonstrations are less likely under a hierarchy than under a mixture that it contains.
+
+    Nats per step: of the ``objective`` of training, and of the log-likelihood. Negative where they are likelier.
+    """
+
+    objective: Finite
+    nats: Finite
+
+    CLOSE: ClassVar[float] = 0.01
+    """An objective that is lower by less is as high."""
+    NEAR: ClassVar[float] = 0.05
+    """The same of the log-likelihood, which training raises only where controls count fully."""
+
+    @property
+    def told(self) -> bool:
+        """Whether the hierarchy ended in a worse optimum."""
+        return self.objective > self.CLOSE or self.nats > self.NEAR
 
 
 class InARow(Record):
@@ -523,6 +548,8 @@ class Metrics(Record, frozen=False):
     demonstrations_by_likelihood: list[Listed]
     comparison: dict[str, Compared]
     worth: LeftOut[Worth | None] = None
+    below: LeftOut[dict[str, Below]] = {}
+    """By the name of each mixture among the baselines that the hierarchy contains."""
     branches: LeftOut[list[BranchUse]] = []
     options: LeftOut[list[list[Use]]] = []
     segments: LeftOut[list[Segments]] = []

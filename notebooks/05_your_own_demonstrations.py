@@ -67,7 +67,7 @@ hierarchy:
   levels:
     - {{count: 4, policy: {{network: linear}}, termination: {{network: linear}}}}
   meta_policy: {{network: linear}}
-training: {{initialize: vq_controls, optimizer: {{lr: 1.0e-2}}, epochs: 400}}
+training: {{starts: [vq_controls], optimizer: {{lr: 1.0e-2}}, epochs: 400}}
 compare_with: [flat]
 """
 (RUNS / "mine.yaml").write_text(SPEC)

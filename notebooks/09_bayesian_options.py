@@ -90,7 +90,7 @@ control: {{std: {SIGMA}, scale: none}}
 hierarchy:
   levels: [{{count: 3, policy: {{network: linear}}, termination: {{network: linear}}}}]
   meta_policy: {{network: linear}}
-training: {{optimizer: {{name: em}}, restarts: 3, tune_fraction: 0}}
+training: {{optimizer: {{name: em}}, starts: [vq, vq, vq], tune_fraction: 0}}
 compare_with: []
 """
 spec = parse_spec(yaml.safe_load(SPEC))

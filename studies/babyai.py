@@ -138,7 +138,7 @@ def rule(source: Path, keys: list[str], levels: int, seed: int) -> dict[str, Any
             "meta_policy": LINEAR,
         },
         "training": {
-            "initialize": "vq_controls",
+            "starts": ["vq_controls"],
             "optimizer": {"name": "adam", "lr": 3e-3, "weight_decay": 1e-3},
             "epochs": 400,
             "patience": 50,

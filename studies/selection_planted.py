@@ -68,7 +68,7 @@ def planted_spec(path: Path, folds: int, most: int, seed: int) -> Spec:
             "meta_policy": {"network": "linear"},
         },
         "training": {
-            "initialize": "vq",
+            "starts": ["vq"],
             "layerwise": False,
             "epochs": 80,
             "patience": 10,

@@ -339,10 +339,10 @@ def test_an_option_of_most_steps_of_some_demonstrations_is_a_sign(demonstrations
 @pytest.mark.parametrize(
     ("training", "clusters"),
     [
-        ({"initialize": "equal_parts"}, True),
-        ({"initialize": "random"}, True),
-        ({"initialize": "vq_controls"}, False),
-        ({"initialize": "equal_parts", "labels": {"level": "option", "from": "phase"}}, False),
+        ({"starts": ["equal_parts"]}, True),
+        ({"starts": ["random"]}, True),
+        ({"starts": ["vq_controls"]}, False),
+        ({"starts": ["equal_parts"], "labels": {"level": "option", "from": "phase"}}, False),
     ],
 )
 def test_clusters_are_advised_where_neither_they_nor_labels_start(training: dict[str, Any], clusters: bool) -> None:

@@ -52,7 +52,7 @@ def with_controls(demos: Demonstrations, change: dict[str, np.ndarray] | None = 
 
 
 def spec_for(path: Path, **changes: object) -> Spec:
-    spec = make_spec((2,), control={"std": {"learn": True}}, initialize="vq_controls", epochs=3, batch_size=2)
+    spec = make_spec((2,), control={"std": {"learn": True}}, starts=["vq_controls"], epochs=3, batch_size=2)
     own = {"hierarchy.meta_policy.emits": ["options", "control"], "compare_with": ["flat"]}
     return with_overrides(spec, {**own, "demonstrations": {"path": str(path)}, **changes})
 

@@ -193,7 +193,7 @@ def resting():
 
 def resting_spec(options=3, epochs=6, **control):
     control = {"std": {"learn": True, "per_option": True}, **control}
-    spec = make_spec((options,), control=control, epochs=epochs, initialize="vq_controls")
+    spec = make_spec((options,), control=control, epochs=epochs, starts=["vq_controls"])
     return with_overrides(spec, {"demonstrations.valid_fraction": 0.34})
 
 

@@ -214,7 +214,7 @@ def test_of_several_gpus_each_process_has_its_own(monkeypatch: pytest.MonkeyPatc
 
 def test_a_run_goes_on_where_it_was_begun(demos: Demonstrations, tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     """On the same kind of device bit for bit; on another it is refused before a bit is trained."""
-    spec = spec_of(DROPPING, initialize="random")
+    spec = spec_of(DROPPING, starts=["random"])
 
     def stop(event: Any) -> None:
         if type(event).__name__ == "EpochEnded" and event.epoch == 2:
@@ -238,8 +238,8 @@ def test_a_run_goes_on_where_it_was_begun(demos: Demonstrations, tmp_path, monke
 
 
 def test_restarts_that_were_stopped_elsewhere_keep_nothing_from_being_finished(demos, tmp_path, monkeypatch) -> None:
-    """Nothing is left to train; what `halving` stopped is not, wherever that is."""
-    spec = spec_of(DROPPING, initialize="random", restarts=3, halving=1)
+    """Nothing is left to train; what is far behind is not, wherever that is."""
+    spec = spec_of(DROPPING, starts=["random"] * 3)
     on(monkeypatch, THERE)
     with Device():
         there = ddco_pyro.fit(spec, demos, tmp_path)
@@ -261,7 +261,7 @@ def test_a_fit_leaves_generators_as_they_were(demos: Demonstrations, monkeypatch
     torch.manual_seed(0)
     assert seeded == [0]
     before = torch.get_rng_state()
-    ddco_pyro.fit(spec_of(DROPPING, epochs=1, initialize="random"), demos)
+    ddco_pyro.fit(spec_of(DROPPING, epochs=1, starts=["random"]), demos)
     assert seeded == [0]
     assert torch.equal(torch.get_rng_state(), before)
 

@@ -65,7 +65,7 @@ def test_its_gradient_is_that_of_finite_differences():
 
 # --- in training ------------------------------------------------------------------------------------------------------
 
-TRAINING = {"epochs": 80, "patience": None, "initialize": "vq_controls", "batch_size": 4, "optimizer": {"lr": 0.1}}
+TRAINING = {"epochs": 80, "patience": None, "starts": ["vq_controls"], "batch_size": 4, "optimizer": {"lr": 0.1}}
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +117,7 @@ def test_its_weight_counts_as_much_whatever_the_number_of_demonstrations(demos, 
     """By EM, of constants ψ: the M-step's fixed point, Σ_h ψ_h (steps_h + w N / k) = ends + w N / m, with counts that
     the posterior expects."""
     few, constant, weight = demos.select(demos.names[:number]), {"network": "constant"}, 1.5
-    spec = make_spec((2,), initialize="vq_controls", duration={"mean": 12, "weight": weight}, tune_fraction=0)
+    spec = make_spec((2,), starts=["vq_controls"], duration={"mean": 12, "weight": weight}, tune_fraction=0)
     changed = {"hierarchy.meta_policy": constant, "hierarchy.levels.0.termination": constant, "training.epochs": 300}
     changed |= {"training.optimizer": {"name": "em"}, "demonstrations.valid_fraction": 0}
     fit = ddco_pyro.fit(with_overrides(spec, changed), few)

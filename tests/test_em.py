@@ -31,9 +31,7 @@ from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.outputs import bounded
 from ddco_pyro.spec import RidgeSpec, SpecError, parse_spec, with_overrides
 from ddco_pyro.training import em
-from ddco_pyro.training.checkpoint import Progress, Restart
 from ddco_pyro.training.em import Expectation, is_linear
-from ddco_pyro.training.loop import train
 from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.restarts import Trainer
 from ddco_pyro.training.ridge import cross_validated
@@ -343,7 +341,7 @@ def test_options_under_heavy_tails_are_recovered_with_their_freedom(freedom):
     agreement = {}
     for kind, more in (("gaussian", {}), ("student", {"freedom": "learn"})):
         control = {"kind": kind, "std": {**LEARNED, "per_option": True}, **more}
-        spec = make_spec((3,), control=control, initialize="vq_controls", optimizer={"name": "em"}, epochs=150)
+        spec = make_spec((3,), control=control, starts=["vq_controls"], optimizer={"name": "em"}, epochs=150)
         fit = ddco_pyro.fit(with_overrides(spec, {"demonstrations.valid_fraction": 0.0}), demos)
         batch = encode(demos, fit.hierarchy.encoder, fit.hierarchy.scaling)
         (found,) = segment(fit.hierarchy.tabulate(batch), batch.lengths)
@@ -446,24 +444,6 @@ def test_a_flat_policy_for_each_time_step_is_least_squares_at_that_step():
     assert last == pytest.approx(truth, abs=1e-6)
 
 
-@pytest.mark.parametrize("initialize", ["vq", "cuts", "mixture", "flat"])
-def test_a_fit_that_is_interrupted_has_the_same_bits(tmp_path, initialize):
-    spec = flat_spec(std=LEARNED) if initialize == "flat" else em_spec(initialize=initialize)
-    spec = with_overrides(spec, {"training.epochs": 15})
-    whole, cut = (make_trainer(spec, demonstrations(12), tmp_path / name).data for name in ("whole", "cut"))
-    expected = train(whole, Restart(Progress(0)))
-    path, restart = tmp_path / "restart.safetensors", Restart(Progress(0))
-    for _ in range(1000):
-        restart = train(cut, restart, seconds=0.0)
-        if restart.progress.done:
-            break
-        restart.written(path)
-        restart = Restart.read(path)
-    assert restart.progress.history == expected.progress.history
-    for name, value in expected.states["best"].items():
-        assert torch.equal(restart.states["best"][name], value), name
-
-
 def test_a_spec_that_em_would_not_follow_is_refused():
     seen = [{"key": "pose", "augment": {"versions": "others"}}]
     with pytest.raises(SpecError, match=r"observations\.0\.augment\.versions: em sees"):
@@ -501,7 +481,7 @@ def test_tuning_demonstrations_decide_nothing_before_the_last_stage():
     """One tuning demonstration likes the beginning of a stage better than its end, where few train; segments then get
     lost.
     """
-    spec, demos = em_spec(initialize="vq_controls", epochs=None, patience=3), demonstrations(9)
+    spec, demos = em_spec(starts=["vq_controls"], epochs=None, patience=3), demonstrations(9)
     train_with, histories = demos.select(demos.names[:6]), []
     for tuned_by in demos.names[6:]:
         trainer = Trainer(spec, Dimensions.of(train_with), train_with, demos.select([tuned_by]))

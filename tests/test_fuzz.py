@@ -26,7 +26,7 @@ hierarchy:
     - {name: phase, count: 2, policy: {network: linear, emits: [options, control]}}
   meta_policy: {network: mlp, hidden: [8]}
 compare_with: [flat, {kind: per_timestep, policy: {hidden: [4]}}]
-training: {initialize: vq, epochs: 24, batch_size: 3, restarts: 2, patience: 5, optimizer: {name: adam, lr: 1.0e-2}}
+training: {starts: [vq, vq], epochs: 24, batch_size: 3, patience: 5, optimizer: {name: adam, lr: 1.0e-2}}
 selection: {folds: 2, grid: {hierarchy.levels.0.count: [1, 2]}}
 rollout: {episodes: 4}
 seed: 3

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from collections import Counter
 
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.networks.conv import POOLED
 from ddco_pyro.training.checkpoint import Progress
-from ddco_pyro.training.initialization import Clusters, EqualParts, RandomCuts
+from ddco_pyro.training.initialization import Clusters, EqualParts
 from ddco_pyro.training.objective import Objective
 from ddco_pyro.training.stages import plan
 
@@ -78,32 +77,6 @@ def test_equal_parts_cut_each_demonstration_for_itself():
     ]
 
 
-def test_random_cuts_part_each_demonstration_in_order_every_way_equally_often():
-    """Seven steps can be cut into three parts in C(6, 2) = 15 ways; four steps in three."""
-    batch, ways = make_batch(random_rows(0, 3), random_rows(1, 2), lengths=(7, 4, 6)), (Counter(), Counter())
-    for seed in range(3000):
-        choices = RandomCuts(3, seed).choices(batch)
-        for row, count in enumerate(ways):
-            count[tuple(choices[row, : LENGTHS[row]].tolist())] += 1
-        assert (choices[1, 4:] == 0).all()
-    for count, number in zip(ways, (15, 3), strict=True):
-        assert len(count) == number
-        assert all(list(way) == sorted(way) and set(way) == {1, 2, 3} for way in count)
-        assert max(abs(each / 3000 - 1 / number) for each in count.values()) < 0.04
-
-
-def test_random_cuts_do_not_depend_on_how_demonstrations_are_batched():
-    batch = make_batch(random_rows(0, 3), random_rows(1, 2))
-    cuts = RandomCuts(3, 5)
-    pieces = [cuts.choices(batch.select(torch.tensor(rows)))[:, :6] for rows in ([0, 1], [2])]
-    assert torch.equal(torch.cat(pieces), RandomCuts(3, 5).choices(batch)[:, :6])
-
-
-def test_of_few_steps_each_is_a_part():
-    batch = make_batch(random_rows(0, 3)[:4], random_rows(1, 2)[:4], lengths=(1, 3))
-    assert RandomCuts(5, 0).choices(batch).tolist() == [[1, 0, 0], [1, 2, 3]]
-
-
 @pytest.mark.parametrize(("read", "found"), [(["quiet"], "quiet"), ([], "loud")])
 def test_what_policies_of_options_do_not_read_does_not_begin_them(read, found):
     """Two observations say different things; terminations and meta-policy read both, policies what they name."""
@@ -114,7 +87,7 @@ def test_what_policies_of_options_do_not_read_does_not_begin_them(read, found):
     parts = {key: np.split(each + 0.01 * random_rows(3, each.shape[1]), cuts) for key, each in rows.items()}
     each = [{key: parts[key][number] for key in parts} for number in range(len(LENGTHS))]
     demos = numbered((one, np.arange(len(one["quiet"]))[:, None]) for one in each)
-    training = {"initialize": "vq", "tune_fraction": 0.3, "optimizer": {"name": "adam"}}
+    training = {"starts": ["vq"], "tune_fraction": 0.3, "optimizer": {"name": "adam"}}
     spec = small_spec(policy=LINEAR | {"inputs": read}, observations=["quiet", "loud"], training=training)
     material = make_trainer(spec, demos, None).data
     objective = Objective(material, Progress(0), plan(spec, 1)[0])
@@ -227,7 +200,7 @@ def test_further_restarts_have_other_clusters_than_the_best_of_ten():
     heaps = 3.0 * np.stack(np.meshgrid(range(3), range(3)), -1).reshape(9, 2)
     places = heaps[random.integers(0, 9, 240)] + 0.1 * random.normal(size=(240, 2))
     demos = numbered(({"state": rows}, 0.1 * random.normal(size=(40, 1))) for rows in np.split(places, 6))
-    spec = small_spec((9,), training={"restarts": 6, "optimizer": {"name": "adam"}})
+    spec = small_spec((9,), training={"starts": ["vq"] * 6, "optimizer": {"name": "adam"}})
     data = make_trainer(spec, demos, None).data
 
     def clusters(restart):

@@ -143,7 +143,7 @@ def test_the_runs_options_get_the_names_of_those_that_they_stand_for(tmp_path):
     _, demos, truth = planted(8, 40)
     path = tmp_path / "demos.hdf5"
     demos.write(path)
-    fit = begun(demos, 3, restarts=3)
+    fit = begun(demos, 3, starts=["vq_controls"] * 3)
     named = next(name for name in demos.names if len(np.unique(truth[name])) == 3)
     session = Session(fit, path, tmp_path / "out.hdf5")
     for option, text in ((1, "here"), (3, "there")):
@@ -198,7 +198,7 @@ def test_a_demonstration_that_is_held_out_is_proposed_as_if_nothing_were_said_of
 
 def begun(demos, count, **training):
     """A first fit by EM, whose options have numbers of their own."""
-    training = {"optimizer": {"name": "em"}, "initialize": "vq_controls", "tune_fraction": 0.0, **training}
+    training = {"optimizer": {"name": "em"}, "starts": ["vq_controls"], "tune_fraction": 0.0, **training}
     return ddco_pyro.fit(make_spec((count,), epochs=30, **training), demos)
 
 
@@ -238,7 +238,7 @@ def test_an_option_without_labels_yet_keeps_its_steps():
     named = next(name for name in demos.names if len(np.unique(truth[name])) == 2)
     said = free(demos) | {named: truth[named]}
     missing = ({1, 2, 3} - set(truth[named])).pop()
-    _, again = after(begun(demos, 3, restarts=3), demos, said, 3)
+    _, again = after(begun(demos, 3, starts=["vq_controls"] * 3), demos, said, 3)
     steps = np.concatenate([again.shown(name).options for name in demos.names if name != named])
     wanted = np.concatenate([truth[name] for name in demos.names if name != named])
     assert np.mean(steps[wanted == missing] == missing) > 0.9
@@ -279,7 +279,7 @@ def test_a_model_of_several_levels_is_fitted_as_its_spec_says():
 
 def test_a_refit_by_gradient_steps_is_tuned_by_demonstrations_without_labels():
     _, demos, truth = planted(5, 6)
-    trained = begun(demos, 3, optimizer={"lr": 0.03}, tune_fraction=0.4, restarts=1)
+    trained = begun(demos, 3, optimizer={"lr": 0.03}, tune_fraction=0.4)
     for chosen in demos.names:
         said = free(demos) | {chosen: truth[chosen]}
         again = refit(trained, LEVEL, 3, labelled(demos, said), free(demos))

@@ -429,7 +429,7 @@ def test_demonstrations_are_left_out_whole_and_a_single_one_by_parts():
 def test_three_labelled_demonstrations_name_the_options_of_thirty(tmp_path):
     """Held-out segments have the numbers of the labels, whichever those are; the options 1 to 3 of the truth do not."""
     names = [30, 10, 20]
-    training = {"epochs": 160, "patience": 15, "initialize": "vq", "optimizer": {"lr": 0.03}}
+    training = {"epochs": 160, "patience": 15, "starts": ["vq"], "optimizer": {"lr": 0.03}}
     labels = {"level": "level-1", "from": "phase", "count": 3}
     spec = make_spec((3,), control=CONTROL, labels=labels, **training)
     truth = make_truth(spec)
@@ -465,13 +465,13 @@ training: {{epochs: 3, labels: {{level: skill, from: phase, count: 2}}, duration
     return tmp_path
 
 
-@pytest.mark.parametrize("start", ["equal_parts", "cuts", "vq"])
+@pytest.mark.parametrize("start", ["equal_parts", "vq"])
 def test_a_start_that_does_not_follow_labels_is_warned_of(files, start):
-    given = [files / "mine.yaml", "--set", f"training.initialize={start}", "--set", "compare_with=[]"]
+    given = [files / "mine.yaml", "--set", f"training.starts=[{start}]", "--set", "compare_with=[]"]
     page = files / "run" / "report.html"
     outputs = [call("check", *given).out, call("fit", *given, "--out", files / "run").out, page.read_text()]
     for said in (" ".join(output.split()) for output in outputs):
-        assert (f"training.initialize: {start} numbers options in the order of time" in said) == (start != "vq")
+        assert (f"training.starts: {start} numbers options in the order of time" in said) == (start != "vq")
     assert "training.labels say" not in call("check", *given, "--set", "training.labels=null").out
 
 

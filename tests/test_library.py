@@ -287,7 +287,10 @@ def test_another_process_fits_a_baseline_whose_restarts_are_short(in_memory: ddc
     monkeypatch.setattr(
         "ddco_pyro.fitting.fit.run_all", lambda calls, *rest, **how: asked.extend(calls) or real(calls, *rest, **how)
     )
-    changes = {"training.restarts": 2, "compare_with": [FLAT, {**FLAT, "policy": {"network": "mlp", "hidden": [4]}}]}
+    changes = {
+        "training.starts": ["vq", "vq"],
+        "compare_with": [FLAT, {**FLAT, "policy": {"network": "mlp", "hidden": [4]}}],
+    }
     for optimizer, beside in (("em", ["flat", "flat_2"]), ("adam", [])):
         spec = with_overrides(in_memory.spec, {**changes, "training.optimizer": {"name": optimizer}})
         one, two = (ddco_pyro.fit(spec, two_skills(), jobs=jobs) for jobs in (1, 2))

@@ -21,7 +21,7 @@ SPEC = {
     "observations": ["pose"],
     "hierarchy": {"levels": [{"count": 2, "policy": {"network": "linear"}}], "meta_policy": {"network": "linear"}},
     "compare_with": [{"kind": "flat", "policy": {"network": "linear"}}],
-    "training": {"epochs": 4, "initialize": "random", "layerwise": False},
+    "training": {"epochs": 4, "starts": ["random"], "layerwise": False},
 }
 
 

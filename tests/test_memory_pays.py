@@ -44,7 +44,7 @@ hierarchy:
   meta_policy: {{network: linear}}
 compare_with: [mixture]
 training:
-  initialize: vq_controls
+  starts: [vq_controls]
   layerwise: false
   epochs: 40
   patience: null

@@ -22,7 +22,7 @@ from ddco_pyro.metrics import Metrics
 from ddco_pyro.spec import with_overrides
 from ddco_pyro.training.data import parts
 
-SETTINGS = {"epochs": 300, "patience": 15, "initialize": "vq_controls"}
+SETTINGS = {"epochs": 300, "patience": 15, "starts": ["vq_controls"]}
 
 
 @pytest.fixture(scope="module")

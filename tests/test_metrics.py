@@ -33,7 +33,7 @@ def make_spec(valid_fraction, **model):
         {
             "observations": ["state"],
             "demonstrations": {"path": "unused.hdf5", "valid_fraction": valid_fraction},
-            "training": {"epochs": 30, "optimizer": {"lr": 0.03}, "initialize": "random"},
+            "training": {"epochs": 30, "optimizer": {"lr": 0.03}, "starts": ["random"]},
             **model,
         }
     )

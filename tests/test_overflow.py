@@ -24,7 +24,7 @@ control: {{std: {{learn: true}}, scale: {scale}}}
 hierarchy:
   levels: [{{name: option, count: 2, policy: {{network: linear}}, termination: {{network: linear}}}}]
   meta_policy: {{network: linear}}
-training: {{initialize: vq_controls, epochs: 1}}
+training: {{starts: [vq_controls], epochs: 1}}
 compare_with: [{{kind: flat, policy: {{network: linear}}}}]
 """
 

@@ -275,14 +275,14 @@ def test_what_is_read_ahead_is_what_is_asked_for(kept: Path, monkeypatch: pytest
     monkeypatch.setattr(Readers, "plan", planning)
     monkeypatch.setattr(Readers, "take", taking)
     monkeypatch.setattr(Readers, "__enter__", lambda readers: trained.append(readers) or readers)
-    data = spec_of(kept, "camera", epochs=2, initialize="random", layerwise=False)
+    data = spec_of(kept, "camera", epochs=2, starts=["random"], layerwise=False)
     ddco_pyro.fit(parse_spec(data | {"compare_with": []}))
     assert len(taken) > 4
     assert planned == taken
 
 
 def test_workers_read_the_same(kept: Path) -> None:
-    data = spec_of(kept, {**RAW, "augment": {"shift": 1}}, initialize="random", layerwise=False)
+    data = spec_of(kept, {**RAW, "augment": {"shift": 1}}, starts=["random"], layerwise=False)
     alone, beside = (
         ddco_pyro.fit(parse_spec({**data, "training": data["training"] | {"workers": workers}})) for workers in (0, 2)
     )

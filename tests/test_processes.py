@@ -37,7 +37,7 @@ from ddco_pyro.training.restarts import Trainer
 from ddco_pyro.training.stages import plan
 
 DROPPING = {"network": "mlp", "hidden": [6], "dropout": 0.3}
-TRAINING = {"shards": 4, "batch_size": 5, "epochs": 16, "restarts": 2, "halving": 2, "optimizer": {"lr": 0.03}}
+TRAINING = {"shards": 4, "batch_size": 5, "epochs": 16, "starts": ["vq", "random"], "optimizer": {"lr": 0.03}}
 """Minibatches of 5 and of 3 demonstrations: a shard has two or one, or is empty."""
 
 
@@ -220,7 +220,7 @@ MOMENTUM = {"optimizer": {"name": "momentum"}, "clip_gradient": 0.1, "average": 
 def test_processes_of_torchrun_give_the_bits_of_one(demos, tmp_path, number, training):
     phases = (replace(demo, labels={"phase": np.arange(len(demo)) * 2 // len(demo)}) for demo in demos)
     replace(demos, demonstrations=tuple(phases)).write(tmp_path / "demos.hdf5")
-    short = make_spec(tmp_path / "demos.hdf5", patience=None, epochs=4, restarts=1, **training)
+    short = make_spec(tmp_path / "demos.hdf5", patience=None, epochs=4, starts=["vq"], **training)
     (tmp_path / "spec.yaml").write_text(dump_spec(short))
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(number)]
     command += ["-m", "ddco_pyro.cli", "fit", "spec.yaml", "--out", "run"]

@@ -76,7 +76,7 @@ def deep(tmp_path_factory):
         made(size=2),
         labels=None,
         hierarchy={"levels": [lower, upper], "meta_policy": {**LINEAR, "emits": ["options", "control"]}},
-        training={"epochs": 12, "restarts": 2},
+        training={"epochs": 12, "starts": ["vq", "vq"]},
         compare_with=[{"kind": "flat", "policy": LINEAR}, {"kind": "per_timestep"}],
     )
     Metrics.model_validate(found.metrics.model_dump() | {"rollouts": rollouts()}).write(found.folder)
@@ -250,7 +250,7 @@ def test_films_past_the_limit_are_links(deep, monkeypatch):
 
 
 def test_names_are_escaped(tmp_path):
-    key, training = "$x_{<img>$", {"epochs": 1, "initialize": "random"}
+    key, training = "$x_{<img>$", {"epochs": 1, "starts": ["random"]}
     odd = [replace(one, name=f"<i>{one.name}", observations={key: one.observations["place"]}) for one in made(5)]
     changes = {"observations": [key], "training": training, "compare_with": []}
     page = write_report(*run(tmp_path, Demonstrations(tuple(odd)), "<b>&run", **changes)).read_text()

@@ -30,7 +30,7 @@ SPEC = {
     "observations": ["offsets", "visited"],
     "hierarchy": {"levels": [{"count": 2, "policy": {"network": "linear"}}], "meta_policy": {"network": "linear"}},
     "compare_with": [{"kind": "flat", "policy": {"network": "linear"}}, "mixture"],
-    "training": {"epochs": 4, "initialize": "random", "layerwise": False},
+    "training": {"epochs": 4, "starts": ["random"], "layerwise": False},
 }
 
 
@@ -176,7 +176,7 @@ def few_spec():
         demonstrations={"path": "unused.hdf5", "leave_one_out": True, "labels": "skill"},
         control={"std": {"learn": True, "floor": 0.01, "per_option": True}},
         compare_with=[{"kind": "flat", "policy": LINEAR}],
-        training={"optimizer": {"name": "em"}, "epochs": 30, "tune_fraction": 0, "initialize": "vq_controls"},
+        training={"optimizer": {"name": "em"}, "epochs": 30, "tune_fraction": 0, "starts": ["vq_controls"]},
     )
 
 

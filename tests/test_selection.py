@@ -28,7 +28,7 @@ ONE = Workers(1)
 def finished(tmp_path_factory):
     """A selection over two candidates and four folds: its spec, folder, result, and what was told."""
     folder = tmp_path_factory.mktemp("selection")
-    spec, told = with_overrides(spec_at(folder), {"training.restarts": 2}), Told()
+    spec, told = with_overrides(spec_at(folder), {"training.starts": ["vq", "vq"]}), Told()
     return spec, folder / "run", select(spec, folder / "run", told, ONE), told
 
 

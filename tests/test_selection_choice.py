@@ -139,7 +139,7 @@ def test_a_candidate_that_has_failed_is_given_up():
         ("control.std", [0.1, 0.2], [0.0, 1.0], "std = 0.2 is the best, and the largest"),
         ("hierarchy.levels.0.count", [1, 2, 4], [0.0, 3.0, 2.0], ""),
         ("hierarchy.levels.0.count", [1, 2], [1.0, 0.0], ""),
-        ("training.initialize", ["vq", "random"], [1.0, 0.0], ""),
+        ("training.starts", [["vq"], ["random"]], [1.0, 0.0], ""),
         ("observations", [["a"], ["a", "b"]], [0.0, 1.0], ""),
     ],
 )

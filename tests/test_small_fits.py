@@ -45,7 +45,7 @@ control: {std: {learn: true, floor: 0.01, per_option: true}}
 hierarchy:
   levels: [{name: option, count: 2, policy: {network: linear}, termination: {network: linear}}]
   meta_policy: {network: linear}
-training: {initialize: vq_controls, optimizer: {name: em}, epochs: 60}
+training: {starts: [vq_controls], optimizer: {name: em}, epochs: 60}
 """
 
 

@@ -42,12 +42,11 @@ hierarchy:
       termination: {network: linear}
   meta_policy: {network: mlp, hidden: [64], emits: [options]}
 training:
-  initialize: vq
+  starts: [vq]
   layerwise: true
   optimizer: {name: adam, lr: 1.0e-3}
   epochs: 200
   batch_size: 16
-  restarts: 1
 inference: {engine: fused}
 selection: {folds: 10, grid: {hierarchy.levels.0.count: [1, 2, 3, 4, 5, 6, 7, 8]}}
 rollout: {episodes: 50}
@@ -461,12 +460,12 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         "training.labels.level: no policy selects the options of 'option'; let the policies above emit options",
     ),
     (
-        {"training": {"initialize": "random", "labels": {"level": "option", "from": "phase", "hold": False}}},
+        {"training": {"starts": ["random"], "labels": {"level": "option", "from": "phase", "hold": False}}},
         "training.labels.hold: false uses labels in initialisation alone, and that is random; say vq there",
     ),
-    ({"training.initialize": "clusters"}, "training.initialize: must be one of 'vq', 'vq_controls', 'equal_parts'"),
-    ({"training.initialize": ["vq", "cuts"]}, "training.initialize: has 2 kinds, but training.restarts is 1"),
-    ({"training": {"initialize": "mixture", "lower_levels": "frozen"}}, "training.lower_levels: mixture trains all"),
+    ({"training.starts": ["clusters"]}, "training.starts.0: must be one of 'vq', 'vq_controls', 'windows'"),
+    ({"training.starts": []}, "training.starts: "),
+    ({"training": {"starts": ["mixture"], "lower_levels": "frozen"}}, "training.lower_levels: mixture trains all"),
     ({"training.duration.mean": [20, 2]}, "training.duration.mean: has 2 numbers, but the number of levels is 1"),
     ({"hierarchy": None, "baseline": "flat", "training.duration.mean": 20}, "training.duration: there are no options"),
     ({"task": None}, "task: missing; name a task, or give a file in demonstrations.path"),

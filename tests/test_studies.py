@@ -813,7 +813,7 @@ def test_planted_levels_are_scored_by_their_truth(tmp_path):
     """The truth explains demonstrations of its own best, and finds the lowest level in nearly all steps."""
     study = yaml.safe_load((ROOT / "studies" / "planted.yaml").read_text()) | {
         "spec": str(ROOT / "specs" / "planted_levels.yaml"),
-        "overrides": {"training.epochs": 2, "training.restarts": 1},
+        "overrides": {"training.epochs": 2, "training.starts": ["vq"]},
         "demonstrations": {"counts": [8], "held_out": 4, "test": {"first": 10, "count": 12}},
         "starts": {"test": {"first": 500, "count": 6}},
         "seeds": {"test": {"count": 1}},

@@ -27,13 +27,13 @@ QUICK = {"control": {"std": 1.0}, "optimizer": {"lr": 0.1}}
     ("training", "depth", "names"),
     [
         ({}, 2, ["vq-1", "level-1", "vq-2", "level-2", "meta-policy", "joint"]),
-        ({"initialize": "equal_parts", "layerwise": False}, 2, ["parts-1", "parts-2", "joint"]),
-        ({"initialize": "random"}, 2, ["level-1", "level-2", "meta-policy", "joint"]),
+        ({"starts": ["equal_parts"], "layerwise": False}, 2, ["parts-1", "parts-2", "joint"]),
+        ({"starts": ["random"]}, 2, ["level-1", "level-2", "meta-policy", "joint"]),
         ({"lower_levels": "frozen"}, 1, ["vq-1", "level-1", "meta-policy"]),
         ({"upper_levels": "segments"}, 3, ["vq-1", "level-1", "segments", "upper", "joint"]),
-        ({"initialize": "cuts"}, 1, ["cuts-1", "level-1", "meta-policy", "joint"]),
-        ({"initialize": "mixture", "upper_levels": "segments"}, 3, ["vq-1", "vq-2", "vq-3", "mixture", "joint"]),
-        ({"layerwise": False, "initialize": "random"}, 3, ["joint"]),
+        ({"starts": ["windows"]}, 1, ["vq-1", "level-1", "meta-policy", "joint"]),
+        ({"starts": ["mixture"], "upper_levels": "segments"}, 3, ["vq-1", "vq-2", "vq-3", "mixture", "joint"]),
+        ({"layerwise": False, "starts": ["random"]}, 3, ["joint"]),
         ({}, 0, ["policy"]),
     ],
 )
@@ -45,7 +45,7 @@ def lines(**training):
     """Ten demonstrations along a line, cut into three equal parts, and how they are fitted."""
     line = np.linspace(-1, 1, 12)[:, None] * [1.0, 0.0] + np.random.default_rng(0).normal(0, 0.02, (10, 12, 2))
     demos = numbered(({"state": one}, one) for one in line)
-    own = {"initialize": "equal_parts", "layerwise": False, "optimizer": {"lr": 0.1}, "epochs": 800, "patience": None}
+    own = {"starts": ["equal_parts"], "layerwise": False, "optimizer": {"lr": 0.1}, "epochs": 800, "patience": None}
     return make_trainer(make_spec((3,), **own, **training), demos, None).data
 
 
@@ -164,7 +164,7 @@ def test_stages_share_the_budget_and_what_one_leaves_goes_to_the_later_ones(tmp_
 @pytest.mark.parametrize("counts", [(2, 2), ()])
 def test_every_model_has_the_same_budget(tmp_path, counts):
     """Whatever the number of its stages: 1 or 6 here. The steps are those of minibatches of 3 out of 8."""
-    spec = make_spec(counts, epochs=14, patience=None, batch_size=3, restarts=2)
+    spec = make_spec(counts, epochs=14, patience=None, batch_size=3, starts=["vq", "vq"])
     trainer = make_trainer(spec, of_states([8] * 10), tmp_path)
     trainer.run()
     assert sum(epochs_of(trainer, 0).values()) == sum(epochs_of(trainer, 1).values()) == 14
@@ -184,7 +184,7 @@ def test_without_a_budget_every_stage_trains_until_its_patience(tmp_path):
 @pytest.mark.parametrize(("name", "apart"), [("adamw", True), ("adam", False)])
 def test_weight_decay_of_adamw_is_apart_from_the_gradient(name, apart, tmp_path):
     """In the first step it takes as much more of every weight as it is larger; a penalty is lost in Adam's scaling."""
-    settings = {"initialize": "random", "layerwise": False, "epochs": 1}
+    settings = {"starts": ["random"], "layerwise": False, "epochs": 1}
     after = []
     for decay in (0.0, 1.0, 2.0):
         spec = make_spec((2,), optimizer={"name": name, "lr": 0.01, "weight_decay": decay}, **settings)
@@ -231,12 +231,12 @@ def test_the_running_mean_of_the_weights_is_evaluated_and_kept(tmp_path, monkeyp
         pytest.param("adam", {"epochs": 30, "patience": 1}, None, marks=pytest.mark.slow),
         pytest.param("adam", {"epochs": 10, "upper_levels": "segments"}, 2 * 5 * 2, marks=pytest.mark.slow),
         pytest.param("adam", {"epochs": 12, "average": 0.9}, 2 * 6 * 2, marks=pytest.mark.slow),
-        ("adam", {"epochs": 12, "initialize": ["cuts", "mixture"]}, 12 + 12),
+        ("adam", {"epochs": 12, "starts": ["equal_parts", "mixture"]}, 12 + 12),
     ],
     ids=["adam", "momentum", "stages that stop early", "levels from segments", "mean weights", "starts that differ"],
 )
 def test_resuming_gives_the_same_bits(tmp_path, optimizer, training, rows):
-    spec = make_spec((2, 2), optimizer={"name": optimizer, "lr": 0.01}, restarts=2, **training)
+    spec = make_spec((2, 2), optimizer={"name": optimizer, "lr": 0.01}, **({"starts": ["vq", "vq"]} | training))
     demos = of_states([8] * 10)
     whole = make_trainer(spec, demos, tmp_path / "whole")
     expected = whole.run().state_dict()
@@ -341,8 +341,8 @@ def test_what_is_called_converged_is_at_the_optimum(tmp_path):
 EM = {"optimizer": {"name": "em"}, "epochs": 300}
 
 
-def test_a_planted_hierarchy_is_recovered_from_the_best_of_several_cuts(tmp_path):
-    spec = make_spec((4,), control=CONTROL, initialize="cuts", restarts=4, **EM)
+def test_a_planted_hierarchy_is_recovered_from_the_likeliest_of_several_starts(tmp_path):
+    spec = make_spec((4,), control=CONTROL, starts=["random", "random", "equal_parts", "vq_controls"], **EM)
     truth = make_truth(spec)
     trainer = make_trainer(spec, plant(truth, 80, 40, seed=1)[0], tmp_path)
     values = recovered(trainer.run(), truth, *plant(truth, 40, 40, seed=2))
@@ -351,7 +351,6 @@ def test_a_planted_hierarchy_is_recovered_from_the_best_of_several_cuts(tmp_path
     segments = trainer.restarts[0].states["best"], trainer.restarts[1].states["best"]
     assert any(not torch.equal(segments[0][name], segments[1][name]) for name in segments[0])
     told = trainer.summary["restarts"]
-    assert [each["initialize"] for each in told["each"]] == ["cuts"] * 4
     assert [each["nmi"] is not None for each in told["each"]] == [number != told["best"] for number in range(4)]
 
 
@@ -363,7 +362,7 @@ def test_a_planted_hierarchy_is_recovered_from_the_best_of_several_cuts(tmp_path
 @pytest.mark.parametrize("counts", [(3,), (3, 2)])
 def test_a_hierarchy_begins_from_the_mixtures_fit_with_psi_one_half(tmp_path, counts, optimizer):
     """The stage before the last maximises the likelihood of the spec whose options always end."""
-    spec = make_spec(counts, control=CONTROL, initialize="mixture", optimizer=optimizer, epochs=240)
+    spec = make_spec(counts, control=CONTROL, starts=["mixture"], optimizer=optimizer, epochs=240)
     data = make_trainer(spec, plant(make_truth(spec), 30, 20, seed=1)[0], tmp_path).data
     restart = train(data, Restart(Progress(0)), until=0)
     model = data.hierarchy(0, restart.states["model"])
@@ -393,7 +392,9 @@ def psi(model, batch):
 @pytest.mark.parametrize("counts", [(4,), (4, 2)])
 def test_a_planted_hierarchy_is_recovered(tmp_path, counts):
     """Held-out log-likelihood within 2 % of the truth's own, and segments that agree with the true options."""
-    spec = make_spec(counts, control=CONTROL, **(TRAINING if len(counts) > 1 else TRAINING | {"restarts": 1}))
+    spec = make_spec(
+        counts, control=CONTROL, **(TRAINING if len(counts) > 1 else TRAINING | {"starts": ["vq_controls"]})
+    )
     truth = make_truth(spec)
     demos, _ = plant(truth, 80 if len(counts) > 1 else 40, 40, seed=1)
     values = recovered(make_trainer(spec, demos, tmp_path).run(), truth, *plant(truth, 40, 40, seed=2))
@@ -405,7 +406,7 @@ def test_a_planted_hierarchy_is_recovered(tmp_path, counts):
 
 
 LEARNT = {"std": {"learn": True, "floor": 0.01}, "scale": "none"}
-SETTINGS = {"epochs": 200, "patience": 10, "initialize": "vq_controls"}
+SETTINGS = {"epochs": 200, "patience": 10, "starts": ["vq_controls"]}
 
 
 @pytest.fixture(scope="module")

@@ -53,7 +53,7 @@ def said(folder):
     (folder / "task.yaml").write_text(
         "task: needle\ndemonstrations: {count: 2}\nobservations: [gripper_pose]\nhierarchy: {levels: [{count: 2}]}\n"
     )
-    quick = ("--set", "training.epochs=2", "--set", "training.restarts=1", "--set", "compare_with=[]")
+    quick = ("--set", "training.epochs=2", "--set", "compare_with=[]")
     return call(
         folder,
         ("init", "mine.hdf5", "--out", "mine.yaml"),

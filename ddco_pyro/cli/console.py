@@ -106,7 +106,7 @@ class Progress:
             case UpdatesDone(done, loss):
                 self._advance(done=done, note=f"loss {loss:.2g}")
             case RestartStopped(restart, epochs):
-                self._say(f"restart {restart}: stopped at epoch {epochs} (not in the better half)")
+                self._say(f"restart {restart}: stopped at epoch {epochs} (far behind the likeliest)")
             case RestartDiverged(restart, why):
                 self._say(f"restart {restart}: diverged: {why}")
             case TrainingEnded():

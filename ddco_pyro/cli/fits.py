@@ -124,7 +124,7 @@ def _ready(spec: Spec, jobs: int) -> AbstractContextManager[object]:
     """A block inside which other processes are ready to train beside the model, if they are of use."""
     number = Workers(jobs).number(sys.maxsize if spec.demonstrations.leave_one_out else 1 + len(spec.compare_with)) - 1
     long = spec.training.epochs is None or spec.training.epochs >= LONG
-    short = spec.training.restarts == 1 or spec.training.optimizer.name == "em"
+    short = len(spec.training.starts) == 1 or spec.training.optimizer.name == "em"
     useful = number > 0 and long and short and spec.training.device == "cpu"
     return processes(number, *TRAINING) if useful else nullcontext()
 

@@ -22,6 +22,12 @@ from ddco_pyro.spec.yaml import read_yaml
 
 TEMPLATE = Path(__file__).with_suffix(".yaml.j2")
 
+STARTS = ("vq_controls", "vq", "mixture", "equal_parts")
+"""Ways to begin, of which the likeliest in training is kept."""
+
+MARGIN = 0.1
+"""Nats per step by which another way has to be likelier than the first."""
+
 MANY = 100
 """From so many demonstrations on a tenth is held out, of fewer a fifth."""
 
@@ -193,6 +199,8 @@ def _filled(
         left_out=[(field, why) for field in observed if (why := _left_out(inspection, field))],
         notes=[printable(note) for note in inspection.notes],
         batch=batch,
+        starts=("windows", *STARTS) if decided["small"].window else STARTS,
+        margin=MARGIN,
         em=em,
         few=em and len(lengths) < FEW and not {"train", "valid"} & set(masks) and not decided["by"],
         epochs=max(_epochs(np.array(lengths), batch, recipe), EXACT_EPOCHS if em else 0),

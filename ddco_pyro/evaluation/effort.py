@@ -70,13 +70,13 @@ def restarts(training: Training) -> str:
     early = ", ".join(f"{number} after {epochs}" for number, epochs in stopped.items()) or "none"
     ended = ", ".join(str(number) for number, restart in enumerate(told.each) if restart.diverged)
     early += f"; diverged: {ended}" if ended else ""
-    starts = [restart.initialize for restart in told.each]
-    every = f"0 to {len(starts) - 1}" + (f" from {starts[0]}" if starts[0] else "")
-    if len(set(starts)) > 1:
-        every = ", ".join(f"{number} from {start}" for number, start in enumerate(starts))
+    starts = [restart.start for restart in told.each]
+    every = ", ".join(f"{number} from {start}" for number, start in enumerate(starts))
+    if len(set(starts)) == 1:
+        every = f"0 to {len(starts) - 1} from {starts[0]}"
     alike = ", ".join(f"{number(one.nmi)} of {n}" for n, one in enumerate(told.each) if one.nmi is not None)
     return (
-        f"restart {told.best} was the best of {len(starts)} ({every}; stopped early, "
+        f"restart {told.best} was the likeliest of {len(starts)} ({every}; stopped early, "
         f"with their epochs of the last stage: {early}), which took {told.spent.epochs} epochs "
         f"({told.spent.gradient_steps} gradient steps) together"
         + (f"; NMI of its segments of the training demonstrations with those of the others: {alike}" if alike else "")

@@ -18,6 +18,7 @@ from ddco_pyro.metrics import Agreement, Alike, Metrics, Segments, Use
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
 from ddco_pyro.names import numbered_name
 from ddco_pyro.spec import Spec, TrainingSpec
+from ddco_pyro.training.initialization import WAYS
 
 
 class OnPaths(NamedTuple):
@@ -155,7 +156,7 @@ Kind = Literal["unused", "redundant", "dominating", "whole", "never_persisting",
 
 ADVICE: Mapping[Kind, str] = {
     "unused": "Fewer options may do: compare hierarchy.levels.*.count by cross-validation (ddco-pyro select), or try "
-    "more restarts.",
+    "more starts (training.starts).",
     "redundant": "Make them one and see what it costs (ddco-pyro merge), or compare hierarchy.levels.*.count by "
     "cross-validation (ddco-pyro select). If they should differ, lower control.std, below which differences do not "
     "count.",
@@ -200,7 +201,7 @@ class Finding:
         start = START.get(self.kind)
         if start is None or training.labels or {start, "vq_controls"} & {*training.starts}:
             return ADVICE[self.kind]
-        return f"{ADVICE[self.kind]} Or start from clusters (training.initialize: {start})."
+        return f"{ADVICE[self.kind]} Or start from clusters, too (training.starts: {start})."
 
     def options(self, names: Sequence[str]) -> str:
         """The option, or the two options that act alike, by the names of a level's choices."""
@@ -312,11 +313,11 @@ SIGNS: Mapping[Kind, tuple[str, str]] = {
 
 def unlabelled_start(training: TrainingSpec) -> list[tuple[str, str]]:
     """Starts that do not follow the labels to train from, with a remedy."""
-    blind = [start for start in training.starts if start in ("equal_parts", "cuts")]
+    blind = [start for start in training.starts if WAYS[start].ordered]
     if training.labels is None or not blind:
         return []
-    text = f"training.initialize: {listed(blind)} numbers options in the order of time, whatever training.labels say."
-    return [(text, "Start from what labelled steps say of the others (training.initialize: vq_controls).")]
+    text = f"training.starts: {listed(blind)} numbers options in the order of time, whatever training.labels say."
+    return [(text, "Start from what labelled steps say of the others (training.starts: vq_controls).")]
 
 
 def degeneracies(metrics: Metrics, spec: Spec, names: Mapping[str, Sequence[str]]) -> list[tuple[str, str]]:
@@ -375,7 +376,7 @@ def _less_than_equal_parts(found: Agreement, levels: Sequence[str]) -> Iterator[
                 f"Equal parts of each demonstration agree better with labels/{labels} than options of level “{level}” "
                 f"do: normalised mutual information {number(other.nmi)} against {number(own.nmi)}, {part}.",
                 "Equal parts know nothing but the time. Observe what tells the labels apart, start from some of them "
-                "(training.labels), or start from equal parts (training.initialize: equal_parts).",
+                "(training.labels), or start from equal parts (training.starts: equal_parts).",
             )
 
 

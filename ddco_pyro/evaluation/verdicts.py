@@ -24,7 +24,7 @@ from ddco_pyro.drawing.words import (
     with_error,
 )
 from ddco_pyro.evaluation.effort import rising
-from ddco_pyro.metrics import Counts, Difference, Metrics, PerStep, Rollouts, Seeds, SuccessWorth, Worth
+from ddco_pyro.metrics import Below, Counts, Difference, Metrics, PerStep, Rollouts, Seeds, SuccessWorth, Worth
 from ddco_pyro.names import FLAT, MIXTURE, method
 from ddco_pyro.statistics import mean_interval, t_quantile, wider_interval
 
@@ -54,12 +54,23 @@ def caution(metrics: Metrics) -> str:
     values = {capital(method(name)): one.log_likelihood_per_step for name, one in metrics.methods.items()}
     said = cautions(values, below, len(metrics.valid))
     number_of = metrics.demonstrations.train
+    said = " ".join(
+        [said, *(_below(ours, method(name), one) for name, one in metrics.below.items() if one.told)]
+    ).lstrip()
     if said and metrics.demonstrations.left_out and number_of < FEW:
         said += (
             f" {number_of} demonstrations are too few here: each held-out one leaves {number_of - 1} to train with. "
             f"Record at least {FEW}, and until then take two options and the fewest observations."
         )
     return said
+
+
+def _below(ours: str, mixture: str, below: Below) -> str:
+    """A sentence on a hierarchy that is less likely in training than a mixture that it contains."""
+    return (
+        f"In training {ours.lower()} {verb(ours, 'are', 'is')} less likely than the {mixture} that they contain, by "
+        f"{number(max(below.objective, below.nats))} nats per step. Add ways to begin (training.starts)."
+    )
 
 
 def cautions(values: Mapping[str, PerStep], flats: Mapping[str, tuple[str, Difference]], held_out: int) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +24,7 @@ from ddco_pyro.inference.posteriors import Decomposition
 from ddco_pyro.metrics import (
     Agreement,
     Alike,
+    Below,
     ByDimension,
     Compared,
     Dimensions,
@@ -131,6 +132,9 @@ def evaluate(
     parts: dict[str, Demonstrations],
     demos: Demonstrations,
     on_event: OnEvent = ignore,
+    *,
+    training: Mapping[str, Any],
+    contained: Collection[str] = (),
     **about: Any,
 ) -> Metrics:
     """The evaluation of a model.
@@ -140,7 +144,9 @@ def evaluate(
 
     :param parts: training (``train``) and held-out (``valid``) demonstrations.
     :param demos: all demonstrations.
-    :param about: the other fields of :class:`ddco_pyro.metrics.Metrics`: training and versions, for example.
+    :param training: the field of :class:`ddco_pyro.metrics.Metrics`.
+    :param contained: names of the mixtures among the baselines that the model contains.
+    :param about: the other fields of :class:`ddco_pyro.metrics.Metrics`: versions, for example.
     :raises NotFinite: a log-likelihood is NaN or infinite.
     """
     ours = {name: _Part.of(fitted, part, name == "valid") for name, part in parts.items()}
@@ -176,6 +182,14 @@ def evaluate(
             )
             for name, fit in fitted.baselines.items()
         },
+        below={
+            name: Below(
+                objective=fitted.baselines[name].metrics.training.objective - training["objective"],
+                nats=fitted.baselines[name].metrics.log_likelihood_per_step.train - per_step["train"],
+            )
+            for name in contained
+        },
+        training=training,  # type: ignore[arg-type]  # validated
         worth=_worth(fitted, held_out, ours["valid"], valid) if valid else None,
         branches=branch_use(fitted.hierarchy, infer(fitted.hierarchy, valid or demos)),
         options=options,

@@ -142,7 +142,7 @@ def fit(
         assert demos is not None
         if not known:  # the dimensions of the control decide the baselines too
             models = check_models(spec, Dimensions.of(demos))
-        short = spec.training.restarts == 1 or all(_over_all(*model) for model in models.values())
+        short = len(spec.training.starts) == 1 or all(_over_all(*model) for model in models.values())
         baselines = dict(list(models.items())[1:])
         return _fit_model(spec, demos, folder, on_event, workers, clock, baselines, short)
 
@@ -197,15 +197,18 @@ def _fit_model(
         with clock("training"):
             free = max(1, workers.number() - len(long))
             trained = train_model(spec, size, split["train"], on_event, checkpoints, split.get("valid"), name, free)
-        hierarchy = trained.hierarchy
-        if folder:
-            write_history(folder, trained.history)
-            write_model(folder, hierarchy)
         specs |= {name: _with_recogniser(specs[name], trained.summary["recogniser"]) for name in later}
         with clock("baselines"):
             others = {name: fit_of(name)(on_event, workers) for name in specs if name not in long} | dict(fitted_beside)
             by_name = {name: replace(others[name], given=demos) for name in specs}
+    contained = [other for other in by_name if _contains(spec, specs[other])]
     with clock("training"):
+        for other in contained:
+            trained.contain(by_name[other].hierarchy, by_name[other].metrics.training.objective)
+        hierarchy = trained.hierarchy
+        if folder:
+            write_history(folder, trained.history)
+            write_model(folder, hierarchy)
         alone = workers if _worth_a_process(spec, hierarchy, demos) else ALONE
         apart = _leave_one_out(spec, size, demos, folder, on_event, alone)
     fitted = Fit(spec, hierarchy, folder=folder, given=demos, beside=by_name, apart=apart)
@@ -224,6 +227,7 @@ def _fit_model(
             control_dimensions=[dimension.as_data() for dimension in size.control],
             parameters=parameters(hierarchy),
             training=trained.summary,
+            contained=contained,
             seconds={},
             versions=_versions(),
         )
@@ -239,6 +243,13 @@ def _fit_model(
     if folder:
         metrics.write(folder)
     return replace(fitted, metrics=metrics, named=named or {})
+
+
+def _contains(spec: Spec, baseline: Spec) -> bool:
+    """Whether a hierarchy contains a baseline, a mixture of the same policies that is trained in the same way."""
+    if spec.hierarchy is None or baseline.hierarchy is None or spec.training.lower_levels == "frozen":
+        return False
+    return baseline.training == spec.training and baseline.control == spec.control
 
 
 def _shares_recogniser(baseline: Spec) -> bool:

@@ -144,7 +144,7 @@ def merged_spec(spec: Spec, level: int) -> Spec:
         "training.labels": {"level": own.name, "from": LABELS, "hold": False},
     }
     if "random" in spec.training.starts:  # which would not begin from anything
-        changes["training.initialize"] = "vq"
+        changes["training.starts"] = ["vq"]
     return with_overrides(spec, changes)
 
 

@@ -32,9 +32,10 @@ OrNaN = Annotated[float, BeforeValidator(lambda value: math.nan if value is None
 """A number; NaN, null in the file, for a measure that does not apply."""
 
 
-def policies(fit: Fit) -> dict[str, Policy | str]:
+def policies(fit: Fit, best: bool = False) -> dict[str, Policy | str]:
     """The policies to roll out, by name: scripted ones, baselines, and the model itself last.
 
+    :param best: of the fitted ones, :attr:`Fit.best` alone.
     :raises RunError: the spec has no task, or names a scripted policy that the task lacks.
     """
     if fit.spec.task is None:
@@ -46,11 +47,19 @@ def policies(fit: Fit) -> dict[str, Policy | str]:
             f"rollout.policies: task {fit.spec.task!r} has no {', '.join(unknown)} (it has: {', '.join(known)})"
         )
     scripted: dict[str, Policy | str] = {name: name for name in fit.spec.rollout.policies}
+    if best:
+        return scripted | {fit.best.name: fit.best.controller()}
     return scripted | {name: other.controller() for name, other in fit.baselines.items()} | {fit.name: fit.controller()}
 
 
 def roll_out(
-    fit: Fit, episodes: int, film: int = 0, on_event: OnEvent = ignore, jobs: int = -1, resume: bool = False
+    fit: Fit,
+    episodes: int,
+    film: int = 0,
+    on_event: OnEvent = ignore,
+    jobs: int = -1,
+    resume: bool = False,
+    best: bool = False,
 ) -> Rollouts:
     """Roll out a fit, its baselines and the task's scripted policies from the same initial states.
 
@@ -60,13 +69,14 @@ def roll_out(
     :param episodes: the number of initial states.
     :param film: the number of episodes of each method to film.
     :param resume: return the finished rollouts of the run where seeds and methods are the same.
+    :param best: of the fitted models, roll out :attr:`Fit.best` alone.
     :returns: ``rollouts`` of the fit's metrics.
     :raises RunError: there is no task, or the fit has no folder.
     :raises Damaged: the file of an interrupted rollout is damaged.
     """
     folder = fit.run_folder
     seeds = range(fit.spec.rollout.seed, fit.spec.rollout.seed + episodes)
-    played = policies(fit)
+    played = policies(fit, best)
     held = fit.metrics.rollouts
     whole = held and (held.seed, held.episodes, {*held.methods}) == (seeds.start, episodes, {*played})
     if held and whole and resume and all(_filmed(fit, name, seeds[:film]) for name in played):
@@ -163,6 +173,6 @@ def _method(
 ) -> Method:
     """The measures of a method, and its successes against ours."""
     found: dict[str, Any] = {"measures": summarize(task, outcomes)}
-    if name != ours and name in succeeded:
+    if name != ours and {name, ours} <= {*succeeded}:
         found["against"] = paired_difference(succeeded[ours], succeeded[name])
     return Method.model_validate(found)

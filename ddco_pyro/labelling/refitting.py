@@ -107,7 +107,7 @@ def refit_spec(trained: Fit, level: str, count: int) -> Spec:
         "demonstrations.leave_one_out": False,
         "demonstrations.valid_fraction": 0.0,
         "demonstrations.exclude": [],
-        "training.restarts": 1,
+        "training.starts": trained.spec.training.starts[:1],
         "training.labels": {"level": level, "from": SAID, "recogniser": recogniser},
         f"hierarchy.levels.{place}.count": count,
     }

@@ -71,7 +71,7 @@ class Caller(nn.Module):
         self.sizes = (logits, scaling.numbers + of_state if self.emits_control else 0)
         self.network = build(network, shape, sum(self.sizes), copies)
         if of_state:
-            self.network.begin_at_zero(of_state)
+            self.network.begin_at(of_state)
         self.std = std
 
     def forward(self, raw: Tensor, scaling: ControlScaling, std: Tensor | None = None) -> CallerOutputs:
@@ -205,11 +205,11 @@ class Hierarchy(nn.Module):
             each |= {} if level.termination is None else {f"{place}.termination": level.termination}
         return each | {"meta_policy": self.meta_policy.network}
 
-    def begin_terminations(self) -> None:
-        """Have every ψ start at 1/2 at every state; those of a user's network keep their start."""
+    def begin_terminations(self, logit: float = 0.0) -> None:
+        """Have every ψ start at one value, 1/2 or that of a logit; those of a user's network keep their start."""
         for level in self.option_levels():
             if level.termination is not None:
-                level.termination.begin_at_zero(1)
+                level.termination.begin_at(1, logit)
 
     def named_networks(self) -> Iterator[tuple[str, nn.Module]]:
         """Every network, with the σ of its control, by its place in the spec."""

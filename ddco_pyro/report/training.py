@@ -30,8 +30,6 @@ STAGES = {
     "beginning. Its values can be compared within the panel only.",
     "parts": "“From equal parts” trains each option of a level on one of equally long parts of every demonstration. "
     "Its values can be compared within the panel only.",
-    "cuts": "“From random cuts” trains each option of a level on one of the parts that every demonstration is cut into "
-    "at random. Its values can be compared within the panel only.",
     "mixture": "“All together without memory” trains all policies while every option ends after every step.",
     "level": "“Alone” trains a level’s options while all are equally likely.",
     "meta": "“Meta-policy alone” then trains the policy that selects the options.",
@@ -45,7 +43,7 @@ def _stage_name(name: str) -> str:
     kind, _, level = name.partition("-")
     whole = {"meta-policy": "meta-policy alone", "joint": "all together", "mixture": "all together without memory"}
     whole |= {"segments": "levels above the lowest from segments", "upper": "levels above the lowest together"}
-    how = {"vq": "from clusters", "parts": "from equal parts", "cuts": "from random cuts", "level": "alone"}.get(kind)
+    how = {"vq": "from clusters", "parts": "from equal parts", "level": "alone"}.get(kind)
     return f"level {level} {how}" if how else whole.get(name, name)
 
 

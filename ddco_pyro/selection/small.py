@@ -59,7 +59,7 @@ class Lasting(NamedTuple):
 
     :param power: β.
     :param constant: whether gates and terminations are constant.
-    :param window: ``training.window`` of options that last long.
+    :param window: ``training.window`` of options that last long; 0 for none.
     :param segments: of the lowest level.
     :param value: log-likelihood per step of the tuning demonstrations with that power, nats.
     """
@@ -76,7 +76,7 @@ def overrides(spec: Spec, power: float, constant: bool, window: int) -> dict[str
     values: dict[str, Any] = {"control.power": power}
     if power < USUAL:
         values |= {f"training.optimizer.ridge.{gate}": RIDGE for gate in ("gate", "termination")}
-        values["training.window"] = window
+        values |= {"training.starts": ["windows"], "training.window": window} if window else {}
     if constant and spec.hierarchy is not None:
         levels = enumerate(spec.hierarchy.levels)
         gates = [f"levels.{n}.{part}" for n, level in levels for part in _gates(n, level.lasts)]
@@ -146,7 +146,7 @@ def lasting(spec: Spec, demos: Demonstrations, steps: float | None, on_event: On
 
 
 def _sketch(spec: Spec) -> Spec:
-    """The spec of a small fit of the model alone, with all demonstrations."""
+    """The spec of a small fit of the model alone, with all demonstrations, from its first start."""
     return with_overrides(
         spec,
         {
@@ -154,6 +154,7 @@ def _sketch(spec: Spec) -> Spec:
             "demonstrations.valid_fraction": 0,
             "demonstrations.leave_one_out": False,
             "demonstrations.hold_out_by": None,
+            "training.starts": spec.training.starts[:1],
             "training.epochs": min(EPOCHS, spec.training.epochs or EPOCHS),
         },
     )

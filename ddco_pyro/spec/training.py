@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Literal
 
 from pydantic import ConfigDict, Field
 
@@ -113,28 +113,27 @@ class DurationSpec(Model):
     as many as the demonstrations would have with these durations; 0 for no prior."""
 
 
-Start = Literal["vq", "vq_controls", "equal_parts", "cuts", "mixture", "random"]
-Starts = Annotated[Items[Start], Field(min_length=1)]
-STARTS = get_args(Start)
+Start = Literal["vq", "vq_controls", "windows", "equal_parts", "mixture", "random"]
 
 
 class TrainingSpec(Model):
     """How the model is trained."""
 
-    initialize: Annotated[
-        Start | Starts,
-        nested((list, tuple), Starts, f"one of {', '.join(map(repr, STARTS))}, or a list of them", STARTS),
-    ] = "vq"
-    """``vq``: vector quantisation of the observations that the options' policies read (SM 2.2). ``vq_controls``: vector
-    quantisation of these observations and the controls. ``equal_parts``: each demonstration cut into k parts of equal
-    length, for skills that follow one another. ``cuts``: each demonstration cut into k parts at random, other ones in
-    each restart. ``mixture``: first the memoryless mixture (ψ = 1) is trained from ``vq_controls``; then ψ starts at
-    1/2, and all levels train together, whatever ``layerwise`` says. ``random``: random weights. A list has a kind for
-    each of several restarts in turn, the first again after the last. The first restart has the best of ten runs of
-    k-means, each further one a run from random steps."""
-    window: int = Field(default=0, ge=0)
-    """For ``vq``, ``vq_controls`` and ``mixture``: steps before and after a step over which observations and controls
-    are averaged before they are clustered. People's skills show over a second, not in a step."""
+    starts: Annotated[Items[Start], Field(min_length=1)] = ("vq",)
+    """Ways to begin. Training goes on from each, and keeps the model with the highest objective on the training
+    demonstrations: the log-likelihood (``control.power``) with the log-prior of the ridges.
+
+    ``vq``: vector quantisation of the observations that the options' policies read (SM 2.2). ``vq_controls``: of these
+    observations and the controls. ``windows``: of means of both over ``window`` steps. ``equal_parts``: each
+    demonstration cut into k parts of equal length, for skills that follow one another. ``mixture``: first the
+    memoryless mixture (ψ = 1) is trained from ``vq_controls``; then ψ starts at 1/2, and all levels train together,
+    whatever ``layerwise`` says. ``random``: random weights. Named again, a way begins from other random numbers: the
+    first clusters are the best of ten runs of k-means, further ones a run from random steps each."""
+    margin: float = Field(default=0.0, ge=0)
+    """Nats per step by which the objective of a later start has to exceed that of the first to be kept."""
+    window: Count = 10
+    """Steps before and after a step over which ``windows`` averages observations and controls. People's skills show
+    over a second, not in a step."""
     layerwise: bool = True
     """Whether levels are discovered one after another, lowest first, rather than all at once."""
     upper_levels: Literal["clusters", "segments"] = "clusters"
@@ -155,17 +154,12 @@ class TrainingSpec(Model):
     shards: Count = 1
     """Number of parts of a minibatch, and the most processes of ``torchrun`` that can share it. Results depend on the
     number of shards, by rounding and dropout, and not on the number of processes."""
-    restarts: Count = 1
-    """Number of independent initialisations; the best on the tuning demonstrations is kept."""
-    halving: Count | None = 50
-    """Successive halving of several restarts: after so many epochs of the last stage the worse half on the tuning
-    demonstrations is stopped, again after twice as many epochs, and so on. Null: all restarts train to the end."""
     seed: Seed | None = None
     """Seed of initial weights, clusters, the order of demonstrations, and dropout; null: the spec's ``seed``. The split
     into training, tuning and held-out demonstrations does not depend on this seed."""
     tune_fraction: Share = 0.1
-    """Fraction of the training demonstrations used for tuning: early stopping and the choice among restarts; at least
-    one demonstration. With 0, ``em`` trains on all of them until it converges."""
+    """Fraction of the training demonstrations used for tuning, which stops training early; at least one demonstration.
+    With 0, ``em`` trains on all of them until it converges."""
     tune_by: Literal["mean", "median"] = "mean"
     """The tuning score: ``mean`` of the objective over steps, or ``median`` over demonstrations, which is robust to a
     single outlier."""
@@ -190,16 +184,6 @@ class TrainingSpec(Model):
         given = self.optimizer.model_fields_set - {"ridge"} or {"average", "clip_gradient"} & self.model_fields_set
         return bool(given) and self.optimizer.name != "em"
 
-    def start(self, restart: int) -> Start:
-        """The kind of initialisation that a restart begins from (``initialize``)."""
-        kinds = self.starts
-        return kinds[restart % len(kinds)]
-
-    @property
-    def starts(self) -> tuple[Start, ...]:
-        """The kinds of initialisation, one or more."""
-        return self.initialize if isinstance(self.initialize, tuple) else (self.initialize,)
-
     def problems(self) -> Problems:
         if self.optimizer.name == "em":
             steps = self.optimizer
@@ -207,9 +191,6 @@ class TrainingSpec(Model):
             for key, value in (unused | {"optimizer.schedule": steps.schedule != "constant"}).items():
                 if value:
                     yield key, "em takes no gradient steps and would not use it; leave it out"
-        if len(self.starts) > self.restarts:
-            text = f"has {len(self.starts)} kinds, but training.restarts is {self.restarts}; give as many restarts"
-            yield "initialize", text
         if "mixture" in self.starts and self.lower_levels == "frozen":
             yield "lower_levels", "mixture trains all levels together in the end; say fine_tuned"
         if self.epochs is None and self.patience is None:

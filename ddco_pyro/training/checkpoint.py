@@ -20,6 +20,7 @@ from ddco_pyro.spec import Spec
 from ddco_pyro.training.devices import device_of, room
 from ddco_pyro.training.labels import Labels
 from ddco_pyro.training.networks import Dimensions, build_hierarchy
+from ddco_pyro.training.stages import starts_of
 
 State = dict[str, Tensor]
 
@@ -72,15 +73,22 @@ class TrainingData:
             return self
         return replace(self, train=self.train.held(device), tune=self.tune.held(device))
 
-    def seed(self, *place: int) -> int:
+    def seed(self, restart: int, *place: int) -> int:
         """The seed of a restart, of one of its stages, of an epoch of a stage, or of a shard of a minibatch.
 
+        The first restarts of two ways to begin have the same seeds, and so have the second ones: the way alone differs.
         numpy pads with zeros: a stage has the seed of its first epoch, and the first stage that of its restart. Those
-        seeds draw different things: weights, clusters, the order of minibatches. No two restarts, stages of a restart,
-        epochs or shards have the same seed.
+        seeds draw different things: weights, clusters, the order of minibatches. No two restarts of one way, stages of
+        a restart, epochs or shards have the same seed.
         """
         own, training = self.spec.seed, self.spec.training.seed
-        return int(np.random.SeedSequence([own if training is None else training, *place]).generate_state(1)[0])
+        entropy = [own if training is None else training, self.repetition(restart), *place]
+        return int(np.random.SeedSequence(entropy).generate_state(1)[0])
+
+    def repetition(self, restart: int) -> int:
+        """How many restarts before this one begin in the same way."""
+        starts = starts_of(self.spec)
+        return starts[:restart].count(starts[restart])
 
 
 @dataclass
@@ -95,6 +103,9 @@ class Progress:
     :param stale: epochs since the best one.
     :param start: tuning log-likelihood per step before the current stage.
     :param best: the best tuning log-likelihood per step of the current stage.
+    :param objective: of the training demonstrations under the model that is kept, with the log-prior of its weights,
+        nats per step.
+    :param sounded: the same at the pause in which restarts are compared; of one that ended before it, at the end.
     :param ended: a :class:`ddco_pyro.training.stages.StageEnd` for each stage that has ended.
     :param history: a row for each epoch.
     :param device: the kind of device that its networks are trained on.
@@ -107,6 +118,8 @@ class Progress:
     stale: int = 0
     start: float = -np.inf
     best: float = -np.inf
+    objective: float = -np.inf
+    sounded: float = -np.inf
     done: bool = False
     ended: list[dict[str, Any]] = field(default_factory=list)
     history: list[dict[str, Any]] = field(default_factory=list)
@@ -135,10 +148,12 @@ class Restart:
     :param states: tensors of the ``model``, of its ``optimizer`` and of the ``best`` epoch of the current stage; where
         there are any, of the ``average`` of weights, and the ``known`` choices and the ``constants`` of the objective.
         A restart that is done has the best alone, one that has diverged nothing.
+    :param paused: the stage in which it pauses, in memory alone.
     """
 
     progress: Progress
     states: dict[str, State] = field(default_factory=dict)
+    paused: Any = field(default=None, repr=False)
 
     def written(self, path: Path | None) -> Restart:
         """This restart, written as a checkpoint where there is a path: whole or not at all."""

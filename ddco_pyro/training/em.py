@@ -241,21 +241,10 @@ class Expectation:
         """Whether each of the last two steps gained less than :data:`TOLERANCE`, or roughly: than :data:`ROUGHLY`."""
         return self.gain < (ROUGHLY if roughly else TOLERANCE)
 
-    def states(self) -> dict[str, Tensor]:
-        """What a checkpoint keeps: the weights in float64, and those before the last step with their value."""
-        before = {f"before.{name}": value for name, value in (self._before or {}).items()}
-        numbers = {"value": self.value, "gain": self.gain, "stretch": self.stretch, "last": self._last}
-        exact = {name: torch.tensor(one, dtype=torch.float64) for name, one in numbers.items()}
-        kept = {**self._state(), **before, **exact}
-        return {name: one.clone() for name, one in kept.items()}
-
-    def load_states(self, states: Mapping[str, Tensor]) -> None:
-        """Go on from what :meth:`states` kept."""
-        numbers = (float(states[name]) for name in ("value", "gain", "stretch", "last"))
-        self.value, self.gain, self.stretch, self._last = numbers
-        self._before = {name.removeprefix("before."): one for name, one in states.items() if name.startswith("before.")}
-        self._before = self._before or None
-        self._restore(states)
+    def objective(self, batch: Batch) -> float:
+        """The penalised log-likelihood of all demonstrations, nats."""
+        value, sums = self._expect(batch)
+        return value + self._penalty(sums)
 
     def step(self, batch: Batch) -> float:
         """One EM step over all demonstrations; their log-likelihood before the step, nats.

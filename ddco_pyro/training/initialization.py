@@ -1,4 +1,6 @@
-"""Initial segments of a level: clusters of observations (vector quantisation, SM 2.2), equal parts, or random cuts.
+"""Ways to begin (``training.starts``): what the initial segments of a level are, and what is trained first.
+
+Segments are clusters of observations (vector quantisation, SM 2.2), also with controls, or equal parts.
 
 The paper clones one policy from each cluster. Here the whole model is trained with the choices of a level clamped to
 these segments. This clones the policies and starts the terminations from the clusters' boundaries, at any level.
@@ -10,7 +12,8 @@ Where some options have labelled steps, their clusters start from the means of t
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,6 +24,7 @@ from ddco_pyro.data.memory import share
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import BYTES_AT_ONCE
 from ddco_pyro.model.recogniser import FRAMES_AT_ONCE, block_means, window_means
+from ddco_pyro.spec import Start
 
 if TYPE_CHECKING:
     from sklearn.cluster import KMeans
@@ -150,23 +154,94 @@ class EqualParts:
         return torch.where(_alive(batch), part, 0)
 
 
-class RandomCuts:
-    """Every trajectory cut at random into ``options`` parts, named as the options 1 to k in order.
+# --- ways to begin ----------------------------------------------------------------------------------------------------
 
-    The k - 1 cuts of a trajectory are different steps, drawn uniformly. A trajectory of fewer than k steps has parts of
-    one step. Batches draw on from a single generator: a batch and its pieces in order have the same cuts.
+
+@dataclass(frozen=True)
+class Given:
+    """What the initial segments of a level come from; the parameters are those of :class:`Clusters`."""
+
+    batch: Batch
+    options: int
+    seed: int
+    labels: Tensor | None
+    read: Sequence[str]
+    best: bool
+    window: int
+
+    def clusters(self, controls: bool, window: int = 0) -> Clusters:
+        """Clusters of the observations, and of the controls if asked for."""
+        return Clusters(self.batch, self.options, self.seed, controls, self.labels, self.read, self.best, window)
+
+
+class Observations:
+    """Clusters of the observations that the policies read.
+
+    :cvar stage: names the stages that train on the segments; empty where there are no segments.
+    :cvar memoryless: whether the memoryless mixture is trained before options that last.
+    :cvar ordered: whether segments are numbered in the order of time.
     """
 
-    def __init__(self, options: int, seed: int) -> None:
-        self.options, self._random = options, np.random.default_rng(seed)
+    stage = "vq"
+    memoryless = False
+    ordered = False
 
-    def choices(self, batch: Batch) -> Tensor:
-        """The part of each step, [N, T], 1 to k; 0 where there is padding."""
-        part = torch.ones(batch.inputs.batch, dtype=torch.long)
-        for row, length in zip(part, batch.lengths.tolist(), strict=True):
-            for cut in self._random.choice(length - 1, min(self.options, length) - 1, replace=False):
-                row[cut + 1 :] += 1
-        return torch.where(_alive(batch), part, 0)
+    def segments(self, given: Given) -> Clusters | EqualParts:
+        """What gives each step its option, :meth:`Clusters.choices`."""
+        return given.clusters(controls=False)
+
+
+class ObservationsAndControls(Observations):
+    """Clusters of observations and controls."""
+
+    def segments(self, given: Given) -> Clusters | EqualParts:
+        """Clusters of both."""
+        return given.clusters(controls=True)
+
+
+class Windows(Observations):
+    """Clusters of means of observations and controls over the steps around each."""
+
+    def segments(self, given: Given) -> Clusters | EqualParts:
+        """Clusters of both, over ``training.window`` steps before and after."""
+        return given.clusters(controls=True, window=given.window)
+
+
+class Mixture(ObservationsAndControls):
+    """The memoryless mixture, which is trained first from clusters of observations and controls."""
+
+    memoryless = True
+
+
+class Parts(Observations):
+    """Parts of equal length of each demonstration."""
+
+    stage = "parts"
+    ordered = True
+
+    def segments(self, given: Given) -> Clusters | EqualParts:
+        """As many parts as options."""
+        return EqualParts(given.options)
+
+
+class Random(Observations):
+    """Random weights."""
+
+    stage = ""
+
+
+WAYS: Mapping[Start, Observations] = {
+    "vq": Observations(),
+    "vq_controls": ObservationsAndControls(),
+    "windows": Windows(),
+    "equal_parts": Parts(),
+    "mixture": Mixture(),
+    "random": Random(),
+}
+"""Every way to begin, by its name in a spec."""
+
+
+# --- labels and clusters ----------------------------------------------------------------------------------------------
 
 
 class _Start:

@@ -3,9 +3,9 @@
 The gradient of the marginal log-likelihood *is* the expectation-gradient step: the posteriors of the E-step weight the
 gradients of the networks. A gradient step sees a minibatch of whole trajectories.
 
-The random numbers of an epoch are seeded by (seed, restart, stage, epoch). A restart that is continued from the end of
-any epoch, in this process or another, therefore has the same bits as one without an interruption. The gradients of a
-minibatch's shards (``training.shards``) are added in the order of the shards, so that the number of processes that
+The random numbers of an epoch are seeded by (seed, restart, stage, epoch). Gradient steps that are continued from the
+end of any epoch, in this process or another, therefore have the same bits as without an interruption. The gradients of
+a minibatch's shards (``training.shards``) are added in the order of the shards, so that the number of processes that
 compute them changes no bit either.
 """
 
@@ -43,7 +43,7 @@ from ddco_pyro.training.optimizers import (
     restore_optimizer,
 )
 from ddco_pyro.training.processes import Ranks
-from ddco_pyro.training.stages import Stage, StageEnd, plan, share
+from ddco_pyro.training.stages import EVERYTHING, Stage, StageEnd, plan, share
 
 SAVE_EVERY = 5.0
 """Seconds between checkpoints, at least: an epoch of a small model takes less time than its checkpoint."""
@@ -56,18 +56,18 @@ def train(
     data: TrainingData,
     restart: Restart,
     until: int | None = None,
-    seconds: float = math.inf,
     checkpoint: Path | None = None,
     on_event: OnEvent = ignore,
 ) -> Restart:
     """Train a restart further, on one thread, together with the processes of ``torchrun`` (:meth:`Ranks.here`).
 
     :param until: epochs of the last stage after which training pauses; None to train until patience or budget end it.
-    :param seconds: training also pauses after about this time, at the end of an epoch.
-    :param checkpoint: the file that the restart is written to at the end of epochs and of the training.
+        A restart whose steps are over all demonstrations goes on from there in this process alone.
+    :param checkpoint: the file that the restart is written to, at the end of epochs of gradient steps and of the
+        training. Steps over all demonstrations take seconds: those of a stage are made again after an interruption.
     """
     now, states, spec = restart.progress, restart.states, data.spec.training
-    device, deadline, saved = device_of(spec), time.monotonic() + seconds, -math.inf
+    device, saved = device_of(spec), -math.inf
     with one_thread(), repeatable(device), Readers(spec.workers) as readers:
         data = data.read_by(readers).held(device)
         model = data.hierarchy(now.restart, states.get("model"))
@@ -76,22 +76,31 @@ def train(
             while not now.done:
                 last = now.stage == len(stages) - 1
                 cap = share(spec.epochs, now.spent, len(stages) - now.stage)
-                stage, begun = StageTraining(data, model, stages[now.stage], restart, last), now.epoch
+                stage = restart.paused or StageTraining(data, model, stages[now.stage], restart, last)
+                restart.paused = None
                 while (cap is None or now.epoch < cap) and not stage.converged:
-                    overdue = now.epoch > begun and time.monotonic() > deadline
-                    if overdue or (last and until is not None and now.epoch >= until):
+                    if last and until is not None and now.epoch >= until:
+                        now.sounded = stage.reached()
+                        if stage.whole is not None:
+                            restart.paused = stage
+                            return restart
                         states |= stage.states()
                         return restart.written(checkpoint)
                     on_event(stage.epoch(cap))
-                    if checkpoint and time.monotonic() - saved > SAVE_EVERY:
+                    if checkpoint and stage.whole is None and time.monotonic() - saved > SAVE_EVERY:
                         states |= stage.states()
                         restart.written(checkpoint)
                         saved = time.monotonic()
                 stage.end(cap)
+                if last:
+                    now.objective = stage.reached()
+                    if until is not None:
+                        now.sounded = now.objective
                 now.stage, now.epoch, now.done = (now.stage, now.epoch, True) if last else (now.stage + 1, 0, False)
             restart.states = {"best": states["best"]}
         except Diverged as error:
-            now.done, now.diverged, now.best, restart.states = True, str(error), -math.inf, {}
+            now.done, now.diverged, restart.states = True, str(error), {}
+            now.best = now.objective = -math.inf
     return restart.written(checkpoint)
 
 
@@ -125,10 +134,7 @@ class StageTraining:
         decay = self.spec.average
         self.mean = None if decay is None else AveragedModel(model, multi_avg_fn=get_ema_multi_avg_fn(decay))
         if now.epoch > 0:
-            if self.whole is not None:
-                self.whole.load_states(restart.states["whole"])
-            else:
-                restore_optimizer(self.optimizer, restart.states["optimizer"])
+            restore_optimizer(self.optimizer, restart.states["optimizer"])
             if self.mean is not None:
                 self.mean.load_state_dict(restart.states["average"])
         else:
@@ -262,11 +268,23 @@ class StageTraining:
                     yield piece
 
     def states(self) -> dict[str, State]:
-        """The state of the stage in a checkpoint, beside the best epoch and the objective."""
+        """The state of gradient steps in a checkpoint, beside the best epoch and the objective."""
         average = {} if self.mean is None else {"average": copy_of(self.mean)}
-        if self.whole is not None:
-            return {"model": copy_of(self.model), "whole": self.whole.states(), **average}
         return {"model": copy_of(self.model), "optimizer": optimizer_state(self.optimizer), **average}
+
+    def reached(self) -> float:
+        """The objective of the training demonstrations under the best epoch's model, with the log-prior of the ridges
+        where EM trains it, nats per step.
+        """
+        train, model = self.data.train, self.data.hierarchy(self.restart.progress.restart, self.restart.states["best"])
+        if isinstance(self.whole, Expectation):
+            score = Expectation(model, EVERYTHING, self._score, self.spec.optimizer.ridge).objective(train)
+        else:
+            with torch.no_grad():
+                pieces = train.pieces(model.steps_at_once)
+                tables = ((self.objective.tables(model, piece, rows), piece.lengths) for rows, piece in pieces)
+                score = sum(float(self.objective.values(*pair).sum()) for pair in tables)
+        return score / train.steps
 
     def end(self, cap: int | None) -> None:
         """The best epoch is the model that the stage gives."""

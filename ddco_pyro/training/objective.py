@@ -19,9 +19,9 @@ from ddco_pyro.model.networks.inputs import Frames
 from ddco_pyro.model.tables import Tables, always_ends
 from ddco_pyro.spec import DurationSpec
 from ddco_pyro.training.checkpoint import Progress, State, TrainingData
-from ddco_pyro.training.initialization import Clusters, EqualParts, RandomCuts
+from ddco_pyro.training.initialization import WAYS, Given
 from ddco_pyro.training.processes import Ranks
-from ddco_pyro.training.stages import Stage
+from ddco_pyro.training.stages import Stage, starts_of
 from ddco_pyro.training.upper import Constants, expected, fitted
 
 
@@ -85,22 +85,16 @@ class Objective:
         """A step without a label has its cluster, or the part of the demonstration it is in, as known choice."""
         data, hierarchy = self.data, self.data.spec.hierarchy
         assert hierarchy is not None  # only levels are clamped
-        kind, count = data.spec.training.start(self.progress.restart), hierarchy.levels[level - 1].count
-        seed = data.seed(self.progress.restart, self.progress.stage)
-        start: EqualParts | RandomCuts | Clusters
+        restart = self.progress.restart
+        seed = data.seed(restart, self.progress.stage)
         if (labels := data.labels) is not None and labels.level == level and labels.starts is not None:
             for known, found in zip(self.known, labels.starts, strict=True):
                 known[level] = torch.where(known[level] < 0, found, known[level])
             return
-        if kind == "equal_parts":
-            start = EqualParts(count)
-        elif kind == "cuts":
-            start = RandomCuts(count, seed)
-        else:
-            given, read = self.known[0].get(level), hierarchy.read_by(level)
-            best = self.progress.restart == 0  # further restarts are to differ
-            window = data.spec.training.window
-            start = Clusters(data.train, count, seed, kind != "vq", given, read, best, window)
+        count, read = hierarchy.levels[level - 1].count, hierarchy.read_by(level)
+        best = not data.repetition(restart)  # further restarts are to differ
+        given = Given(data.train, count, seed, self.known[0].get(level), read, best, data.spec.training.window)
+        start = WAYS[starts_of(data.spec)[restart]].segments(given)
         for known, batch in zip(self.known, (data.train, data.tune), strict=True):
             choices = start.choices(batch)
             labelled = known.get(level, choices)

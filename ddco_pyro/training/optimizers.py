@@ -94,9 +94,6 @@ EVALUATIONS = 25
 NOTHING = 1e-9
 """L-BFGS has converged where a step gains less, in nats per step of the demonstrations."""
 
-_LISTS = ("old_dirs", "old_stps", "ro")
-_NUMBERS = ("n_iter", "func_evals", "d", "t", "H_diag", "prev_flat_grad", "prev_loss")
-
 
 class QuasiNewton:
     """L-BFGS (Liu and Nocedal 1989) with a line search for the strong Wolfe conditions, over all demonstrations.
@@ -152,20 +149,3 @@ class QuasiNewton:
         for parameter, gradient in zip(self._parameters, evaluation[3], strict=True):
             parameter.grad = gradient.clone()
         return evaluation[1:3]
-
-    def states(self) -> dict[str, Tensor]:
-        """For a checkpoint: the weights in float64, and the optimiser's history."""
-        history = self._optimizer.state[self._parameters[0]]
-        lists = {name: torch.stack([*map(torch.as_tensor, history[name])]) for name in _LISTS if history.get(name)}
-        numbers = {name: torch.as_tensor(history[name]).clone() for name in _NUMBERS if history.get(name) is not None}
-        weights = nn.utils.parameters_to_vector(self._parameters).detach()
-        return {"weights": weights, "gain": torch.tensor(self.gain).double(), **lists, **numbers}
-
-    def load_states(self, states: Mapping[str, Tensor]) -> None:
-        """Go on from the :meth:`states` of a checkpoint."""
-        nn.utils.vector_to_parameters(states["weights"], self._parameters)
-        self.gain = float(states["gain"])
-        history = self._optimizer.state[self._parameters[0]]
-        history |= {name: list(states.get(name, ())) for name in _LISTS}
-        history |= {name: states[name].clone() for name in _NUMBERS if name in states}
-        history["n_iter"] = int(history["n_iter"])

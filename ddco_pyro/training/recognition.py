@@ -242,7 +242,7 @@ def _begun(data: TrainingData, batch: Batch, starts: Tensor, known: Tensor, name
     (rows,) = torch.where((known > 0).any(1))
     part, known = batch.select(rows), known[rows, : int(batch.lengths[rows].max())]
     labels = replace(data.labels, train=known, tune=known)
-    changes = {"training.restarts": 1, "training.initialize": data.spec.training.start(0)}
+    changes = {"training.starts": data.spec.training.starts[:1]}
     spec, names = with_overrides(data.spec, changes), tuple(names[row] for row in rows.tolist())
     alone = replace(data, spec=spec, train=part, tune=part, labels=labels, names=names)
     restart, ranks = Restart(Progress(0)), Ranks.here()

@@ -1,17 +1,19 @@
-"""Restarts: independent initialisations of a model, of which the best on the tuning demonstrations is kept.
+"""Restarts: a model is trained from several starts, and the likeliest in training is kept.
 
-Successive halving: all restarts train until ``training.halving`` epochs of the last stage, the better half until twice
-as many, and so on; the last restart alone trains until patience or budget end it. Earlier stages are trained whole,
-since their objectives cannot be compared. A restart whose log-likelihood becomes NaN or infinite ends there and ranks
-last. The histories alone decide which restarts go on, so that neither the number of processes nor an interruption
-changes the result.
+EM and gradient ascent end near where they began. ``training.starts`` lists ways to begin; each is a restart. All
+restarts train for :data:`SOUNDING` epochs of their last stage. Those that are far behind by then are stopped, and the
+others train until patience or budget end them. The objective that decides is of the training demonstrations: the
+log-likelihood (``control.power``) with the log-prior of the ridges. A restart whose log-likelihood becomes NaN or
+infinite ends there and ranks last. Neither the number of processes nor an interruption changes the result.
+
+A hierarchy contains its memoryless mixture (ψ = 1), and should be no less likely in training (:meth:`Trainer.go_on`).
 """
 
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -37,7 +39,7 @@ from ddco_pyro.model.batch import encode, refuse_unusable
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.seeding import seeded
 from ddco_pyro.spec import Spec, with_overrides
-from ddco_pyro.training.checkpoint import Progress, Restart, TrainingData
+from ddco_pyro.training.checkpoint import Progress, Restart, TrainingData, copy_of
 from ddco_pyro.training.data import tuning_split
 from ddco_pyro.training.devices import described, device_of, one_thread
 from ddco_pyro.training.labels import Labels
@@ -48,10 +50,18 @@ from ddco_pyro.training.optimizers import optimizer_of
 from ddco_pyro.training.processes import Ranks
 from ddco_pyro.training.recognition import Recognition, recognise
 from ddco_pyro.training.ridge import cross_validated
-from ddco_pyro.training.stages import StageEnd, plan
+from ddco_pyro.training.stages import StageEnd, plan, starts_of
 
-SHORT = 10.0
-"""Seconds of training here before other processes start, which takes seconds itself."""
+SOUNDING, BY_GRADIENT = 5, 50
+"""Epochs of the last stage before restarts are compared: of EM, and of gradient steps."""
+BEHIND = 0.1
+"""Nats per step and control dimension by which a restart that is stopped is behind the likeliest."""
+BESIDE = "the mixture beside"
+"""What a restart that goes on from a baseline begins from."""
+ROUNDING = 1e-3
+"""Nats per step by which objectives of models that say the same may differ."""
+ALMOST_ALWAYS = 6.0
+"""A logit of ψ with which options that last are as likely as the mixture, up to 0.004 nats per step."""
 
 
 class OtherDevice(BadInput):
@@ -90,12 +100,14 @@ def train_model(
 
 def training_began(spec: Spec, name: str | None = None) -> TrainingBegan:
     """The event with which the training of a model begins."""
-    epochs, restarts = spec.training.epochs, spec.training.restarts
-    return TrainingBegan(name or model_name(spec), None if epochs is None else epochs * restarts)
+    epochs = spec.training.epochs
+    return TrainingBegan(name or model_name(spec), None if epochs is None else epochs * len(starts_of(spec)))
 
 
 class Trainer:
-    """Trains restarts of a spec's hierarchy on ``train``, stopping and choosing among them by ``tune``.
+    """Trains restarts of a spec's hierarchy on ``train``, of which the likeliest there is kept.
+
+    Demonstrations to ``tune`` with end each restart.
 
     :ivar hierarchy: the model: before :meth:`run` without training, then the best restart's.
     :ivar check: how far the engines are apart, once :meth:`check_engines` has compared them.
@@ -121,7 +133,7 @@ class Trainer:
         jobs: int = 1,
     ) -> None:
         self.spec, self.checkpoints, self.on_event, self.ranks = spec, checkpoints, on_event, Ranks.here()
-        self.jobs = Workers(jobs).number(spec.training.restarts)
+        self.jobs = Workers(jobs).number(len(starts_of(spec)))
         self.hierarchy = build_hierarchy(spec, dimensions)
         encoder, scaling = self.hierarchy.encoder, self.hierarchy.scaling
         encoder.fit(train)
@@ -142,6 +154,7 @@ class Trainer:
             self.data, self.recognition = recognise(self.hierarchy, self.data, every)
         self.restarts: list[Restart] = []
         self.stopped: dict[int, int] = {}
+        self._least = -math.inf
         self.agreement: dict[int, float] = {}
         self.check = EngineCheck(math.nan, math.nan)
 
@@ -174,11 +187,16 @@ class Trainer:
         :raises OtherDevice: a restart was begun on another kind of device than it is to be continued on.
         :raises TrainingError: every restart has diverged.
         """
-        self.restarts = [self._begun(number) for number in range(self.spec.training.restarts)]
-        self.ranks.share(self.data)
-        with processes(self.jobs):
-            self._run_rungs()
-        self.ranks.share(None)
+        self.restarts = [self._begun(number) for number in range(len(starts_of(self.spec)))]
+        every = range(len(self.restarts))
+        with processes(self.jobs), self._together():
+            if len(every) > 1:
+                self._train(every, BY_GRADIENT if self._by_gradient else SOUNDING)
+                self._stop(self._behind())
+            self._train([number for number in every if number not in self.stopped], None)
+            if self.restarts[self.best].progress.diverged is not None and self.stopped:
+                again, self.stopped = [*self.stopped], {}
+                self._train(again, None)
         if (why := self.restarts[self.best].progress.diverged) is not None:
             raise TrainingError(why)
         if len(self.restarts) > 1 and self.hierarchy.depth:
@@ -187,33 +205,73 @@ class Trainer:
             found = {n: self._segments(n) for n, restart in enumerate(self.restarts) if "best" in restart.states}
             own = found.pop(self.best)
             self.agreement = {n: float(normalized_mutual_info_score(own, other)) for n, other in found.items()}
+        return self._keep_best()
+
+    def contain(self, mixture: Hierarchy, objective: float) -> Hierarchy:
+        """Keep no model that is less likely in training than a mixture which the hierarchy contains.
+
+        Where no restart is as likely, further ones go on from the mixture: first with ψ = 1/2, then with ψ nearly 1,
+        where options that last are as likely as the mixture from the first step on.
+
+        :param mixture: networks of the same spec, whose options end after every step.
+        :param objective: of the mixture, nats per step of the same demonstrations.
+        :returns: the best restart's hierarchy.
+        """
+        self._least = objective - ROUNDING
+        for logit in (0.0, ALMOST_ALWAYS):
+            if self.objective >= self._least:
+                break
+            self._go_on(mixture, logit)
+        return self._keep_best()
+
+    def _go_on(self, mixture: Hierarchy, logit: float) -> None:
+        """Train one more restart, which begins as a mixture with every ψ at a logit."""
+        number = len(self.restarts)
+        starts = [*starts_of(self.data.spec), "mixture"]
+        self.data = replace(self.data, spec=with_overrides(self.data.spec, {"training.starts": starts}))
+        model = self.data.hierarchy(number)
+        model.begin_terminations(logit)
+        begun = Progress(number, stage=self._last(number), device=described(device_of(self.spec.training)))
+        self.restarts.append(self._begun(number, Restart(begun, {"model": copy_of(model) | copy_of(mixture)})))
+        with self._together():
+            self._train([number], None)
+
+    def _keep_best(self) -> Hierarchy:
         self.hierarchy.load_state_dict(self.restarts[self.best].states["best"])
         return self.hierarchy.place(device_of(self.spec.training)).eval()
 
-    def _run_rungs(self) -> None:
-        """Train and stop restarts by successive halving, then train the last one, or ones, to the end."""
-        left, epochs = list(range(len(self.restarts))), self.spec.training.halving
-        worse: list[int] = []  # the best first
-        while epochs is not None and len(left) > 1:
-            before = len(self.history)
-            self._train(left, epochs)
-            tops = {n: best_until(self.restarts[n].progress, epochs, self._last(n)) for n in left}
-            order = ranked(tops)
-            better, behind = sorted(order[: (len(order) + 1) // 2]), order[(len(order) + 1) // 2 :]
-            self._stop(sorted(behind), tell=len(self.history) > before)
-            left, worse, epochs = better, behind + worse, 2 * epochs
-        self._train(left, None)
-        while self.restarts[self.best].progress.diverged is not None and self.stopped:
-            again = next(number for number in worse if number in self.stopped)
-            del self.stopped[again]
-            self._train([again], None)
+    @contextmanager
+    def _together(self) -> Iterator[None]:
+        """Inside, the processes of ``torchrun`` train along (:func:`follow`)."""
+        self.ranks.share(self.data)
+        yield
+        self.ranks.share(None)
+
+    @property
+    def _by_gradient(self) -> bool:
+        return optimizer_of(self.spec.training.optimizer, self.hierarchy) not in ("em", "lbfgs")
+
+    def _behind(self) -> list[int]:
+        """The restarts that are far behind the likeliest."""
+        reached = {restart.progress.restart: restart.progress.sounded for restart in self.restarts}
+        least = max(reached.values()) - BEHIND * self.hierarchy.scaling.size
+        return [number for number, value in reached.items() if value < least]
+
+    @property
+    def objective(self) -> float:
+        """The objective of the best restart, nats per step of the training demonstrations."""
+        return self.restarts[self.best].progress.objective
 
     @property
     def best(self) -> int:
-        """The restart with the best tuning log-likelihood, the first of equals; one that diverged where all did."""
-        whole = [restart.progress for restart in self._whole]
-        sound = [progress for progress in whole if progress.diverged is None]
-        return ranked({progress.restart: progress.best for progress in sound or whole})[0]
+        """The likeliest restart in training; the first where no other is likelier by ``training.margin``.
+
+        One that is less likely than the mixture is not kept by the margin.
+        """
+        values = {one.progress.restart: one.progress.objective for one in self._whole}
+        best = max(values, key=lambda number: (values[number], -number))
+        first = values.get(0, -math.inf)
+        return 0 if first >= max(self._least, values[best] - self.spec.training.margin) else best
 
     @property
     def history(self) -> list[dict[str, Any]]:
@@ -226,13 +284,14 @@ class Trainer:
         optimizer = optimizer_of(self.spec.training.optimizer, self.hierarchy)
         whole = optimizer in ("em", "lbfgs")
         best, updates = self.best, 1 if whole else math.ceil(len(self.data.train) / self.spec.training.batch_size)
-        ends = [StageEnd(**end) for end in self.restarts[best].progress.ended]
+        ends, own = [StageEnd(**end) for end in self.restarts[best].progress.ended], len(starts_of(self.spec))
         each = [
             {
                 "epochs": len(restart.progress.history),
                 "stopped": self.stopped.get(number),
                 "diverged": restart.progress.diverged is not None,
-                "initialize": self.spec.training.start(number) if self.hierarchy.depth else None,
+                "start": starts_of(self.data.spec)[number] if number < own else BESIDE,
+                "objective": None if math.isinf(restart.progress.objective) else restart.progress.objective,
                 "nmi": self.agreement.get(number),
             }
             for number, restart in enumerate(self.restarts)
@@ -248,6 +307,7 @@ class Trainer:
             "converged": ends[-1].converged,  # the last stage trains what acts in the end
             "restarts": {"best": best, "spent": effort(len(self.history)), "each": each},
             "device": self.restarts[best].progress.device,
+            "objective": self.objective,
             "by_em": optimizer == "em",
             "by_lbfgs": optimizer == "lbfgs",
             "raised_ridge": self.ridge if self.ridge != self.spec.training.optimizer.ridge.policy else None,
@@ -264,20 +324,20 @@ class Trainer:
 
     def _last(self, number: int) -> int:
         """The last stage of a restart."""
-        return len(plan(self.spec, self.hierarchy.depth, number)) - 1
+        return len(plan(self.data.spec, self.hierarchy.depth, number)) - 1
 
     @property
     def _whole(self) -> list[Restart]:
         return [restart for restart in self.restarts if restart.progress.restart not in self.stopped]
 
-    def _begun(self, number: int) -> Restart:
-        """A restart from its checkpoint, or at its beginning.
+    def _begun(self, number: int, beginning: Restart | None = None) -> Restart:
+        """A restart from its checkpoint, or at its beginning: None for that of its way to begin.
 
         :raises Damaged: it does not hold what was written.
         """
         path = self._path(number)
         if path is None or not path.exists():
-            return Restart(Progress(number, device=described(device_of(self.spec.training))))
+            return beginning or Restart(Progress(number, device=described(device_of(self.spec.training))))
         return Restart.read(path)
 
     def _refuse_other_device(self, progress: Progress, until: int | None) -> None:
@@ -295,39 +355,31 @@ class Trainer:
     def _path(self, number: int) -> Path | None:
         return None if self.checkpoints is None else self.checkpoints / f"restart-{number}.safetensors"
 
-    def _stop(self, numbers: Sequence[int], tell: bool) -> None:
-        """Those that are done need not be stopped.
-
-        :param tell: whether it is news: where nothing was trained for it, they were stopped before an interruption.
-        """
+    def _stop(self, numbers: Sequence[int]) -> None:
+        """Those that are done need not be stopped."""
         for number in numbers:
             progress = self.restarts[number].progress
             if not progress.done:
                 self.stopped[number] = progress.epoch
-                if tell:
-                    self.on_event(RestartStopped(number, progress.epoch))
+                self.on_event(RestartStopped(number, progress.epoch))
 
     def _train(self, numbers: Sequence[int], until: int | None) -> None:
-        """Train restarts until so many epochs of the last stage, None for to the end; jobs share what takes long.
+        """Train restarts until so many epochs of the last stage, None for to the end; jobs share gradient steps.
 
         :raises OtherDevice: a restart was begun on another kind of device; nothing is trained then.
         """
-        left = [number for number in numbers if not self.restarts[number].progress.done]
+        left = [n for n in numbers if not self.restarts[n].progress.reached(self._last(n), until)]
         for number in left:
             self._refuse_other_device(self.restarts[number].progress, until)
-        deadline = time.monotonic() + (math.inf if self.jobs == 1 else SHORT)
-        while left and (len(left) == 1 or time.monotonic() < deadline):
-            own, seconds = self.restarts[left[0]], math.inf if len(left) == 1 else deadline - time.monotonic()
-            self.ranks.share((own, until))
-            self._keep(train(self.data, own, until, seconds, self._path(left[0]), self.on_event))
-            if seconds == math.inf or time.monotonic() < deadline:  # or it has paused
-                del left[0]
-        if not left:
+        if len(left) > 1 and self.jobs > 1 and self._by_gradient:
+            calls = {n: partial(train, self.data, self.restarts[n], until, self._path(n)) for n in left}
+            with run_all(calls, Workers(self.jobs), "trained a restart", self.on_event) as trained:
+                for _, restart in trained:
+                    self._keep(restart)
             return
-        calls = {n: partial(train, self.data, self.restarts[n], until, math.inf, self._path(n)) for n in left}
-        with run_all(calls, Workers(self.jobs), "trained a restart", self.on_event) as trained:
-            for _, restart in trained:
-                self._keep(restart)
+        for number in left:
+            self.ranks.share((self.restarts[number], until))
+            self._keep(train(self.data, self.restarts[number], until, self._path(number), self.on_event))
 
     def _keep(self, restart: Restart) -> None:
         number, why = restart.progress.restart, restart.progress.diverged
@@ -342,18 +394,3 @@ def follow(ranks: Ranks) -> None:
         while (work := ranks.share()) is not None:
             restart, until = work
             train(data, restart, until)
-
-
-def best_until(progress: Progress, epochs: int, last: int) -> float:
-    """The best tuning log-likelihood per step before and in the first epochs of the last stage, whose number is
-    ``last``; -inf where the restart has diverged by then. What comes later does not count: an interrupted training may
-    have gone further than one that has just arrived there.
-    """
-    if progress.diverged is not None and (progress.stage < last or progress.epoch < epochs):
-        return -math.inf
-    return max(progress.tune[: epochs + 1])
-
-
-def ranked(values: Mapping[int, float]) -> list[int]:
-    """Restarts, the best first; what is not a number is worst, and the first of equals is the better."""
-    return sorted(values, key=lambda number: (-values[number] if values[number] > -math.inf else math.inf, number))

@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from ddco_pyro.spec import Spec
+from ddco_pyro.spec import Spec, Start
+from ddco_pyro.training.initialization import WAYS
 
 RISING = 0.01
 """Nats per step. A stage whose tuning value rose by more than this over its last epochs has not converged."""
@@ -17,13 +18,16 @@ RISING = 0.01
 WINDOW = 20
 """The number of last epochs where ``training.patience`` is null."""
 
+EVERYTHING = ("trunk.", "levels.", "meta_policy.")
+"""Prefixes of the names of all parameters."""
+
 
 @dataclass(frozen=True)
 class Stage:
     """One stage of training.
 
     :param discovering: d trains levels 1 to d under a uniform meta-policy; None trains the whole hierarchy.
-    :param clamped: the level whose choices are clamped to clusters or parts of the demonstrations; None for no level.
+    :param clamped: the level whose choices are clamped to initial segments; None for no level.
     :param trained: prefixes of the names of the parameters that are trained.
     :param selecting: train the meta-policy on the clamped choices, beside the levels under a uniform one.
     :param from_constants: train the networks to :class:`ddco_pyro.training.upper.Constants`.
@@ -39,26 +43,29 @@ class Stage:
     memoryless: bool = False
 
 
-_CLAMPING = {"vq": "vq", "vq_controls": "vq", "mixture": "vq", "equal_parts": "parts", "cuts": "cuts"}
-"""The name of stages that train on initial segments, for each kind of them."""
+def starts_of(spec: Spec) -> tuple[Start, ...]:
+    """The ways in which the restarts of a model begin. A policy without options has random weights alone."""
+    starts: tuple[Start, ...] = spec.training.starts
+    if spec.hierarchy is None:
+        starts = tuple(start for start in starts if start == "random") or ("random",)
+    return starts
 
 
 def plan(spec: Spec, depth: int, restart: int = 0) -> list[Stage]:
     """The stages of training of a restart for D levels: from the lowest level up, the meta-policy last."""
     training = spec.training
-    everything = ("trunk.", "levels.", "meta_policy.")
     if depth == 0:
-        return [Stage("policy", None, None, everything)]
+        return [Stage("policy", None, None, EVERYTHING)]
     stages: list[Stage] = []
-    kind = training.start(restart)
-    mixed = kind == "mixture"
+    way = WAYS[starts_of(spec)[restart]]
+    mixed = way.memoryless
     layerwise = training.layerwise and not mixed
     together = training.upper_levels == "segments" and depth > 1 and not mixed
     for level in range(1, 2 if together else depth + 1):
         networks = _memoryless(level) if mixed else (f"levels.{level - 1}.",)
         networks = networks if level > 1 else ("trunk.", *networks)
-        if kind != "random":
-            name = f"{_CLAMPING[kind]}-{level}"
+        if way.stage:
+            name = f"{way.stage}-{level}"
             if level == depth and not layerwise and _meta_policy_selects(spec):
                 trained = (*networks, "meta_policy.")
                 stages.append(Stage(name, None, level, trained, selecting=True, memoryless=mixed))
@@ -76,7 +83,7 @@ def plan(spec: Spec, depth: int, restart: int = 0) -> list[Stage]:
         policies = (name for level in range(1, depth + 1) for name in _memoryless(level))
         stages.append(Stage("mixture", None, None, ("trunk.", *policies, "meta_policy."), memoryless=True))
     if not layerwise or training.lower_levels == "fine_tuned":
-        stages.append(Stage("joint", None, None, everything))
+        stages.append(Stage("joint", None, None, EVERYTHING))
     return stages
 
 

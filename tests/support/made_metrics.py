@@ -11,7 +11,11 @@ TRAINING = {
     "spent": {"epochs": 5, "gradient_steps": 10},
     "stages": [{"stage": "joint", "epochs": 5, "cap": 5, "rising": 0.0, "over": 5, "converged": True}],
     "converged": True,
-    "restarts": {"best": 0, "spent": {"epochs": 5, "gradient_steps": 10}, "each": [{"epochs": 5, "stopped": None}]},
+    "restarts": {
+        "best": 0,
+        "spent": {"epochs": 5, "gradient_steps": 10},
+        "each": [{"epochs": 5, "stopped": None, "start": "vq", "objective": 1.0}],
+    },
     "device": "cpu",
     "by_em": False,
     "by_lbfgs": False,

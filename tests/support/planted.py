@@ -18,7 +18,7 @@ from ddco_pyro.training.restarts import Trainer
 
 LINEAR = {"network": "linear"}
 CONTROL = {"std": 0.05, "scale": "none"}
-TRAINING = {"epochs": 900, "restarts": 3, "patience": 25, "initialize": "vq_controls"}
+TRAINING = {"epochs": 900, "starts": ["vq_controls"] * 3, "patience": 25}
 
 
 def small_spec(counts=(2,), policy=LINEAR, **sections):

@@ -43,7 +43,7 @@ DATA = {
         "levels": [{"count": 2, "policy": {"network": "linear"}, "termination": {"network": "linear"}}],
         "meta_policy": {"network": "linear"},
     },
-    "training": {"initialize": "vq", "epochs": 8, "batch_size": 6, "optimizer": {"lr": 0.05}},
+    "training": {"starts": ["vq"], "epochs": 8, "batch_size": 6, "optimizer": {"lr": 0.05}},
     "selection": {"folds": 4, "grid": {"hierarchy.levels.0.count": [1, 2]}},
 }
 

@@ -149,11 +149,11 @@ class Network(nn.Module):
         self.layers.features = outputs
         return self
 
-    def begin_at_zero(self, outputs: int) -> None:
-        """Have the last ``outputs`` numbers of the head start at 0."""
+    def begin_at(self, outputs: int, value: float = 0.0) -> None:
+        """Have the last ``outputs`` numbers of the head start at a value, whatever is observed."""
         with torch.no_grad():
-            for parameter in self.layers[-1].parameters():
-                parameter[..., -outputs:] = 0
+            for name, parameter in self.layers[-1].named_parameters():
+                parameter[..., -outputs:] = value if name == "bias" else 0.0
 
     def numpy_form(self) -> NumpyForm | None:
         """Facts and arrays for the numpy runner of an exported controller; None where it cannot evaluate this."""

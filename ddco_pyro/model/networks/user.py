@@ -65,7 +65,7 @@ class UserNetwork(Network):
         """What the module gives, and its state."""
         return self.module(inputs, state) if self.remembers else (self.module(inputs), state)
 
-    def begin_at_zero(self, outputs: int) -> None:
+    def begin_at(self, outputs: int, value: float = 0.0) -> None:
         """Nothing: a user's outputs start where the module's own weights put them."""
 
 
