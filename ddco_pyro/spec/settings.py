@@ -17,7 +17,6 @@ from ddco_pyro.spec.base import (
     Problems,
     Seed,
     Share,
-    TaskName,
     Text,
     bare,
     invalid,
@@ -34,7 +33,7 @@ class DemonstrationsSpec(Model):
 
     path: Text | None = None
     """HDF5 file in robomimic's layout; null: demonstrations are collected in the task."""
-    task: TaskName | None = None
+    task: Text | None = None
     """Task in which demonstrations are collected; null: the spec's ``task``."""
     count: int = Field(default=100, ge=2)
     """Number of demonstrations to collect."""
