@@ -223,11 +223,6 @@ class PartSpec(Model):
     """As ``control.std``; null: the same."""
     scale: Scale | None = None
     """As ``control.scale``; null: the same. A list has a number for each dimension of the part."""
-    bounds: Annotated[Items[float], Field(min_length=2, max_length=2)] | None = None
-    """For ``clipped`` and ``hurdle``: lower and upper bound, in the control's units; null: the extremes that the
-    demonstrations often reach."""
-    value: float | None = None
-    """For ``hurdle``: the value that each dimension often has exactly; null: the commonest value inside the range."""
     freedom: Freedom | None = None
     """As ``control.freedom``; null: the same."""
 
@@ -237,16 +232,8 @@ class PartSpec(Model):
         for setting in ("scale", "std"):
             if self.kind in DISCRETE and getattr(self, setting) is not None:
                 yield setting, f"does not apply to kind: {self.kind}; leave it out"
-        if self.bounds is not None and self.kind not in ("clipped", "hurdle"):
-            yield "bounds", "are for kind: clipped or hurdle"
-        if self.bounds is not None and self.bounds[0] >= self.bounds[1]:
-            yield "bounds", "must be a lower and a higher number"
         if self.freedom is not None and self.kind != "student":
             yield "freedom", "is for kind: student"
-        if self.value is not None and self.kind != "hurdle":
-            yield "value", "is for kind: hurdle"
-        elif self.value is not None and self.bounds and not self.bounds[0] < self.value < self.bounds[1]:
-            yield "value", "must lie between the bounds"
 
 
 class ControlSpec(Model):
