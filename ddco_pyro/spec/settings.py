@@ -106,8 +106,6 @@ class ObservationSpec(Model):
 
     key: Text
     """Name of the observation in the demonstrations; ``step`` is built in."""
-    relative: bool = False
-    """For vectors: read x_t − x_0, relative to the first step of the demonstration or episode, in place of x_t."""
     differences: bool = False
     """Append x_t − x_{t−1}."""
     angles: Items[Annotated[int, Field(ge=0)]] = ()
@@ -127,8 +125,6 @@ class ObservationSpec(Model):
     """For pictures: top, left, height and width of the crop, in the file's pixels; null: no crop."""
     resize: Size | None = None
     """For pictures: height and width after the crop is scaled by area averaging; null: not scaled."""
-    grey: bool = False
-    """For pictures: whether red, green and blue become one luminance channel."""
     frames: Count = 1
     """For pictures: number of successive pictures stacked along the channels, oldest first. Before the first step the
     first picture is repeated. A single picture does not show velocities."""
@@ -140,8 +136,6 @@ class ObservationSpec(Model):
             yield "crop", "is top, left, height, width; height and width must be at least 1"
         if self.key == STEP and self.differences:
             yield "differences", f"{STEP} grows by the same at each step; leave it out"
-        if self.key == STEP and self.relative:
-            yield "relative", f"{STEP} is 0 at the first step; leave it out"
         turned = [*self.angles, *(first + place for first in self.quaternions for place in range(4))]
         for key in ("angles", "quaternions"):
             if getattr(self, key) and self.key == STEP:
