@@ -19,7 +19,7 @@ import selecting
 import toy_task
 import yaml
 from killing import Kept, until_done, whole
-from random_demonstrations import demonstrations, numbered
+from random_demonstrations import numbered
 
 from ddco_pyro.data.importing import import_demonstrations
 from ddco_pyro.data.tensors import read_tensors
@@ -93,11 +93,6 @@ def same_segments(one: Path, other: Path) -> None:
         assert one.with_name(name).read_bytes() == other.with_name(name).read_bytes()
 
 
-def parts(result: str) -> Kept:
-    """The parts of a file that is made little by little."""
-    return lambda folder: None if (folder / result).exists() else written(folder.glob(f".{result}.parts/*.hdf5"))
-
-
 def written(paths: Iterable[Path]) -> set[object]:
     """Files, each with the moment at which it was written."""
     return {(path.name, path.stat().st_ino, path.stat().st_mtime_ns) for path in paths}
@@ -130,8 +125,7 @@ class Case:
 
 
 CASES = {
-    "collect": Case("demos.hdf5", same_hdf5, parts("demos.hdf5")),
-    "import": Case("imported.hdf5", same_hdf5, parts("imported.hdf5")),
+    "collect": Case("demos.hdf5", same_hdf5),
     "fit": Case("fitted", same_run, epochs),
     "fit to pictures": Case("seen", same_run, epochs),
     "select": Case("selected", same_selection, folds),
@@ -142,7 +136,6 @@ CASES = {
 }
 COMMANDS = {
     "collect": "collect {inputs}/toy.yaml --out demos.hdf5 --set demonstrations.count=40 --allow-code",
-    "import": "import {inputs}/source.hdf5 --out imported.hdf5",
     "fit": "fit {inputs}/toy.yaml --out fitted --resume --allow-code --set training.epochs=100 "
     "--set compare_with=[flat]",
     "fit to pictures": "fit {inputs}/pictures.yaml --out seen --resume",
@@ -158,7 +151,6 @@ COMMANDS = {
 def inputs(tmp_path_factory: pytest.TempPathFactory, toy_run) -> Path:
     folder = tmp_path_factory.mktemp("inputs")
     (folder / "toy.yaml").write_text(toy_task.SPEC.replace("task: toy", "task: toy_task:task"))
-    demonstrations(300).write(folder / "source.hdf5")
     demonstrations_of(load_spec(folder / "toy.yaml", allow_code=True)).write(folder / "toy_source.hdf5")
     import_demonstrations(folder / "toy_source.hdf5", folder / "toy.hdf5")
     write_pictures(folder)
@@ -198,7 +190,7 @@ def check(name: str, inputs: Path, tmp_path: Path, kills: int, seed: int, by: si
     seconds = whole(command, folders[0], tmp_path / "cache-whole")
     killed = until_done(command, folders[1], tmp_path / "cache-killed", kills, seconds, seed, case.kept, by)
     case.same(folders[0] / case.result, folders[1] / case.result)
-    assert not [path for path in folders[1].rglob("*") if path.name.endswith((".tmp", ".parts"))]
+    assert not [path for path in folders[1].rglob("*") if path.name.endswith((".tmp", ".lock"))]
     return killed
 
 
@@ -213,7 +205,7 @@ def test_terminated_and_called_again(inputs: Path, tmp_path: Path, name: str) ->
 @pytest.mark.parametrize("name", CASES)
 def test_killed_at_very_many_moments(inputs: Path, tmp_path: Path, name: str) -> None:
     killed: list[int] = []
-    while sum(killed) < 10:  # ninety in all; a moment that comes after the end kills nothing
+    while sum(killed) < 10:  # eighty in all; a moment that comes after the end kills nothing
         folder = tmp_path / str(len(killed))
         folder.mkdir()
         killed.append(check(name, inputs, folder, kills=10, seed=len(killed)))

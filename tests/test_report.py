@@ -528,7 +528,7 @@ def test_like_warnings_are_one_with_a_list():
         "2 options of level “skill” say which demonstration, not which skill; they take 90 % of the 3 demonstrations "
         "that have it (option 22) and 90 % of the 3 demonstrations that have it (option 23)."
     )
-    assert "relative to the first step (relative: true" in signs[1][1]
+    assert "positions relative to the first step" in signs[1][1]
     assert alike == (
         "Option 20 and option 21 of level “skill” act alike; while either is active they differ, in nats per step, by "
         "0.010."

@@ -21,14 +21,13 @@ class ObservationError(BadInput):
 
 
 class Window:
-    """A window over the first and the last observations, for what the encoder makes of several.
+    """A window over the last observations, for what the encoder makes of several.
 
     ``time`` counts the observations.
     """
 
     def __init__(self, encoder: ObservationEncoder) -> None:
         self.encoder, self.time = encoder, 0
-        self._first: list[dict[str, np.ndarray]] = []
         self._last: list[list[dict[str, np.ndarray]]] = []
 
     def inputs(self, observations: Sequence[Mapping[str, np.ndarray]]) -> Inputs:
@@ -43,13 +42,11 @@ class Window:
         ]
         if not now:
             raise ObservationError("there are no observations; give one for each episode")
-        self._first = self._first or now
         last = [*self._last, now][-self.encoder.steps_seen :]
         episodes = zip(*last, strict=True)
         recent = self.encoder.inputs(
             ({key: np.stack([seen[key] for seen in episode]) for key in self.encoder.shapes} for episode in episodes),
             np.full(len(last), self.time),
-            self._first,
         )
         latest = recent.part(slice(None), slice(-1, None)).loaded()
         inputs = Inputs(latest.vectors, latest.images, torch.tensor([self.time]))

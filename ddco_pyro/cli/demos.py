@@ -7,7 +7,7 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -20,9 +20,7 @@ from ddco_pyro.spec.yaml import read_yaml
 
 if TYPE_CHECKING:
     from ddco_pyro.data.inspection import Inspection
-    from ddco_pyro.data.sources import Source
     from ddco_pyro.data.starting import Decided
-    from ddco_pyro.segmenting.formats.reading import Labelled
 
 SourcePath = Annotated[
     Path, typer.Argument(metavar="FILE", help=f"Demonstrations: {', '.join(about.text for about in FORMATS.values())}.")
@@ -33,6 +31,8 @@ FormatOption = Annotated[
         "--format", metavar="NAME", help=f"One of {', '.join(FORMATS)}; recognised unless given.", show_default=False
     ),
 ]
+
+TimeUnit = Literal["seconds", "milliseconds", "steps"]
 
 
 def collect(
@@ -200,10 +200,22 @@ def import_(
     labels: Annotated[
         Path | None,
         typer.Option(
-            metavar="PATH",
-            help="Segments that were made in ELAN, BORIS or Label Studio, as labels: a file, or a folder of files.",
+            metavar="TABLE",
+            help="A table (CSV, TSV, Parquet) of segments that become labels, such as exported by ELAN, BORIS or "
+            "Label Studio.",
             show_default=False,
         ),
+    ] = None,
+    columns: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ROLE=NAME,...",
+            help="The columns of TABLE: demonstration=A,label=B,start=C,stop=D.",
+            show_default=False,
+        ),
+    ] = None,
+    unit: Annotated[
+        TimeUnit | None, typer.Option(help="The unit of TABLE's times, unless its columns say it.", show_default=False)
     ] = None,
     fps: Annotated[
         float | None,
@@ -214,39 +226,39 @@ def import_(
     ] = False,
     allow_external: AllowExternal = False,
 ) -> None:
-    """Write demonstrations of another format into this project's layout; an interrupted import is continued.
+    """Write demonstrations of another format into this project's layout.
 
     With --labels, FILE may have this layout already.
     """
     from ddco_pyro.cli import console
+    from ddco_pyro.data.annotations import LabelTable
     from ddco_pyro.data.importing import Choice, import_demonstrations
     from ddco_pyro.events import DemonstrationsDone
 
-    if fps and labels is None:
-        raise BadInput("--fps says how long the steps of --labels are; give both, or --hz for another rate")
+    if labels is None and (fps or columns or unit):
+        raise BadInput("--fps, --columns and --unit are about the table of --labels; give it, or --hz for another rate")
     check_outputs([Output("--out", out, "file")], [source, *([labels] if labels else [])])
     size = (image_size, image_size) if image_size else None
-    choice = Choice(tuple(observations), mask, videos, size, hz, skip_broken, allow_external, tuple(actions))
-    given: list[Labelled] = []
-
-    def seen_as(source: Source) -> Source:
-        if labels is None:
-            return source
-        from ddco_pyro.segmenting.formats.reading import Labelled
-
-        given.append(Labelled(source, labels, fps))
-        return given[0]
-
+    table = LabelTable(labels, _columns(columns), unit, fps) if labels else None
+    choice = Choice(tuple(observations), mask, videos, size, hz, skip_broken, allow_external, tuple(actions), table)
     with console.Progress("importing") as progress:
-        imported = import_demonstrations(
-            source, out, form, choice, lambda *done: progress(DemonstrationsDone(*done)), seen_as
-        )
+        imported = import_demonstrations(source, out, form, choice, lambda *done: progress(DemonstrationsDone(*done)))
     for name, reason in imported.left_out.items():
         print(f"left out {name}: {reason}", file=sys.stderr)
-    for line in (*imported.unread, *(note for own in given for note in own.notes)):
+    for line in imported.notes:
         print(f"note: {line}", file=sys.stderr)
-    counts = "".join(f", labels/{name} in {number}" for own in given for name, number in own.counts.items())
+    counts = "".join(f", labels/{name} in {number}" for name, number in imported.labelled.items())
     print(f"{out}: {len(imported.names)} demonstrations{counts}")
+
+
+def _columns(text: str | None) -> dict[str, str]:
+    """The columns that ``demonstration=A,label=B,start=C,stop=D``, or a part of it, names."""
+    from ddco_pyro.data.annotations import ROLES
+
+    columns = {role: name for role, _, name in (part.partition("=") for part in text.split(","))} if text else {}
+    if columns.keys() - set(ROLES) or "" in columns.values():
+        raise BadInput(f"--columns {text}: write {','.join(f'{role}=COLUMN' for role in ROLES)}, or a part of it")
+    return columns
 
 
 def encode(

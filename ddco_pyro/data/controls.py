@@ -439,11 +439,11 @@ def _parts(
         if each == "categorical":
             yield from (replace(part, why=decided[part.dims[0]][1]) for part in _actions(alike, place, name))
             continue
-        exact = {dim.number: _exact(dim, place, spec) for dim in alike if each == "hurdle"}
-        for own in _resting_together(alike, exact) if exact else [alike]:
+        exact = {dim.number: _exact(dim, place) for dim in alike if each == "hurdle"}
+        for own in _resting_together(alike) if exact else [alike]:
             low, high = (), ()
             if each in (*BOUNDED, *DISCRETE):
-                ends = [_ends(dim, each, place, spec, exact.get(dim.number)) for dim in own]
+                ends = [_ends(dim, each, place) for dim in own]
                 low, high = zip(*ends, strict=True)
             why = "; ".join(dict.fromkeys(decided[dim.number][1] for dim in own))
             numbers = tuple(dim.number for dim in own)
@@ -481,57 +481,35 @@ def _declared(dimension: ControlDimension, kind: str) -> tuple[str, str]:
     return kind, f"as declared; {dimension.atom}, and options gain by collecting these steps, without any skill"
 
 
-def _exact(dim: ControlDimension, place: str, spec: PartSpec | None) -> float:
-    """The value of a ``hurdle`` dimension as the demonstrations have it; a spec may give it in float32."""
-    if spec is None or spec.value is None:
-        if dim.inside is None:
-            raise SpecError(
-                f"{place}.kind: control dimension {dim.number} is at no value inside its range in "
-                f"{100 * ATOM:g} % of the steps; it is no hurdle"
-            )
-        return dim.inside
-    for known in (dim.inside, dim.minimum, dim.maximum):
-        if known is not None and np.float32(known) == np.float32(spec.value):
-            return known
-    raise SpecError(
-        f"{place}.value: control dimension {dim.number} is hardly ever exactly {number(spec.value)} in the "
-        "demonstrations" + (f"; it is {dim.atom}" if dim.atom else "")
-    )
+def _exact(dim: ControlDimension, place: str) -> float:
+    """The value of a ``hurdle`` dimension."""
+    if dim.inside is None:
+        raise SpecError(
+            f"{place}.kind: control dimension {dim.number} is at no value inside its range in "
+            f"{100 * ATOM:g} % of the steps; it is no hurdle"
+        )
+    return dim.inside
 
 
-def _resting_together(
-    dimensions: Sequence[ControlDimension], exact: Mapping[int, float]
-) -> Iterator[list[ControlDimension]]:
+def _resting_together(dimensions: Sequence[ControlDimension]) -> list[list[ControlDimension]]:
     """Groups of dimensions that equal their commonest inside values in the same steps."""
     groups: list[list[ControlDimension]] = []
     for dim in dimensions:
-        rests = exact[dim.number] == dim.inside
-        own = next((own for own in groups if rests and dim.number in own[0].together), None)
-        if own is None or exact[own[0].number] != own[0].inside:
+        own = next((own for own in groups if dim.number in own[0].together), None)
+        if own is None:
             groups.append([dim])
         else:
             own.append(dim)
-    yield from groups
+    return groups
 
 
-def _ends(
-    dim: ControlDimension, kind: str, place: str, spec: PartSpec | None, exact: float | None
-) -> tuple[float, float]:
+def _ends(dim: ControlDimension, kind: str, place: str) -> tuple[float, float]:
     """The bounds of a dimension, or its two values."""
     if kind == "binary":
         if len(dim.values) != 2:
             raise SpecError(f"{place}.kind: control dimension {dim.number} takes more than two values; it is no switch")
         return dim.minimum, dim.maximum
-    if spec is not None and spec.bounds is not None:
-        low, high = spec.bounds
-        ends = np.array([dim.minimum, dim.maximum])
-        if not (((ends >= low) & (ends <= high)) | same(ends, low) | same(ends, high)).all():
-            raise SpecError(
-                f"{place}.bounds: control dimension {dim.number} goes from {number(dim.minimum)} to "
-                f"{number(dim.maximum)} in the demonstrations, beyond these bounds"
-            )
-        return low, high
-    often = {name: value for name, value, _ in dim.extremes if value != exact}
+    often = {name: value for name, value, _ in dim.extremes}
     if kind == "clipped" and not often:
         often = {"minimum": dim.minimum, "maximum": dim.maximum}
     return often.get("minimum", -math.inf), often.get("maximum", math.inf)

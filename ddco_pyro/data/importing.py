@@ -1,26 +1,23 @@
-"""Import of other libraries' demonstrations into one HDF5 file of this project's layout, resumable."""
+"""Import of other libraries' demonstrations into one HDF5 file of this project's layout."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 
+from ddco_pyro.data.annotations import Labelled, LabelTable
 from ddco_pyro.data.checks import NUMBERS, check, check_alike, check_values, reading
-from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError, opened
+from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError
 from ddco_pyro.data.pictures import resized
 from ddco_pyro.data.sources import Column, Recording, Source, open_source
 from ddco_pyro.data.sources.metadata import FREQUENCY
-from ddco_pyro.data.sources.robomimic import Parts, discard, parts_of
+from ddco_pyro.data.sources.robomimic import robomimic_file, write_recording
 from ddco_pyro.errors import BadInput, nearest
-
-IDENTITY = "imported"
-"""Attribute of a file: digest of the source and the choice."""
 
 OnRecording = Callable[[int, int], None]
 
@@ -38,6 +35,7 @@ class Choice:
     :param skip_broken: whether unusable demonstrations are left out rather than refused.
     :param allow_external: whether parts of an HDF5 file may be in other files.
     :param actions: names in the source of the arrays that are the control together; if empty, the usual ones.
+    :param labels: a table of segments that become labels.
     """
 
     observations: tuple[str, ...] = ()
@@ -48,6 +46,7 @@ class Choice:
     skip_broken: bool = False
     allow_external: bool = False
     actions: tuple[str, ...] = ()
+    labels: LabelTable | None = None
 
 
 @dataclass(frozen=True)
@@ -56,13 +55,16 @@ class Imported:
 
     :param names: the demonstrations in the file.
     :param left_out: the reason for each demonstration that was left out.
-    :param unread: a line for each observation that networks cannot read, or that was left out as a video.
+    :param notes: a line for each observation that networks cannot read or that was left out as a video, and for what
+        was left out of the table of labels.
+    :param labelled: for labels of the table by name, the number of demonstrations in which a step is named.
     """
 
     path: Path
     names: tuple[str, ...]
     left_out: Mapping[str, str]
-    unread: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    labelled: Mapping[str, int] = field(default_factory=dict)
 
 
 def import_demonstrations(
@@ -71,38 +73,36 @@ def import_demonstrations(
     form: str | None = None,
     choice: Choice = Choice(),
     on_recording: OnRecording = lambda done, total: None,
-    seen_as: Callable[[Source], Source] = lambda source: source,
 ) -> Imported:
-    """Write the demonstrations of a file or folder into ``out``, continuing an interrupted import.
+    """Write the demonstrations of a file or folder into ``out``, whole or not at all.
 
     Memory holds one block of an array at a time.
 
-    :param seen_as: what is imported of the source, such as the source with further labels.
     :raises DemonstrationsError: the source cannot be read, or a demonstration cannot be used.
-    :raises BadInput: ``out`` exists and is not this import, or another process is writing it.
+    :raises BadInput: ``out`` exists, or the table of labels does not fit.
     """
+    if out.exists():
+        raise BadInput(f"{out}: is there already; choose another --out, or remove it")
     with open_source(source, form, choice.allow_external, choice.actions) as whole:
-        opened_source = seen_as(whole)
-        identity = _identity(opened_source, choice)
-        if out.exists():
-            discard(out)
-            return _already(out, identity)
-        with parts_of(out, identity) as parts:
-            if parts is None:
-                return _already(out, identity)
-            left_out, unread = _keep(opened_source, choice, parts, on_recording)
-            if not parts.done:
+        labelled = Labelled(whole, choice.labels) if choice.labels else None
+        chosen = labelled or whole
+        masks: dict[str, tuple[str, ...]] = {}
+        with robomimic_file(out, _attributes(chosen, source, choice), masks) as data:
+            left_out, unread = _write(chosen, choice, data, on_recording)
+            if not len(data):
                 why = next(iter(left_out.values()))
                 raise DemonstrationsError(f"{source}: none of its demonstrations can be used: {why}")
-            done = tuple(parts.done)
-            parts.finish(_attributes(opened_source, source, identity, choice), _masks(opened_source, done))
-    return Imported(out, done, left_out, unread)
+            names = tuple(name for name in chosen.names if name in data)
+            masks |= _masks(chosen, names)
+    if labelled is None:
+        return Imported(out, names, left_out, unread)
+    return Imported(out, names, left_out, (*unread, *labelled.notes), labelled.counts)
 
 
-def _keep(
-    source: Source, choice: Choice, parts: Parts, on_recording: OnRecording
+def _write(
+    source: Source, choice: Choice, data: h5py.Group, on_recording: OnRecording
 ) -> tuple[dict[str, str], tuple[str, ...]]:
-    """Add all missing demonstrations; the reason for each that is left out, and the observations that are not read."""
+    """Write all demonstrations; the reason for each that is left out, and the observations that are not read."""
     names = _names(source, choice)
     left_out: dict[str, str] = {}
     unread: tuple[str, ...] = ()
@@ -112,9 +112,8 @@ def _keep(
     for number, name in enumerate(names):
         try:
             recording = _usable(source, name, choice, first)
-            if name not in parts.done:
-                check_values(recording, pictures=choice.skip_broken)
-                parts.add(recording)
+            check_values(recording, pictures=choice.skip_broken)
+            write_recording(data, recording)
             unread = unread if first else tuple(_unread(source.recording(name), recording))
             first = first or recording
         except DemonstrationsError as error:
@@ -122,10 +121,6 @@ def _keep(
                 raise _refused(source, names, choice, error) from None
             left_out[name] = str(error)
         on_recording(number + 1, len(names))
-    try:
-        parts.close()
-    except DemonstrationsError as error:  # a picture of one that is not written yet
-        raise _refused(source, names, choice, error) from None
     return left_out, unread
 
 
@@ -167,25 +162,6 @@ def _refused(source: Source, names: Sequence[str], choice: Choice, error: Demons
     return error
 
 
-def _identity(source: Source, choice: Choice) -> str:
-    """What determines the contents of an import."""
-    files = [(str(path.resolve()), path.stat().st_size, path.stat().st_mtime_ns) for path in source.files]
-    return json.dumps(
-        {"format": source.format, "files": files, "choice": asdict(choice), "frequency": source.frequency}
-    )
-
-
-def _digest(identity: str) -> str:
-    return hashlib.sha256(identity.encode()).hexdigest()
-
-
-def _already(out: Path, identity: str) -> Imported:
-    with opened(out) as file:
-        if file.attrs.get(IDENTITY) != _digest(identity):
-            raise BadInput(f"{out}: is there already and is not this import; choose another --out")
-        return Imported(out, tuple(file["data"]), {})
-
-
 def _names(source: Source, choice: Choice) -> tuple[str, ...]:
     if choice.mask is None:
         return source.names
@@ -204,11 +180,10 @@ def _masks(source: Source, names: Sequence[str]) -> dict[str, tuple[str, ...]]:
     return {mask: members for mask, members in imported.items() if members}
 
 
-def _attributes(source: Source, path: str | Path, identity: str, choice: Choice) -> dict[str, Attribute]:
+def _attributes(source: Source, path: str | Path, choice: Choice) -> dict[str, Attribute]:
     rate = choice.hz or source.frequency
     frequency = {FREQUENCY: rate} if rate else {}
-    facts = {"source": Path(path).name, "source_format": source.format, IDENTITY: _digest(identity)}
-    return {**source.attributes, **frequency, **facts}
+    return {**source.attributes, **frequency, "source": Path(path).name, "source_format": source.format}
 
 
 def _chosen(recording: Recording, choice: Choice, frequency: float | None) -> Recording:

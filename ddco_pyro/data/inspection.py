@@ -38,7 +38,6 @@ from ddco_pyro.data.controls import (
     listed,
     most_few,
     notes,
-    number,
     same,
 )
 from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError, outside_files
@@ -186,7 +185,7 @@ class Inspection:
     :param unreadable: names of demonstrations that could not be read.
     :param external: other files that the HDF5 file names as parts of itself; they are not read.
     :param turns: the angles in radians and the first numbers of quaternions that jump, by place of the array.
-    :param odd: names of demonstrations that are dead or padded and change the model of all, and why.
+    :param odd: names of demonstrations that are dead or change the kind of a control dimension, and why.
     :param attributes: of each demonstration by its name.
     """
 
@@ -376,7 +375,7 @@ class _Inspector:
             except DemonstrationsError as error:
                 self._problem("unreadable", str(error), re.sub(r"\d+", "", str(error).removeprefix(name)))
                 unreadable.append(name)
-                self.coincidences.forget(name)
+                self.coincidences.digests.pop(name, None)
                 self.controls.pop(name, None)
         for name, there in places.items():
             for place in (place for place in fields if place not in there):
@@ -399,7 +398,7 @@ class _Inspector:
             frequency=source.frequency,
             problems=[*kinds, *_problems_of_division(source, names, masks), *_problems(fields, self.lengths)],
             control=dimensions,
-            coincidences=(*self.coincidences.notes(masks, dimensions), *self._jumps(), *self._other_rates()),
+            coincidences=(*self.coincidences.notes(masks, varying), *self._jumps(), *self._other_rates()),
             turns={place: self._turning(place) for place in self.turns if any(self._turning(place))},
             leaks=tuple(p for p, array in fields.items() if self.coincidences.leaks(p, varying, array.constant)),
             excluded=exclude,
@@ -412,8 +411,7 @@ class _Inspector:
     def _odd(self, dimensions: Sequence[ControlDimension]) -> dict[str, str]:
         """Names of demonstrations to exclude, and why.
 
-        Dead ones are, and those whose padding, or other values of a switch, make what no other demonstration has. A
-        demonstration that rests or saturates for long is not.
+        Dead ones are, and the few without which a control dimension is a switch.
         """
         if any(dimension.integer for dimension in dimensions):
             return {}
@@ -424,20 +422,11 @@ class _Inspector:
         reasons = dict.fromkeys(dead, "all commands are 0") if 2 * len(dead) < len(self.lengths) else {}
         if len(others) <= most_few(len(self.lengths)):
             reasons |= dict.fromkeys(others, "all commands are the same")
-        paddings = self.coincidences.paddings()
         for dimension in dimensions:
-            made = {name: getattr(dimension, end) for end, names in dimension.made_by.items() for name in names}
-            if dimension.values:  # one in all others
-                rarer = min((dimension.at_minimum, dimension.minimum), (dimension.at_maximum, dimension.maximum))[1]
-                made |= dict.fromkeys(dimension.strays, rarer)
-            for name in (*made, *dimension.strays):
-                rows = paddings.get(name, {}).items()
-                value = made.get(name, math.nan)
-                why = next((why for why, row in rows if name not in made or same(row[dimension.number], value)), "")
-                if not why and name in dimension.strays and not dimension.values:
-                    why = f"control dimension {dimension.number} has further values there, and is a switch elsewhere"
-                if why:
-                    reasons.setdefault(name, why)
+            for name in () if dimension.values else dimension.strays:
+                reasons.setdefault(
+                    name, f"control dimension {dimension.number} has further values there, and is a switch elsewhere"
+                )
         return {name: reasons[name] for name in self.lengths if name in reasons}
 
     def _turning(self, place: str) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -487,7 +476,7 @@ class _Inspector:
         recording = self.source.recording(name)
         steps = self.lengths[name] = recording.actions.shape[0] if recording.actions.shape else 0
         self.attributes[name] = recording.attributes
-        self.coincidences.begin(name, steps)
+        self.coincidences.digests[name] = hashlib.sha256()
         if frequency := rate(recording.attributes):
             self.periods.setdefault("its attributes", {})[name] = 1 / frequency
         for place, column in recording.columns():
@@ -510,16 +499,16 @@ class _Inspector:
         place, step = array.place, 0
         whole = column.array() if place == "actions" or math.prod(array.shape) <= WIDEST else None
         first = np.zeros((0, 0))
-        label = place.startswith("labels/")
+        label, digest = place.startswith("labels/"), self.coincidences.digests[name]
         if not label:
-            self.coincidences.begin_column(place)
+            digest.update(place.encode())
         for block in column.blocks() if whole is None else blocks(whole):
             if not len(block):
                 continue
             values = block.reshape(len(block), -1)
             first = first if step else values[:1].copy()
             if not label:
-                self.coincidences.add(values, step)
+                digest.update(np.ascontiguousarray(values).tobytes())
             array.add(values, name, step, first)
             step += len(values)
         if label or whole is None or not step:
@@ -527,8 +516,8 @@ class _Inspector:
         values = whole.reshape(len(whole), -1)
         if place == "actions":
             self.controls[name] = whole
-        if not array.image:
-            self.coincidences.add_vectors(place, values)
+        elif not array.image and name in self.controls:
+            self.coincidences.compare(place, values, self.controls[name].reshape(len(self.controls[name]), -1))
         if array.dtype.kind == "f" and values.shape[1] <= MOST_DIMENSIONS:
             self.turns.setdefault(place, _Turns.of(values.shape[1])).add(values, name)
         if step > 1 and values.shape[1] == 1 and TIME.search(place):
@@ -574,9 +563,6 @@ LOOKED_AT = 1000
 WIDEST = 10_000
 """Largest array, in numbers per step, of which a demonstration is read at once, and compared with controls."""
 
-FEW = 3
-"""Number of values of a switch with padding."""
-
 TURNS = {"2π": 2 * math.pi, "360": 360.0}
 """A turn in radians and in degrees, and what it is called."""
 
@@ -592,95 +578,21 @@ TIME = re.compile(r"^obs/(.*[/_.])?(time|times|time_?stamps?|t)$")
 SAME_RATE = 1.2
 """Two steps take equally long if their times differ by less than this factor."""
 
-STILL = 0.01
-"""Numbers that change by at most this part of their range are still."""
-
-LONG, LONG_SHARE = 10, 0.1
-"""A stretch is long from so many steps on, and from this share of the demonstration."""
-
 SHIFTS = {0: "at the same step", 1: "of the next step", -1: "of the step before"}
 """Steps by which a control follows the observation that equals it."""
 
 
-@dataclass
-class _Demonstration:
-    """What is known of one demonstration.
-
-    :param tails: for each array, the controls first, the number of equal last steps.
-    :param controls: [T, A].
-    :param rests: for each vector, the number of first steps and of last steps in which it hardly changes.
-    """
-
-    name: str
-    steps: int
-    digest: Any = field(default_factory=hashlib.sha256)
-    tails: list[int] = field(default_factory=list)
-    controls: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
-    rests: list[tuple[int, int]] = field(default_factory=list)
-
-    @property
-    def tail(self) -> int:
-        """Number of last steps in which no array changes."""
-        return min(self.tails, default=0)
-
-    def rest(self, end: int, span: np.ndarray) -> int:
-        """The number of first controls, or at ``end`` 1 of last ones, that change by a small part of ``span`` [A]."""
-        return _rest(self.controls[::-1] if end else self.controls, span)
-
-
-def _rest(rows: np.ndarray, span: np.ndarray) -> int:
-    """The number of first rows [T, D], at most :data:`LOOKED_AT`, that equal row 0 up to a part of ``span`` [D]."""
-    rows = rows[:LOOKED_AT]
-    with np.errstate(invalid="ignore"):
-        moved = (np.abs(rows - rows[0].astype(np.float64)) > STILL * span).any(1)
-    return int(moved.argmax()) if moved.any() else len(rows)
-
-
 class _Coincidences:
-    """Suspicious equalities: padded ends, copied demonstrations, and controls among the observations."""
+    """Copied demonstrations, and controls among the observations."""
 
     def __init__(self) -> None:
-        self._demos: list[_Demonstration] = []
+        self.digests: dict[str, Any] = {}  # by demonstration, of all its arrays but labels
         self._equal: dict[str, np.ndarray] = {}  # by place, for each shift, [D, A]: whether they are always equal
         self._compared: dict[str, np.ndarray] = {}  # number of compared steps, for each shift
-        self._last = np.empty(0)
 
-    def begin(self, name: str, steps: int) -> None:
-        """Begin a demonstration, whose controls come first."""
-        self._demos.append(_Demonstration(name, steps))
-
-    def forget(self, name: str) -> None:
-        """Drop a demonstration that could not be read to its end."""
-        self._demos = [demo for demo in self._demos if demo.name != name]
-
-    def begin_column(self, place: str) -> None:
-        """Begin an array of the demonstration."""
-        self._demos[-1].tails.append(0)
-        self._demos[-1].digest.update(place.encode())
-
-    def add(self, rows: np.ndarray, first: int) -> None:
-        """Add rows [T, D] of the array from step ``first`` on."""
-        demo = self._demos[-1]
-        (others,) = np.nonzero((rows != rows[-1]).any(1))
-        tail = len(rows) - (int(others[-1]) + 1 if len(others) else 0)
-        continues = first and tail == len(rows) and np.array_equal(rows[0], self._last)
-        demo.tails[-1], self._last = tail + (demo.tails[-1] if continues else 0), rows[-1].copy()
-        demo.digest.update(np.ascontiguousarray(rows).tobytes())
-
-    def add_vectors(self, place: str, rows: np.ndarray) -> None:
-        """Add a whole array [T, D] of vectors."""
-        demo = self._demos[-1]
-        if place == "actions":
-            demo.controls = rows
-        else:
-            with np.errstate(invalid="ignore"):
-                span = rows.max(0).astype(np.float64) - rows.min(0)
-            demo.rests.append((_rest(rows, span), _rest(rows[::-1], span)))
-            if len(demo.controls):
-                self._compare(place, rows[:LOOKED_AT], demo.controls[:LOOKED_AT])
-
-    def _compare(self, place: str, rows: np.ndarray, commands: np.ndarray) -> None:
+    def compare(self, place: str, rows: np.ndarray, commands: np.ndarray) -> None:
         """Update which numbers of an observation [T, D] equal controls [T, A] of the same or a neighbouring step."""
+        rows = rows[:LOOKED_AT]
         commands = commands[: len(rows)]
         floats = [array.dtype for array in (rows, commands) if array.dtype.kind == "f"]
         coarser = min(floats, key=lambda dtype: dtype.itemsize, default=np.dtype(np.float64))
@@ -696,45 +608,9 @@ class _Coincidences:
             for dimension in np.flatnonzero(equal[at].any(0)):
                 equal[at, :, dimension] &= (observed == ahead[:, [dimension]]).all(0)
 
-    def notes(self, masks: Mapping[str, Sequence[str]], dimensions: Sequence[ControlDimension]) -> list[str]:
+    def notes(self, masks: Mapping[str, Sequence[str]], varying: Sequence[int]) -> list[str]:
         """A line for each kind of coincidence, with a count and the first place."""
-        varying = [dimension.number for dimension in dimensions if not dimension.constant]
-        padding = list(self._padding())
-        idle = () if any(dimension.integer for dimension in dimensions) else self._idle(dimensions, bool(padding))
-        return [*self._switches(dimensions), *padding, *idle, *self._copies(masks), *self._observed(varying)]
-
-    def paddings(self) -> dict[str, dict[str, np.ndarray]]:
-        """By name of the few demonstrations with equal commands at an end: the stretch in words, and the command."""
-        stretches: dict[str, dict[str, np.ndarray]] = {}
-        moving = [demo for demo in self._demos if len(demo.controls)]
-        for end, where in enumerate(("first", "last")):
-            steps = {demo.name: demo.rest(end, np.zeros(demo.controls.shape[1])) for demo in moving}
-            padded = [demo for demo in moving if steps[demo.name] >= FEWEST]
-            for demo in padded if len(padded) <= most_few(len(self._demos)) else ():
-                why = f"the {where} {steps[demo.name]} commands are the same, as padding is"
-                stretches.setdefault(demo.name, {})[why] = demo.controls[-end]
-        return stretches
-
-    def _idle(self, dimensions: Sequence[ControlDimension], padded: bool) -> Iterator[str]:
-        """A line for the demonstrations that begin with a long idle stretch, and for those that end with one."""
-        span = np.array([dimension.maximum - dimension.minimum for dimension in dimensions])
-        moves = [place for place, dimension in enumerate(dimensions) if not dimension.values]
-        for end, where in enumerate(("start", "end")):
-            idle: dict[str, int] = {}
-            for demo in self._demos:
-                if not len(demo.controls) or len(span) != demo.controls.shape[1] or (end and padded and demo.tail > 1):
-                    continue
-                steps = demo.rest(end, span)
-                if demo.controls[-end][moves].any():  # no velocity: what is seen has to rest, too
-                    steps = min([steps, *(rests[end] for rests in demo.rests)])
-                if max(LONG, LONG_SHARE * demo.steps) <= steps < demo.steps:
-                    idle[demo.name] = steps
-            if idle:
-                name, steps = next(iter(idle.items()))
-                yield (
-                    f"nothing moves at the {where} of {len(idle)} of {len(self._demos)} demonstrations, in {name} for "
-                    f"{steps} steps: cut such stretches off, or an option may be the waiting"
-                )
+        return [*self._copies(masks), *self._observed(varying)]
 
     def leaks(self, place: str, varying: Sequence[int], still: Sequence[int]) -> bool:
         """Whether an observation holds nothing but controls that are still to be predicted.
@@ -763,27 +639,18 @@ class _Coincidences:
                 if observed:
                     effect = "tend to repeat it" if shift < 0 else "see what they have to predict"
                     yield (
-                        f"{place}: {listed(observed)} = control {listed(controls)} {when}, in all {len(self._demos)} "
-                        f"demonstrations, the first {self._demos[0].name}: policies {effect}"
+                        f"{place}: {listed(observed)} = control {listed(controls)} {when}, in all {len(self.digests)} "
+                        f"demonstrations, the first {next(iter(self.digests))}: policies {effect}"
                     )
-
-    def _padding(self) -> Iterator[str]:
-        padded = [demo for demo in self._demos if demo.tail > 1]
-        if len(padded) > 1:
-            first = padded[0]
-            yield (
-                f"the last steps are the same in {len(padded)} of {len(self._demos)} demonstrations, the first "
-                f"{first.name} from step {first.steps - first.tail} on: cut them off if they are padding"
-            )
 
     def _copies(self, masks: Mapping[str, Sequence[str]]) -> Iterator[str]:
         known: dict[bytes, str] = {}
-        each = [(known.setdefault(demo.digest.digest(), demo.name), demo.name) for demo in self._demos]
+        each = [(known.setdefault(digest.digest(), name), name) for name, digest in self.digests.items()]
         pairs = [(first, again) for first, again in each if first != again]
         effect = "one of two that are the same may be trained on and the other held out"
         if masks.keys() & {"train", "valid"}:
             try:
-                valid = set(divided([demo.name for demo in self._demos], masks)[1])
+                valid = set(divided(list(self.digests), masks)[1])
             except DemonstrationsError:
                 return  # reported as a problem
             pairs = [pair for pair in pairs if (pair[0] in valid) != (pair[1] in valid)]
@@ -791,30 +658,6 @@ class _Coincidences:
         if pairs:
             first, again = pairs[0]
             yield (
-                f"{len(pairs)} of {len(self._demos)} demonstrations equal another one, the first {again}, which equals "
-                f"{first}: {effect}"
+                f"{len(pairs)} of {len(self.digests)} demonstrations equal another one, the first {again}, which "
+                f"equals {first}: {effect}"
             )
-
-    def _switches(self, dimensions: Sequence[ControlDimension]) -> Iterator[str]:
-        """Dimensions that are switches except for padding, or under two conventions."""
-        for dimension in dimensions:
-            if len(dimension.distinct) != FEW or 0.0 not in dimension.distinct:
-                continue
-            where = f"control dimension {dimension.number}"
-            columns = {demo.name: demo.controls[:, dimension.number] for demo in self._demos if len(demo.controls)}
-            moving = {name: np.count_nonzero(column) for name, column in columns.items() if not column.all()}
-            ends = all(columns[name][:steps].all() for name, steps in moving.items())
-            if ends and len(moving) > most_few(len(columns)):  # fewer are odd
-                low, high = (number(value) for value in dimension.distinct if value)
-                first, step = next(iter(moving.items()))
-                yield (
-                    f"{where}: {low} or {high}, and 0 at the end of {len(moving)} of {len(columns)} demonstrations, "
-                    f"the first {first} from step {step} on: cut the ends off if they are padding, and it is a switch"
-                )
-            values = {name: set(np.unique(column).tolist()) for name, column in columns.items()}
-            signs, bits = ([name for name in values if values[name] == pair] for pair in ({-1.0, 1.0}, {0.0, 1.0}))
-            if signs and bits and not any({-1.0, 0.0} <= there for there in values.values()):
-                yield (
-                    f"{where}: -1 or 1 in {len(signs)} demonstrations, the first {signs[0]}, and 0 or 1 in "
-                    f"{len(bits)}, the first {bits[0]}: write all of them in one way, and it is a switch"
-                )

@@ -147,17 +147,15 @@ def same(left: Observed, right: Observed) -> bool:
 
 
 class Transform(NamedTuple):
-    """The preprocessing of pictures: crop, scale, grey, then stack with earlier pictures.
+    """The preprocessing of pictures: crop, scale, then stack with earlier pictures.
 
     :param crop: top, left, height, width in the file's pixels; None for no crop.
     :param resize: height and width after scaling; None for no scaling.
-    :param grey: whether red, green and blue become one luminance channel.
     :param frames: number of successive pictures that are stacked.
     """
 
     crop: tuple[int, ...] | None = None
     resize: tuple[int, ...] | None = None
-    grey: bool = False
     frames: int = 1
 
     def as_data(self) -> dict[str, Any]:
@@ -167,13 +165,13 @@ class Transform(NamedTuple):
     def shape(self, stored: Sequence[int]) -> tuple[int, ...]:
         """[H', W', C'] of preprocessed pictures [H, W, C].
 
-        :raises TransformError: the crop leaves the picture, ``grey`` finds no three channels, or there are no pictures.
+        :raises TransformError: the crop leaves the picture, or there are no pictures.
         """
         if self == Transform():
             return tuple(stored)
         if len(stored) != PICTURE_DIMENSIONS:
             raise TransformError(
-                f"has shape {list(stored)} at each step: crop, resize, grey and frames are for pictures [H, W, C]"
+                f"has shape {list(stored)} at each step: crop, resize and frames are for pictures [H, W, C]"
             )
         height, width, colours = stored
         if self.crop is not None:
@@ -183,9 +181,7 @@ class Transform(NamedTuple):
                     f"crop: [{', '.join(map(str, self.crop))}] is not within {height} × {width} pixels"
                 )
             height, width = size
-        if self.grey and colours != 3:
-            raise TransformError(f"grey: is for pictures of three colours, not {colours}")
-        return *(self.resize or (height, width)), self.frames * (1 if self.grey else colours)
+        return *(self.resize or (height, width)), self.frames * colours
 
     def seen(self, array: Observed, steps: slice) -> Iterator[np.ndarray]:
         """Preprocessed pictures of consecutive steps, [steps, H', W', C'], block by block.
@@ -204,8 +200,6 @@ class Transform(NamedTuple):
             frames = frames[:, top : top + height, left : left + width]
         if self.resize is not None and frames.shape[1:3] != self.resize:
             frames = resized(frames, self.resize)
-        if self.grey:
-            frames = _grey(frames)
         if self.frames == 1:
             return frames
         rows = np.arange(len(frames))  # earlier pictures first; the first picture is repeated
@@ -222,12 +216,6 @@ def resized(frames: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
         one = cv2.resize(np.ascontiguousarray(frame), (width, height), interpolation=cv2.INTER_AREA)
         scaled[number] = one.reshape(scaled.shape[1:])
     return scaled
-
-
-def _grey(frames: np.ndarray) -> np.ndarray:
-    """Luminance of red, green and blue (ITU-R BT.601), [T, H, W, 1]."""
-    red, green, blue = np.moveaxis(frames.astype(np.uint32), -1, 0)
-    return ((299 * red + 587 * green + 114 * blue + 500) // 1000).astype(frames.dtype)[..., None]
 
 
 def padded(

@@ -31,7 +31,6 @@ class Reader(Model):
     """Convolutions. A user's class is refused, because what is written beside a file has to be safe to read."""
     crop: Items[int] | None = None
     resize: Items[Count] | None = None
-    grey: bool = False
 
     @field_validator("network")
     @classmethod
@@ -51,7 +50,7 @@ class FittedReader(PictureNetwork):
     def __init__(self, about: Reader, picture: Sequence[int]) -> None:
         super().__init__()
         self.about = about
-        self.transform = Transform(about.crop, about.resize, about.grey)
+        self.transform = Transform(about.crop, about.resize)
         (self.key,) = about.network.inputs
         self.network = build_trunk(about.network, InputShape({}, {self.key: self.transform.shape(picture)}), 1)
         self.eval()
@@ -97,7 +96,7 @@ def from_fit(fit: Fit, key: str, picture: Sequence[int]) -> FittedReader:
     if problem or transform is None or found is None:
         raise BadInput(f"{fit.place}: {problem}")
     network = found[0].model_copy(update={"inputs": (key,), "shared": False})
-    about = Reader(network=network, crop=transform.crop, resize=transform.resize, grey=transform.grey)
+    about = Reader(network=network, crop=transform.crop, resize=transform.resize)
     reader, weights = FittedReader(about, picture), found[1].state_dict()
     reader.network.load_state_dict({name: weights[name] for name in reader.network.state_dict()})
     return reader

@@ -162,8 +162,8 @@ ADVICE: Mapping[Kind, str] = {
     "count.",
     "dominating": "Train layer by layer (training.layerwise: true), or give the options' policies less capacity, so "
     "that one of them cannot do all the work.",
-    "whole": "Observe what is alike in all demonstrations: positions relative to the first step (relative: true beside "
-    "the observation's key), or differences alone, written into the file.",
+    "whole": "Observe what is alike in all demonstrations: write positions relative to the first step, or differences "
+    "alone, into the file.",
     "never_persisting": "A simpler termination (network: linear), fewer options, or observations that change more "
     "slowly (differences: false) let options last.",
     "brief": "Options so short are parts of one movement, not skills. Ask for longer ones (training.duration), take "

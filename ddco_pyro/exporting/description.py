@@ -105,7 +105,6 @@ def describe(hierarchy: Hierarchy, control: RolloutSpec, program: StepProgram) -
                 "key": key,
                 "shape": list(shape),
                 "image": key in encoder.images,
-                "relative": key in vectors and vectors[key].relative,
                 "differences": key in vectors and vectors[key].differences,
                 "angles": list(vectors[key].angles) if key in vectors else [],
                 "quaternions": list(vectors[key].quaternions) if key in vectors else [],

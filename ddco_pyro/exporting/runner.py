@@ -63,7 +63,6 @@ class Runner:
         self.choices: tuple[int, ...] = ()
         self.terminations: tuple[float, ...] = ()
         self.outputs: Outputs = {}
-        self._first: dict[str, np.ndarray] = {}
         self._last: dict[str, np.ndarray] | None = None
         self._pictures: dict[str, list[np.ndarray]] = {}
         self._marginal: np.ndarray | None = None
@@ -86,7 +85,6 @@ class Runner:
         specs = self.about["observations"]
         now = {spec["key"]: _checked(observation, spec) for spec in specs}
         images = {spec["key"]: self._recent(now[spec["key"]], spec) for spec in specs if spec["image"]}
-        self._first = self._first or now
         features = self._features(now, self._last or now)
         self.outputs, self._state = self._networks(features, self.time, images, self._state)
         generator = np.random.default_rng([self.seed, self.time])
@@ -113,7 +111,7 @@ class Runner:
         for spec in self.about["observations"]:
             if not spec["image"]:
                 value = _turned(now[spec["key"]], spec)
-                parts.append(value - _turned(self._first[spec["key"]], spec) if spec["relative"] else value)
+                parts.append(value)
                 if spec["differences"]:
                     parts.append(value - _turned(before[spec["key"]], spec))
         return np.concatenate(parts)
@@ -198,15 +196,12 @@ def _turned(value: np.ndarray, spec: Mapping[str, Any]) -> np.ndarray:
 
 
 def _picture(picture: np.ndarray, spec: Mapping[str, Any]) -> np.ndarray:
-    """A picture [H, W, C] after the cropping, scaling and conversion to grey that its ``spec`` asks for."""
+    """A picture [H, W, C] after the cropping and scaling that its ``spec`` asks for."""
     if "crop" in spec:
         top, left, height, width = spec["crop"]
         picture = picture[top : top + height, left : left + width]
     if "resize" in spec and picture.shape[:2] != tuple(spec["resize"]):
         picture = _resized(picture, *spec["resize"])
-    if spec.get("grey"):
-        red, green, blue = np.moveaxis(picture.astype(np.uint32), -1, 0)
-        picture = ((299 * red + 587 * green + 114 * blue + 500) // 1000).astype(np.uint8)[..., None]
     return picture
 
 

@@ -163,12 +163,10 @@ class ObservationEncoder(nn.Module):
         self,
         observations: Mapping[str, Observed],
         times: np.ndarray | None = None,
-        first: Mapping[str, np.ndarray] | None = None,
     ) -> np.ndarray:
         """Observations [T, ...] by name to features [T, F], not yet standardised.
 
         :param times: the number of each step [T]; by default 0 to T - 1.
-        :param first: the observation of the trajectory's first step by name; by default that of these.
         """
         steps = len(next(iter(observations.values())))
         times = np.arange(steps) if times is None else times
@@ -176,9 +174,6 @@ class ObservationEncoder(nn.Module):
         for spec in self.specs:
             values = times / float(self.longest) if spec.key == STEP else observations[spec.key]
             column = _turned(np.asarray(values, dtype=np.float64).reshape(steps, -1), spec)
-            if spec.relative:
-                start = values[:1] if first is None else first[spec.key]
-                column = column - _turned(np.asarray(start, dtype=np.float64).reshape(1, -1), spec)
             columns.append(column)
             if spec.differences:
                 columns.append(np.diff(column, axis=0, prepend=column[:1]))
@@ -194,19 +189,15 @@ class ObservationEncoder(nn.Module):
         self,
         observations: Iterable[Mapping[str, Observed]],
         times: np.ndarray | None = None,
-        first: Iterable[Mapping[str, np.ndarray]] | None = None,
     ) -> Inputs:
         """Sequences of observations, each [T_n, ...] by name, to padded network inputs.
 
         Pictures are read when a network asks for them.
 
         :param times: as in :meth:`features`.
-        :param first: as in :meth:`features`, for each sequence.
         """
         sequences = list(observations)
-        starts = [None] * len(sequences) if first is None else list(first)
-        pairs = zip(sequences, starts, strict=True)
-        vectors = [self.scaled(self.features(sequence, times, start)) for sequence, start in pairs]
+        vectors = [self.scaled(self.features(sequence, times)) for sequence in sequences]
         vector = padded(vectors).float()
         by_key, steps = dict(zip(self.keys, vector.split(self.sizes, -1), strict=True)), vector.shape[1]
         pictures = {key: tuple(_as_pictures(sequence[key]) for sequence in sequences) for key in self.images}
@@ -250,7 +241,7 @@ def _ends(values: np.ndarray, bins: int) -> np.ndarray:
 
 
 def _transform(spec: ObservationSpec) -> Transform:
-    return Transform(spec.crop, spec.resize, spec.grey, spec.frames)
+    return Transform(spec.crop, spec.resize, spec.frames)
 
 
 def _seen_shape(spec: ObservationSpec, shapes: Shapes) -> tuple[int, ...]:
@@ -259,8 +250,8 @@ def _seen_shape(spec: ObservationSpec, shapes: Shapes) -> tuple[int, ...]:
     :raises ShapeError: it cannot be cropped, scaled, binned or augmented as the spec says.
     """
     stored = shapes[spec.key]
-    if (spec.bins or spec.relative) and len(stored) == PICTURE_DIMENSIONS:
-        raise ShapeError(f"observations: {spec.key!r} has pictures: bins and relative are for vectors")
+    if spec.bins and len(stored) == PICTURE_DIMENSIONS:
+        raise ShapeError(f"observations: {spec.key!r} has pictures: bins are for vectors")
     size, last = int(np.prod(stored)), max([*spec.angles, *(first + 3 for first in spec.quaternions)], default=-1)
     if last >= 0 and (len(stored) == PICTURE_DIMENSIONS or last >= size):
         raise ShapeError(

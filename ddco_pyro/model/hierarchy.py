@@ -130,7 +130,6 @@ class Hierarchy(nn.Module):
     :param constant: the control dimensions outside the model, and the values that are emitted for them.
     :param parts: the kinds of the other control dimensions; by default all are Gaussian.
     :raises ShapeError: a network cannot read these observations.
-    :raises SpecError: a user's network does not take its options.
     """
 
     power: Tensor

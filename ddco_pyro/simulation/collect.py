@@ -5,13 +5,14 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Collection
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ddco_pyro.data.demonstrations import DemonstrationsError
-from ddco_pyro.data.hdf5 import opened
-from ddco_pyro.data.sources.robomimic import Parts, parts_of
+from ddco_pyro.data.files import only_one
+from ddco_pyro.data.hdf5 import Attribute, attributes_of, opened
+from ddco_pyro.data.sources.robomimic import robomimic_file, write_recording
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
 from ddco_pyro.jobs import Workers, processes
@@ -62,8 +63,8 @@ def collect(
 ) -> Path:
     """Record ``spec.count`` demonstrations into a file, unless the file exists; returns its path.
 
-    Each demonstration is saved at once. After an interruption the next call records the missing ones. The root
-    attribute ``supervisor`` holds the supervisor's own success rate, as JSON.
+    The root attribute ``supervisor`` holds the supervisor's own success rate, as JSON. Of several processes that want
+    the same file one records it, and the others wait.
 
     :param path: the file; by default one in the cache.
     :param observed: the spec's observations; the task's cameras among them are recorded.
@@ -77,21 +78,29 @@ def collect(
     if path is not None and path.exists():
         _refuse_others(path, task, spec)
     path = path or cache_path(task, task_name, spec, observed)
-    if path.exists():
-        return path
+    lock = path.with_name(f".{path.name}.lock")
+    if not path.exists():
+        with only_one(lock, wait=True):
+            try:
+                if not path.exists():
+                    _record(task, task_name, spec, path, on_event, observed)
+            finally:
+                lock.rmdir()
+    return path
+
+
+def _record(
+    task: Task, task_name: str, spec: DemonstrationsSpec, path: Path, on_event: OnEvent, observed: Collection[str]
+) -> None:
     at_once = EPISODES_WITH_PICTURES if task.seen_by_cameras(observed) else spec.count
-    identity = _identity(task, task_name, spec, observed)
-    with processes(Workers().number(at_once)), parts_of(path, identity, wait=True, at_most=1) as parts:
-        if parts is None:
-            return path
-        seeds = range(spec.seed + len(parts.done), spec.seed + spec.count)
+    seeds = range(spec.seed, spec.seed + spec.count)
+    attributes: dict[str, Attribute] = {"task": task.name, "policy": spec.supervisor}
+    with processes(Workers().number(at_once)), robomimic_file(path, attributes, {}) as data:
         for first in range(0, len(seeds), at_once):
             for episode in run_episodes(task_name, spec.supervisor, seeds[first : first + at_once], observed=observed):
-                parts.add(episode.record.recording())
-                on_event(DemonstrationsDone(len(parts.done), spec.count))
-        attributes = {"task": task.name, "policy": spec.supervisor, "supervisor": json.dumps(_summary(task, parts))}
-        parts.finish(attributes, {})
-    return path
+                write_recording(data, episode.record.recording())
+                on_event(DemonstrationsDone(len(data), spec.count))
+        attributes["supervisor"] = json.dumps(_summary(task, [attributes_of(group) for group in data.values()]))
 
 
 def _refuse_others(path: Path, task: Task, spec: DemonstrationsSpec) -> None:
@@ -108,10 +117,12 @@ def _refuse_others(path: Path, task: Task, spec: DemonstrationsSpec) -> None:
             )
 
 
-def _summary(task: Task, parts: Parts) -> dict[str, Any]:
-    """The supervisor's own measures over the recorded episodes."""
-    facts = parts.attributes()
+def _summary(task: Task, demonstrations: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The supervisor's own measures over the recorded episodes, from their attributes."""
     return summarize(
         task,
-        [{name: float(value) for name, value in demo.items() if name not in ("seed", "num_samples")} for demo in facts],
+        [
+            {name: float(value) for name, value in demo.items() if name not in ("seed", "num_samples")}
+            for demo in demonstrations
+        ],
     )

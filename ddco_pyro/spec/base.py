@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Self, TypeVar, get_args
 
 from pydantic import (
@@ -38,18 +37,6 @@ Emission = Literal["options", "control"]
 TASKS = "ddco_pyro.tasks"
 """The entry-point group in which installed packages register tasks."""
 
-
-@dataclass(frozen=True)
-class Importable:
-    """Marks text that can name code to import as ``module:name``.
-
-    :param entry_points: a group of entry points whose names are trusted; None for no group.
-    """
-
-    entry_points: str | None = None
-
-
-TaskName = Annotated[Text, Importable(TASKS)]
 
 Problems = Iterable[tuple[str, str]]
 """Pairs of a key path, relative to a part of the spec, and the problem there."""

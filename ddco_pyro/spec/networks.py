@@ -23,7 +23,7 @@ from pydantic import (
 )
 
 from ddco_pyro.errors import nearest
-from ddco_pyro.spec.base import Count, Emission, Importable, Items, Model, Problems, Share, Text, invalid, tag_of
+from ddco_pyro.spec.base import Count, Emission, Items, Model, Problems, Share, Text, invalid, tag_of
 
 USER_DEFINED = "module:Class"
 _USER_DEFINED_PATTERN = r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$"
@@ -201,7 +201,7 @@ class BranchesSpec(MlpSpec):
 class UserNetworkSpec(Network):
     """A network class of your own."""
 
-    network: Annotated[str, Importable(), Field(json_schema_extra={"pattern": _USER_DEFINED_PATTERN})]
+    network: Annotated[str, Field(json_schema_extra={"pattern": _USER_DEFINED_PATTERN})]
     """The class, as ``module:Class``."""
     options: dict[str, Any] = Field(default={})
     """Keyword arguments of the class."""

@@ -17,7 +17,6 @@ from ddco_pyro.spec.base import (
     Problems,
     Seed,
     Share,
-    TaskName,
     Text,
     bare,
     invalid,
@@ -34,7 +33,7 @@ class DemonstrationsSpec(Model):
 
     path: Text | None = None
     """HDF5 file in robomimic's layout; null: demonstrations are collected in the task."""
-    task: TaskName | None = None
+    task: Text | None = None
     """Task in which demonstrations are collected; null: the spec's ``task``."""
     count: int = Field(default=100, ge=2)
     """Number of demonstrations to collect."""
@@ -107,8 +106,6 @@ class ObservationSpec(Model):
 
     key: Text
     """Name of the observation in the demonstrations; ``step`` is built in."""
-    relative: bool = False
-    """For vectors: read x_t − x_0, relative to the first step of the demonstration or episode, in place of x_t."""
     differences: bool = False
     """Append x_t − x_{t−1}."""
     angles: Items[Annotated[int, Field(ge=0)]] = ()
@@ -128,8 +125,6 @@ class ObservationSpec(Model):
     """For pictures: top, left, height and width of the crop, in the file's pixels; null: no crop."""
     resize: Size | None = None
     """For pictures: height and width after the crop is scaled by area averaging; null: not scaled."""
-    grey: bool = False
-    """For pictures: whether red, green and blue become one luminance channel."""
     frames: Count = 1
     """For pictures: number of successive pictures stacked along the channels, oldest first. Before the first step the
     first picture is repeated. A single picture does not show velocities."""
@@ -141,8 +136,6 @@ class ObservationSpec(Model):
             yield "crop", "is top, left, height, width; height and width must be at least 1"
         if self.key == STEP and self.differences:
             yield "differences", f"{STEP} grows by the same at each step; leave it out"
-        if self.key == STEP and self.relative:
-            yield "relative", f"{STEP} is 0 at the first step; leave it out"
         turned = [*self.angles, *(first + place for first in self.quaternions for place in range(4))]
         for key in ("angles", "quaternions"):
             if getattr(self, key) and self.key == STEP:
@@ -224,11 +217,6 @@ class PartSpec(Model):
     """As ``control.std``; null: the same."""
     scale: Scale | None = None
     """As ``control.scale``; null: the same. A list has a number for each dimension of the part."""
-    bounds: Annotated[Items[float], Field(min_length=2, max_length=2)] | None = None
-    """For ``clipped`` and ``hurdle``: lower and upper bound, in the control's units; null: the extremes that the
-    demonstrations often reach."""
-    value: float | None = None
-    """For ``hurdle``: the value that each dimension often has exactly; null: the commonest value inside the range."""
     freedom: Freedom | None = None
     """As ``control.freedom``; null: the same."""
 
@@ -238,16 +226,8 @@ class PartSpec(Model):
         for setting in ("scale", "std"):
             if self.kind in DISCRETE and getattr(self, setting) is not None:
                 yield setting, f"does not apply to kind: {self.kind}; leave it out"
-        if self.bounds is not None and self.kind not in ("clipped", "hurdle"):
-            yield "bounds", "are for kind: clipped or hurdle"
-        if self.bounds is not None and self.bounds[0] >= self.bounds[1]:
-            yield "bounds", "must be a lower and a higher number"
         if self.freedom is not None and self.kind != "student":
             yield "freedom", "is for kind: student"
-        if self.value is not None and self.kind != "hurdle":
-            yield "value", "is for kind: hurdle"
-        elif self.value is not None and self.bounds and not self.bounds[0] < self.value < self.bounds[1]:
-            yield "value", "must lie between the bounds"
 
 
 class ControlSpec(Model):

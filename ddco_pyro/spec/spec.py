@@ -8,7 +8,7 @@ from typing import Any, Self
 from pydantic import Field, ValidationError, model_validator
 
 from ddco_pyro.errors import nearest
-from ddco_pyro.spec.base import Emission, Items, Model, Problems, Seed, SpecError, TaskName, invalid, lines, show
+from ddco_pyro.spec.base import Emission, Items, Model, Problems, Seed, SpecError, Text, invalid, lines, show
 from ddco_pyro.spec.model import Baseline, HierarchySpec, LevelSpec
 from ddco_pyro.spec.networks import foreign_keys
 from ddco_pyro.spec.settings import (
@@ -35,7 +35,7 @@ class Spec(Model):
     ('place', 12, 2)
     """
 
-    task: TaskName | None = None
+    task: Text | None = None
     """Name of a registered task, or ``module:name``."""
     demonstrations: DemonstrationsSpec = DemonstrationsSpec()
     """Where the demonstrations come from."""

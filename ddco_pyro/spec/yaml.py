@@ -7,12 +7,13 @@ import stat
 from collections.abc import Iterable, Iterator, Mapping
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import yaml
 
 from ddco_pyro.errors import path_of
-from ddco_pyro.spec.base import Importable, Model, SpecError, show
+from ddco_pyro.spec.base import TASKS, Model, SpecError, show
+from ddco_pyro.spec.networks import UserNetworkSpec
 from ddco_pyro.spec.spec import Spec, parse_spec, plain, with_overrides
 
 
@@ -190,12 +191,27 @@ def _parse_override(text: str) -> tuple[str, Any]:
 # --- user code --------------------------------------------------------------------------------------------------------
 
 
-def user_code(spec: Model) -> dict[str, str]:
-    """Key path to ``module:name`` of the code that using the spec imports, its grid excluded.
+def user_code(spec: Spec) -> dict[str, str]:
+    """Key path to ``module:name`` of the code that using the spec imports: its tasks and networks, the grid excluded.
 
-    Names registered by installed packages are not user code.
+    Tasks registered by installed packages are not user code.
     """
-    return dict(_named(spec, ""))
+    tasks, registered = {"task": spec.task, "demonstrations.task": spec.demonstrations.task}, entry_points(group=TASKS)
+    names = {place: name for place, name in tasks.items() if name and ":" in name and name not in registered.names}
+    return names | user_networks(spec)
+
+
+def user_networks(part: Model) -> dict[str, str]:
+    """Key path to ``module:Class`` of the user's networks in a part of a spec."""
+    return dict(_user_networks(part, ""))
+
+
+def _user_networks(part: Any, place: str) -> Iterator[tuple[str, str]]:
+    if isinstance(part, UserNetworkSpec):
+        yield f"{place}.network", part.network
+    elif isinstance(part, Model | Mapping | tuple):
+        for key, below in enumerate(part) if isinstance(part, tuple) else dict(part).items():
+            yield from _user_networks(below, f"{place}.{key}" if place else str(key))
 
 
 def _refuse_user_code(spec: Spec, path: str | Path) -> None:
@@ -213,27 +229,3 @@ def _refuse_user_code(spec: Spec, path: str | Path) -> None:
                 for place, name in places.items()
             )
         )
-
-
-def _named(value: Any, place: str) -> Iterator[tuple[str, str]]:
-    """Key paths and names of user code below a part of the spec."""
-    if isinstance(value, Model):
-        for key, field in type(value).model_fields.items():
-            below, part = f"{place}.{key}" if place else key, getattr(value, key)
-            for mark in (*field.metadata, *_metadata(field.annotation)):
-                if isinstance(mark, Importable) and isinstance(part, str) and ":" in part:
-                    group = entry_points(group=mark.entry_points) if mark.entry_points else ()
-                    if part not in {point.name for point in group}:
-                        yield below, part
-            yield from _named(part, below)
-    elif isinstance(value, tuple | Mapping):
-        items = value.items() if isinstance(value, Mapping) else enumerate(value)
-        for name, part in items:
-            yield from _named(part, f"{place}.{name}")
-
-
-def _metadata(annotation: Any) -> Iterator[Any]:
-    """The metadata within a type such as ``Annotated[str, mark] | None``."""
-    yield from getattr(annotation, "__metadata__", ())
-    for argument in get_args(annotation):
-        yield from _metadata(argument)

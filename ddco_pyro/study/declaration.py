@@ -23,9 +23,9 @@ from ddco_pyro.evaluation.agreement import MATCHED, UNMATCHED
 from ddco_pyro.selection.grid import point_name
 from ddco_pyro.simulation.task import find_task
 from ddco_pyro.spec import Spec, SpecError, load_spec, parse_spec, user_code
-from ddco_pyro.spec.base import Count, Importable, Items, Model, Problems, Seed, TaskName, Text, lines
+from ddco_pyro.spec.base import Count, Items, Model, Problems, Seed, Text, lines
 from ddco_pyro.spec.model import Baseline
-from ddco_pyro.spec.yaml import read_mapping
+from ddco_pyro.spec.yaml import read_mapping, user_networks
 
 INIT = "init"
 """The ``spec`` that stands for what ``ddco-pyro init`` writes for the training demonstrations of each cell."""
@@ -128,12 +128,12 @@ class Declaration(Model):
 
     question: Text
     spec: Text = INIT
-    world: Annotated[Text, Importable()] | None = None
-    tasks: Items[TaskName] = ()
+    world: Text | None = None
+    tasks: Items[Text] = ()
     overrides: dict[str, Any] = Field(default={})
     grid: Grid = Field(default={})
     choose: Text | None = None
-    choose_on: Items[TaskName] = ()
+    choose_on: Items[Text] = ()
     methods: Annotated[dict[Text, MethodSpec], Field(min_length=1)]
     seeds: Blocks
     demonstrations: DataSpec
@@ -141,7 +141,7 @@ class Declaration(Model):
     measures: Annotated[Items[Text], Field(min_length=1)] = (NATS,)
     contrasts: Items[ContrastSpec] = ()
     correction: Literal["holm", "fixed_sequence"] = "holm"
-    families: dict[Text, Annotated[Items[TaskName], Field(min_length=2)]] = Field(default={})
+    families: dict[Text, Annotated[Items[Text], Field(min_length=2)]] = Field(default={})
     failed: dict[Text, float] = Field(default={})
     pinned: bool = False
     kept: Items[KeptSpec] = ()
@@ -269,7 +269,8 @@ class Study:
         if not study.tasks[0] and (declared.starts or declared.demonstrations.path is None):
             where = "the task in which methods act" if declared.starts else "tasks, or a file in demonstrations.path"
             raise SpecError(f"{path}: tasks: missing; name {where}")
-        code = user_code(declared) | {f"tasks.{n}": task for n, task in enumerate(declared.tasks) if ":" in task}
+        named = {"world": declared.world or ""} | {f"tasks.{n}": task for n, task in enumerate(declared.tasks)}
+        code = {place: name for place, name in named.items() if ":" in name} | user_networks(declared)
         code |= {f"overrides of {where}": name for where, name in study._overridden_code()}
         if code and not allow_code:
             text = "pass --allow-code if you trust it"

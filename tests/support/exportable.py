@@ -29,7 +29,6 @@ def make(
     vectors=True,
     bins=0,
     turns=False,
-    relative=False,
     std=MappingProxyType({"learn": True}),
     **rollout,
 ):
@@ -44,8 +43,8 @@ def make(
     ]
     turned = [{"angles": [1]}, {"quaternions": [0]}] if turns else [{}, {}]
     state, goal = ({"key": key} | own for key, own in zip(("state", "goal"), turned, strict=True))
-    own = {"differences": True, "bins": bins, "relative": relative}
-    seen = [state | own, goal | {"relative": relative}, *built_in] if vectors else []
+    own = {"differences": True, "bins": bins}
+    seen = [state | own, goal, *built_in] if vectors else []
     pictures = [{"key": "camera", **(camera if isinstance(camera, dict) else {})}] if camera else []
     endings = endings or {"network": network if network in ("conv", "per_timestep") else "linear"}
     model = {
@@ -103,7 +102,7 @@ BRANCHES = {
     },
     "hidden": [7],
 }
-SMALL = {"camera": {"resize": [7, 6], "grey": True, "frames": 2}, "built_in": ("step",)}
+SMALL = {"camera": {"resize": [7, 6], "frames": 2}, "built_in": ("step",)}
 BOTH = ("options", "control")
 FITS = {
     "linear": make("linear", options="most_likely"),
@@ -112,8 +111,6 @@ FITS = {
     "per_timestep": make("per_timestep", steps=30),
     "bins": make("mlp", bins=4),
     "angles and quaternions": make("mlp", turns=True),
-    "relative": make("mlp", turns=True, relative=True),
-    "relative, with memory": make(RECURRENT, relative=True, endings={"network": "linear"}),
     "conv": make("conv", camera={"crop": [1, 2, 7, 9], "resize": [6, 8], "frames": 3}, options="sample"),
     "hybrid": make("mlp", (2, 3), BOTH, control="sample"),
     "σ of the state": make("mlp", (2, 3), BOTH, std={"learn": True, "per_state": True}, control="sample"),

@@ -138,7 +138,10 @@ def frequency_of(attributes: Mapping[str, Attribute]) -> float | None:
 def robomimic_file(
     path: Path, attributes: Mapping[str, Attribute], masks: Mapping[str, Sequence[str]]
 ) -> Iterator[h5py.Group]:
-    """The group ``data`` of a new file, for :func:`write_recording`; the file is written whole or not at all."""
+    """The group ``data`` of a new file, for :func:`write_recording`; the file is written whole or not at all.
+
+    ``attributes`` and ``masks`` are read at the end of the block.
+    """
     with whole_file(path) as temporary, written(temporary) as file:
         data = file.create_group("data")
         yield data

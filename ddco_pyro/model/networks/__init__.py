@@ -12,7 +12,7 @@ from ddco_pyro.model.networks.inputs import Inputs, InputShape, ShapeError
 from ddco_pyro.model.networks.lstm import Lstm
 from ddco_pyro.model.networks.perceptrons import Branches, Constant, Linear, Mlp, Network, PerTimestep, State, States
 from ddco_pyro.model.networks.user import UserNetwork
-from ddco_pyro.spec import NetworkSpec, SpecError
+from ddco_pyro.spec import NetworkSpec
 from ddco_pyro.spec.networks import UserNetworkSpec
 
 __all__ = [
@@ -46,7 +46,6 @@ def build(spec: NetworkSpec, shape: InputShape | Network, outputs: int, copies: 
     """``copies`` independent networks of the observations, or of a trunk's features, that give ``outputs`` numbers.
 
     :raises ShapeError: the network is to be shared, or as :func:`build_trunk`.
-    :raises SpecError: as :func:`build_trunk`.
     """
     if spec.shared:
         raise ShapeError("shared: options would all do the same; share a trunk, or a network in of or over")
@@ -63,7 +62,6 @@ def build_trunk(spec: NetworkSpec, shape: InputShape | Network, copies: int) -> 
     :param shape: of the observations, or another trunk, which it reads in their place.
     :raises ShapeError: the network cannot read these observations, cannot be imported or made, or is refused by
         :func:`ddco_pyro.model.networks.probe.try_network`.
-    :raises SpecError: the options do not fit the signature of a user's class.
     """
     copies = 1 if spec.shared else copies
     if isinstance(spec, UserNetworkSpec):
@@ -111,7 +109,5 @@ def named(place: str) -> Iterator[None]:
     """Errors about a network begin with its place in the spec."""
     try:
         yield
-    except SpecError as error:
-        raise SpecError(*(f"{place}.{problem}" for problem in error.problems)) from error
     except ShapeError as error:
         raise ShapeError(f"{place}: {error}") from error

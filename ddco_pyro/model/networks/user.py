@@ -1,26 +1,16 @@
-"""A user's network, ``module:Class``: imported, made with checked options, tried, and adapted to the built-in ones."""
+"""A user's network, ``module:Class``: imported, made, tried, and adapted to the built-in ones."""
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Mapping
-from inspect import Parameter
 from pkgutil import resolve_name
 from typing import Any, Self
 
-from pydantic import PydanticUserError, TypeAdapter, ValidationError
-from pydantic_core import to_json
 from torch import Tensor, nn
 
-from ddco_pyro.errors import nearest
 from ddco_pyro.model.networks.inputs import Inputs, InputShape, ShapeError
 from ddco_pyro.model.networks.perceptrons import Network, State
 from ddco_pyro.model.networks.probe import try_network
-from ddco_pyro.spec import SpecError
-from ddco_pyro.spec.base import in_words, show
-
-POSITIONAL = 3
-"""A user's class is made as ``Class(shape, outputs, copies, **options)``: the first three are no options."""
 
 
 class UserNetwork(Network):
@@ -40,14 +30,13 @@ class UserNetwork(Network):
         """The network of the class ``name``, tried on random observations.
 
         :raises ShapeError: the class cannot be imported or made, or its network is refused by :func:`try_network`.
-        :raises SpecError: the options do not fit the signature of the class.
         """
         network_class = _imported(name)
-        checked = checked_options(network_class, options)
         try:
-            module = network_class(shape, outputs, copies, **checked)
+            module = network_class(shape, outputs, copies, **options)
         except Exception as error:  # whatever the user's code raises
-            raise ShapeError(f"network {name!r} cannot be made with options {options}: {error}") from error
+            why = " ".join(str(error).split())
+            raise ShapeError(f"network {name!r} cannot be made with options {dict(options)}: {why}") from error
         network = cls(module, outputs, copies)
         try_network(name, network, shape)
         return network
@@ -77,67 +66,3 @@ def _imported(name: str) -> type[nn.Module]:
     if not (isinstance(network_class, type) and issubclass(network_class, nn.Module)):
         raise ShapeError(f"network {name!r} is not a torch.nn.Module class")
     return network_class
-
-
-def checked_options(network: type[nn.Module], options: Mapping[str, Any]) -> dict[str, Any]:
-    """The options of a user's class, as the types of its annotations; a list becomes a tuple where that is one.
-
-    :raises SpecError: options are missing, unknown or of another type; a line for each, such as ``options.gain: ...``.
-    """
-    accepted, takes_any = _accepted(network)
-    values, problems = dict(options), []
-    for name, value in options.items():
-        if name in accepted:
-            annotation = _annotation(network, accepted[name])
-            try:
-                values[name] = _typed(value, annotation)
-            except ValidationError as error:
-                problems.append(_mistyped(f"options.{name}", value, annotation, error))
-        elif not takes_any:
-            known = ", ".join(accepted) or "none"
-            problems.append(f"options.{name}: unknown option{nearest(name, accepted)}; the class takes: {known}")
-    for name, parameter in accepted.items():
-        if name not in options and parameter.default is Parameter.empty:
-            problems.append(f"options.{name}: missing; it has to be given")
-    if problems:
-        raise SpecError(*problems)
-    return values
-
-
-def _accepted(network: type[nn.Module]) -> tuple[dict[str, Parameter], bool]:
-    """The options that the class names, and whether it takes others too."""
-    parameters = list(inspect.signature(network).parameters.values())
-    by_name = (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY)
-    accepted = {parameter.name: parameter for parameter in parameters[POSITIONAL:] if parameter.kind in by_name}
-    return accepted, any(parameter.kind is Parameter.VAR_KEYWORD for parameter in parameters)
-
-
-def _annotation(network: type[nn.Module], parameter: Parameter) -> Any:
-    """The type of a parameter; Any without an annotation, or where its name means nothing at run time."""
-    if parameter.annotation is Parameter.empty:
-        return Any
-    if not isinstance(parameter.annotation, str):
-        return parameter.annotation
-    try:
-        return eval(parameter.annotation, inspect.unwrap(network.__init__).__globals__)  # type: ignore[attr-defined]
-    except Exception:  # such as a name that is imported for type checkers alone
-        return Any
-
-
-def _typed(value: Any, annotation: Any) -> Any:
-    """The value as this type. It is read as JSON, because only there strict types take a list for a tuple."""
-    if annotation is Any:
-        return value
-    try:
-        adapter = TypeAdapter(annotation)
-    except (PydanticUserError, NameError):  # a class that pydantic cannot make, or an unknown name within the type
-        return value
-    return adapter.validate_json(to_json(value, inf_nan_mode="constants"), strict=True)
-
-
-def _mistyped(place: str, value: Any, annotation: Any, error: ValidationError) -> str:
-    """The place and the problem in one line; the several errors of a union become one."""
-    details = error.errors()
-    if len(details) > 1:
-        return f"{place}: must be {inspect.formatannotation(annotation)}, got {show(value)}"
-    return f"{'.'.join([place, *map(str, details[0]['loc'])])}: {in_words(details[0])}"

@@ -8,7 +8,6 @@ import torch
 from scipy import stats
 from sklearn.preprocessing import QuantileTransformer
 
-from ddco_pyro.acting.window import Window
 from ddco_pyro.data.controls import all_gaussian
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.inference import log_likelihood
@@ -81,19 +80,6 @@ def test_differences_stand_behind_their_observation_and_begin_with_zero():
         np.testing.assert_array_equal(found[n, : len(demo), :3], pose.astype(np.float32))  # not standardised
         np.testing.assert_allclose(found[n, 0, 3:6], 0)
         np.testing.assert_allclose(found[n, 1 : len(demo), 3:6], pose[1:] - pose[:-1], atol=1e-5)
-
-
-def test_relative_numbers_begin_with_zero_in_each_demonstration_and_from_the_first_step_of_an_episode():
-    """Differences are the same. An episode that is seen step by step is the whole one."""
-    given = {"relative": True, "differences": True, "standardize": False}
-    specs = ObservationSpec(key="pose", **given), ObservationSpec(key="grid", relative=True, standardize=False)
-    encoder, (demo, *_) = fitted(*specs), DEMOS
-    pose, grid = (demo.observations[key].reshape(len(demo), -1) for key in ("pose", "grid"))
-    expected = np.hstack([pose - pose[0], np.diff(pose, axis=0, prepend=pose[:1]), grid - grid[0]])
-    assert encoder.features(demo.observations) == pytest.approx(expected)
-    window = Window(encoder)
-    steps = [window.inputs([{key: values[t] for key, values in demo.observations.items()}]) for t in range(len(demo))]
-    assert torch.cat([step.vector[0] for step in steps]).numpy() == pytest.approx(expected, abs=1e-6)
 
 
 def test_differences_are_standardised_apart_from_their_observation():

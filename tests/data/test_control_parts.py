@@ -138,10 +138,6 @@ def test_parts_by_name_come_first_and_the_rest_follows():
         ({"kind": "binary"}, "control.kind: control dimension 0 takes more than two values; it is no switch"),
         ({"kind": "hurdle"}, "control dimension 0 is at no value inside its range in 5 % of the steps"),
         ({"parts": [{"name": "a", "dims": [9]}]}, "control.parts.0.dims: there is no control dimension 9"),
-        (
-            {"parts": [{"name": "a", "dims": [1], "kind": "clipped", "bounds": [-1, 1]}]},
-            "control.parts.0.bounds: control dimension 1 goes from -2 to 2",
-        ),
         ({"parts": [{"name": "a", "dims": [0, 2], "kind": "categorical"}]}, "control dimension 0 is not of whole"),
     ],
 )
@@ -155,8 +151,6 @@ def test_what_does_not_fit_the_demonstrations_is_refused(control, message):
     [
         [{"name": "a", "dims": [0]}, {"name": "b", "dims": [1, 0]}],
         [{"name": "a", "dims": [0]}, {"name": "a", "dims": [1]}],
-        [{"name": "a", "dims": [0], "bounds": [0, 1]}],
-        [{"name": "a", "dims": [0], "kind": "clipped", "bounds": [1, 0]}],
         [{"name": "a", "dims": [0, 1], "scale": [1.0]}],
         [{"name": "a", "dims": [0], "scale": [1.0, 2.0]}],
         [{"name": "a", "dims": [2], "kind": "binary", "scale": [1.0]}],
@@ -349,24 +343,6 @@ def test_beside_its_value_a_hurdle_is_clipped_where_it_has_bounds():
     for part in decided(at_bounds()):
         assert (part.kind, part.low, part.high) == ("hurdle", (-1.0,), (1.0,))
         assert part.why.endswith("; often at an extreme")
-
-
-def test_a_value_is_that_of_the_demonstrations_however_it_is_rounded():
-    """0.1 in a file of float32 is another number than 0.1 in a spec."""
-    stored = float(np.float32(0.1))
-    controls = np.where(np.arange(60) % 2 == 0, stored, np.random.default_rng(0).normal(size=60))[:, None]
-    for value in (0.1, stored, None):
-        parts = [{"name": "stick", "dims": [0], "kind": "hurdle", "value": value}]
-        (part,) = control_parts(ControlSpec(parts=parts), control_dimensions({"demo": controls}))
-        assert part.exact == (stored,)
-
-
-def test_a_declared_value_may_be_an_extreme():
-    controls = np.abs(no_ops()[0].actions[:, :1])
-    parts = [{"name": "pedal", "dims": [0], "kind": "hurdle", "value": 0.0}]
-    (part,) = control_parts(ControlSpec(parts=parts), control_dimensions({"demo": controls}))
-    assert (part.exact, part.low, part.high) == ((0.0,), (-np.inf,), (np.inf,))
-    assert [part.kind for part in control_parts(ControlSpec(), control_dimensions({"demo": controls}))] == ["clipped"]
 
 
 def test_scaling_keeps_exactly_the_value_apart(rested):

@@ -31,7 +31,7 @@ from ddco_pyro.training.networks import Dimensions, build_hierarchy
 
 HEIGHT, WIDTH = 12, 10
 CONV = {"network": "conv", "filters": 3, "kernel": 3, "pooled": 2, "hidden": [5]}
-RAW = {"key": "camera", "crop": [1, 2, 10, 8], "resize": [5, 4], "grey": True, "frames": 2}
+RAW = {"key": "camera", "crop": [1, 2, 10, 8], "resize": [5, 4], "frames": 2}
 
 
 def demonstrations(number: int = 8) -> Demonstrations:
@@ -109,46 +109,37 @@ def test_transform_by_hand() -> None:
     cut = Transform(crop=(1, 1, 2, 2))
     np.testing.assert_array_equal(cut(picture), picture[:, 1:3, 1:3])
     np.testing.assert_array_equal(cut._replace(resize=(1, 1))(picture), [[[[70, 80, 90]]]])  # means
-    grey = cut._replace(grey=True)(picture)
-    np.testing.assert_array_equal(grey[0, ..., 0], [[18, 58], [98, 138]])  # 0.299 r + 0.587 g + 0.114 b = r + 8.1 here
-    for transform in (cut, cut._replace(resize=(1, 2)), Transform(grey=True), Transform(resize=(8, 7), grey=True)):
+    for transform in (cut, cut._replace(resize=(1, 2)), Transform(resize=(8, 7))):
         assert transform(picture).shape[1:] == transform.shape(picture.shape[1:])
 
 
 def test_pictures_are_seen_behind_those_before_them(kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Along the channels, the oldest first, and the first one repeated, wherever a trajectory is cut."""
     monkeypatch.setattr("ddco_pyro.data.pictures.BLOCK_BYTES", 3 * HEIGHT * WIDTH * 3)
-    spec = ObservationSpec(key="camera", grey=True, frames=3)
+    spec = ObservationSpec(key="camera", frames=3)
     encoder = ObservationEncoder([spec], {"camera": (HEIGHT, WIDTH, 3)})
-    assert encoder.images == {"camera": (HEIGHT, WIDTH, 3)}
+    assert encoder.images == {"camera": (HEIGHT, WIDTH, 9)}
     demos = demonstrations()
     for each in (Demonstrations.read(kept), demos):
         frames = encoder.inputs(demo.observations for demo in each).images
         whole, part = frames["camera"], frames.part(torch.tensor([2]), slice(6, 11))["camera"]
-        grey = Transform(grey=True)(demos[2].observations["camera"])
+        seen = demos[2].observations["camera"]
         for step in range(12):
-            expected = np.concatenate([grey[max(step - back, 0)] for back in (2, 1, 0)], axis=-1)
+            expected = np.concatenate([seen[max(step - back, 0)] for back in (2, 1, 0)], axis=-1)
             np.testing.assert_array_equal(whole[2, step], expected)
             if 6 <= step < 11:
                 np.testing.assert_array_equal(part[0, step - 6], expected)
 
 
-def test_grey_is_that_of_opencv() -> None:
-    """But for how halves are rounded."""
-    picture = np.random.default_rng(0).integers(0, 256, (1, 50, 50, 3), dtype=np.uint8)
-    theirs = cv2.cvtColor(picture[0], cv2.COLOR_RGB2GRAY).astype(int)
-    assert np.abs(Transform(grey=True)(picture)[0, ..., 0].astype(int) - theirs).max() <= 1
-
-
 def test_pictures_are_cut_and_scaled_wherever_they_are(kept: Path) -> None:
     encoder = ObservationEncoder([ObservationSpec(**RAW | {"frames": 1})], {"camera": (HEIGHT, WIDTH, 3)})
-    assert encoder.images == {"camera": (5, 4, 1)}
+    assert encoder.images == {"camera": (5, 4, 3)}
     read, made = ([demo.observations for demo in demos] for demos in (Demonstrations.read(kept), demonstrations()))
     seen, expected = (encoder.inputs(each).loaded().images["camera"] for each in (read, made))
     assert torch.equal(seen, expected)
     first = made[0]["camera"][0, 1:11, 2:10]
     scaled = cv2.resize(first, (4, 5), interpolation=cv2.INTER_AREA)
-    np.testing.assert_array_equal(seen[0, 0], Transform(grey=True)(scaled[None])[0])
+    np.testing.assert_array_equal(seen[0, 0], scaled)
 
 
 def test_shifting_repeats_the_edge() -> None:
@@ -188,7 +179,7 @@ def test_pictures_that_a_device_holds_are_those_that_are_read(kept: Path, stored
     demos = Demonstrations.read(kept) if stored else demonstrations()
     inputs = encoder.inputs(demo.observations for demo in demos)
     whole = Batch(inputs, torch.zeros(8, 40, 2), torch.tensor(demos.lengths))
-    assert whole.picture_bytes == sum(demos.lengths) * 5 * 4 * 2
+    assert whole.picture_bytes == sum(demos.lengths) * 5 * 4 * 2 * 3
     for rows, steps in (([5, 2], slice(0, 40)), ([2, 0, 7], slice(7, 13)), ([1], slice(3, 4))):
         with Device():
             expected, held = (
@@ -203,9 +194,8 @@ def test_pictures_that_a_device_holds_are_those_that_are_read(kept: Path, stored
     ("observation", "message"),
     [
         ({"key": "camera", "crop": [3, 3, 10, 4]}, r"'camera' crop: \[3, 3, 10, 4\] is not within 12 × 10 pixels"),
-        ({"key": "pose", "grey": True}, r"'pose' has shape \[3\] at each step: crop, resize, grey and frames are for"),
-        ({"key": "camera", "bins": 4}, r"'camera' has pictures: bins and relative are for vectors"),
-        ({"key": "camera", "relative": True}, r"'camera' has pictures: bins and relative are for vectors"),
+        ({"key": "pose", "frames": 2}, r"'pose' has shape \[3\] at each step: crop, resize and frames are for"),
+        ({"key": "camera", "bins": 4}, r"'camera' has pictures: bins are for vectors"),
     ],
 )
 def test_what_cannot_be_cut_is_refused(kept: Path, observation: dict[str, Any], message: str) -> None:

@@ -1,4 +1,4 @@
-"""Files that robomimic, LeRobot and Minari themselves wrote, imported: every number is there, interrupted or not.
+"""Files that robomimic, LeRobot and Minari themselves wrote, imported: every number is there.
 
 How ``fixtures/`` was made: ``fixtures/write_robomimic.py`` and ``fixtures/write_lerobot.py``.
 """
@@ -28,7 +28,7 @@ from ddco_pyro.data.inspection import inspect
 from ddco_pyro.data.sources.video import _frames
 from ddco_pyro.errors import BadInput
 
-ROBOMIMIC, LEROBOT = Path(__file__).parent / "fixtures" / "robomimic.hdf5", odd.FIXTURE
+ROBOMIMIC, LEROBOT = Path(__file__).parents[1] / "fixtures" / "robomimic.hdf5", odd.FIXTURE
 
 
 @pytest.fixture
@@ -283,9 +283,7 @@ def written_by_minari(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 def test_minari(written_by_minari, out: Path) -> None:
     folder, buffers = written_by_minari(spaces.Box(-1, 1, (2,)))
-    assert import_demonstrations(folder, out).unread == (
-        "networks do not read obs/mission: it holds text, not numbers",
-    )
+    assert import_demonstrations(folder, out).notes == ("networks do not read obs/mission: it holds text, not numbers",)
     assert "obs/mission holds text, not numbers" in inspect(folder).problems
     demos = Demonstrations.read(out)
     assert demos.lengths == (5, 6, 7, 8)
@@ -447,53 +445,25 @@ def test_what_is_wrong_with_surgeons_files_is_one_line(surgeons, out: Path, chan
     assert not out.exists()
 
 
-# --- whole or not at all, and resumed ---------------------------------------------------------------------------------
+# --- whole or not at all ----------------------------------------------------------------------------------------------
 
 
 class Stopped(Exception):
     pass
 
 
-def stop_after(number: int):
-    def on_recording(done: int, total: int) -> None:
-        if done == number:
+def test_an_interrupted_import_leaves_nothing_and_one_that_is_there_is_not_replaced(out: Path, tmp_path: Path) -> None:
+    def stop(done: int, total: int) -> None:
+        if done == 3:
             raise Stopped
 
-    return on_recording
-
-
-@pytest.mark.parametrize("number", [1, 2, 5])
-def test_an_interrupted_import_goes_on(out: Path, tmp_path: Path, number: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ddco_pyro.data.sources.robomimic.PART_BYTES", 8000)  # one or two demonstrations in a part
-    whole = tmp_path / "whole.hdf5"
-    import_demonstrations(ROBOMIMIC, whole)
     with pytest.raises(Stopped):
-        import_demonstrations(ROBOMIMIC, out, on_recording=stop_after(number))
-    assert not out.exists()
-    kept = sorted((tmp_path / ".demos.hdf5.parts").glob("*.hdf5"))
-    times = [path.stat().st_mtime_ns for path in kept]
-    with pytest.raises(Stopped):
-        import_demonstrations(ROBOMIMIC, out, on_recording=stop_after(6))
-    assert [path.stat().st_mtime_ns for path in kept] == times  # not made again
+        import_demonstrations(ROBOMIMIC, out, on_recording=stop)
+    assert not any(tmp_path.iterdir())
     import_demonstrations(ROBOMIMIC, out)
-    assert out.read_bytes() == whole.read_bytes()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["demos.hdf5", "whole.hdf5"]
-
-
-def test_parts_of_another_import_are_not_used(out: Path, tmp_path: Path) -> None:
-    with pytest.raises(Stopped):
-        import_demonstrations(ROBOMIMIC, out, choice=Choice(("object",)), on_recording=stop_after(6))
-    import_demonstrations(ROBOMIMIC, out)
-    assert set(Demonstrations.read(out).observation_shapes) == {"agentview_image", "object", "robot0_eef_pos"}
-
-
-def test_an_import_that_is_there_is_left_alone_and_nothing_else_replaced(out: Path) -> None:
-    first = import_demonstrations(ROBOMIMIC, out)
-    before = out.stat().st_mtime_ns
-    assert import_demonstrations(ROBOMIMIC, out).names == first.names
-    assert out.stat().st_mtime_ns == before
-    with pytest.raises(BadInput, match=r"demos\.hdf5: is there already and is not this import"):
-        import_demonstrations(ROBOMIMIC, out, choice=Choice(mask="train"))
+    assert [path.name for path in tmp_path.iterdir()] == ["demos.hdf5"]
+    with pytest.raises(BadInput, match=r"demos\.hdf5: is there already; choose another --out, or remove it"):
+        import_demonstrations(ROBOMIMIC, out)
 
 
 # --- what cannot be used ----------------------------------------------------------------------------------------------

@@ -1,0 +1,331 @@
+"""Segments in tables, read as labels: the columns are those that ELAN, BORIS and Label Studio export."""
+
+from __future__ import annotations
+
+import json
+
+import h5py
+import numpy as np
+import pandas as pd
+import pytest
+from command_line import call
+
+from ddco_pyro.data.annotations import Labelled, LabelTable
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.sources import Recording
+from ddco_pyro.errors import BadInput
+
+
+class Held:
+    """A source in memory with demonstrations of these lengths."""
+
+    format, masks, files = "robomimic", {}, ()
+
+    def __init__(self, lengths, frequency=10.0, attributes=None):
+        self._lengths, self.frequency, self.attributes = lengths, frequency, attributes or {}
+        self.names = tuple(lengths)
+
+    def recording(self, name):
+        return Recording.of(name, {}, np.zeros((self._lengths[name], 2)))
+
+
+def labels(source, path, **said):
+    """Names of labels by label name; the name of each step by demonstration, empty where nothing is said; notes."""
+    found = Labelled(source, LabelTable(path, **said))
+    names = json.loads(found.attributes["label_names"])
+    return (
+        names,
+        {
+            demo: {
+                key: [names[key][label] if label >= 0 else "" for label in column.array()]
+                for key, column in found.recording(demo).labels.items()
+            }
+            for demo in source.names
+        },
+        found.notes,
+    )
+
+
+ROWS = [
+    ("demo_1", "reach", 0.1, 0.4),
+    ("demo_1", "grasp", 0.4, 0.6),
+    ("demo_1", "", 0.7, 0.8),
+    ("demo_0", "reach", 0, 0.2),
+]
+STEPS = ["", *["reach"] * 3, *["grasp"] * 2, "", ""]
+
+# --- tables of any origin ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["a.csv", "a.tsv", "a.txt", "a.parquet"])
+@pytest.mark.parametrize(
+    ("names", "scale", "said"),
+    [
+        (("start_s", "stop_s"), 1, {}),
+        (("Start (ms)", "Stop (ms)"), 1000, {}),
+        (("first frame", "last_step"), 10, {}),
+        (("from", "to"), 1000, {"unit": "milliseconds"}),
+        (("from", "to"), 10, {"unit": "steps"}),
+        (("from", "to"), 2, {"unit": "seconds", "rate": 5.0}),
+    ],
+)
+def test_any_table(tmp_path, kind, names, scale, said):
+    """A label is called as its column; steps of which nothing is said, and segments without a label, are unknown."""
+    table = pd.DataFrame(ROWS, columns=["episode", "skill", *names])
+    table[list(names)] *= scale
+    path = tmp_path / kind
+    if kind == "a.parquet":
+        table.to_parquet(path)
+    else:
+        table.to_csv(path, sep={"a.csv": ",", "a.tsv": "\t", "a.txt": ";"}[kind], index=False, encoding="utf-8-sig")
+    columns = dict(zip(("demonstration", "label", "start", "stop"), table, strict=True))
+    found = labels(Held({"demo_0": 3, "demo_1": 8}), path, columns=columns, **said)
+    assert found == (
+        {"skill": ["reach", "grasp"]},
+        {"demo_1": {"skill": STEPS}, "demo_0": {"skill": ["reach", "reach", ""]}},
+        [],
+    )
+
+
+def test_labels_that_differ_by_case_or_blanks_alone_are_one(tmp_path):
+    """They have the source's name, or the commonest; and it is said."""
+    names = ["Grasp", "grasp ", "grasp", "grasp", "Pick Up", "pickup", "PLACE"]
+    table = pd.DataFrame({"demonstration": "demo_0", "label": names, "start": range(7), "stop": range(1, 8)})
+    table.to_csv(tmp_path / "a.csv", index=False)
+    source = Held({"demo_0": 7}, attributes={"label_names": '{"label": ["control", "place"]}'})
+    known, found, notes = labels(source, tmp_path / "a.csv", unit="steps")
+    assert known == {"label": ["control", "place", "grasp", "Pick Up"]}
+    assert found["demo_0"]["label"] == ["grasp"] * 4 + ["Pick Up"] * 2 + ["place"]
+    assert notes == [
+        "labels/label: read 'Grasp' as 'grasp', 'grasp ' as 'grasp', 'pickup' as 'Pick Up', 'PLACE' as 'place', since "
+        "case or blanks alone differ"
+    ]
+
+
+# --- tables of the tools ----------------------------------------------------------------------------------------------
+
+ELAN = """Begin Time - hh:mm:ss.ms\tBegin Time - ss.msec\tBegin Time - msec\tEnd Time - hh:mm:ss.ms\t\
+End Time - ss.msec\tEnd Time - msec\tDuration - hh:mm:ss.ms\tDuration - ss.msec\tDuration - msec\t\
+skill\twho\tFile Name\tFile Path
+00:00:00.100\t0.1\t100\t00:00:00.400\t0.4\t400\t00:00:00.300\t0.3\t300\treach\t\tdemo_1.eaf\tfile:///a
+00:00:00.400\t0.4\t400\t00:00:00.600\t0.6\t600\t00:00:00.200\t0.2\t200\tgrasp\tleft hand\tdemo_1.eaf\tfile:///a
+"""
+
+
+@pytest.mark.parametrize("left_out", ["", "Begin Time - msec"])
+def test_elan(tmp_path, left_out):
+    """Tab-delimited text of multiple files: a column for each tier, and times in several formats."""
+    (tmp_path / "elan.txt").write_text(ELAN.replace(left_out, "Duration - other") if left_out else ELAN)
+    names, found, notes = labels(Held({"demo_0": 3, "demo_1": 8}), tmp_path / "elan.txt")
+    assert (names, notes) == ({"skill": ["reach", "grasp"], "who": ["left hand"]}, [])
+    assert found["demo_1"] == {"skill": STEPS, "who": [*[""] * 4, *["left hand"] * 2, "", ""]}
+    assert found["demo_0"] == {"skill": [""] * 3, "who": [""] * 3}
+
+
+LOCATED = "Observation id\tTime offset (s)\tSubject\tBehavior\tBehavioral category\tModifier #1\tBehavior type"
+AGGREGATED = f"""{LOCATED}\tStart (s)\tStop (s)\tDuration (s)
+demo_0\t5.0\tNo focal subject\treach\t\t\tSTATE\t5.000\t5.800\t0.800
+demo_0\t5.0\tNo focal subject\tbeep\t\t\tPOINT\t5.400\t5.400\tNA
+demo_0\t5.0\tNo focal subject\tgrasp\t\thard\tSTATE\t5.800\t6.100\t0.300
+demo_0\t5.0\tleft\tgrasp\t\t\tSTATE\t6.000\t6.300\t0.300
+"""
+EVENTS = [
+    (5.0, "No focal subject", "reach", "", "START"), (5.4, "No focal subject", "beep", "", "POINT"),
+    (5.8, "No focal subject", "reach", "", "STOP"), (5.8, "No focal subject", "grasp", "hard", "START"),
+    (6.0, "left", "grasp", "", "START"), (6.1, "No focal subject", "grasp", "hard", "STOP"),
+    (6.3, "left", "grasp", "", "STOP"),
+]  # fmt: skip
+
+
+def tabular(events):
+    lines = [
+        f"demo_0\t5.0\t{subject}\t{code}\t\t{modifier}\t{kind}\t{at:.3f}"
+        for at, subject, code, modifier, kind in events
+    ]
+    return "\n".join([f"{LOCATED}\tTime", *lines])
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "modified"),
+    [
+        ("a.tsv", AGGREGATED, 1),
+        ("a.csv", "\ufeff" + AGGREGATED.replace("\t", ","), 1),
+        ("a.tsv", tabular(EVENTS), 2),
+    ],
+)
+def test_boris(tmp_path, name, text, modified):
+    """Aggregated events, and events as START and STOP; a modifier tells two states apart and makes no label."""
+    (tmp_path / name).write_text(text, encoding="utf-8")
+    names, found, notes = labels(Held({"demo_0": 14, "demo_1": 2}), tmp_path / name)
+    assert names == {"behavior": ["reach", "grasp"], "left": ["grasp"]}
+    assert found["demo_0"]["behavior"] == [*["reach"] * 8, *["grasp"] * 3, "", "", ""]
+    assert found["demo_0"]["left"] == [*[""] * 10, *["grasp"] * 3, ""]
+    assert found["demo_1"] == {"behavior": ["", ""], "left": ["", ""]}
+    assert notes == [
+        "left out 1 point events, which last no step",
+        f"left out the modifiers of {modified} rows: a label is a behavior alone",
+    ]
+
+
+def test_an_event_without_its_other_is_named_and_nothing_else_is_lost(tmp_path):
+    orphans = [
+        (5.1, "left", "grasp", "", "STOP"), (5.2, "left", "reach", "", "START"), (5.3, "left", "grasp", "", "START"),
+    ]  # fmt: skip
+    (tmp_path / "a.tsv").write_text(tabular([*orphans, *EVENTS]))
+    _, found, notes = labels(Held({"demo_0": 14}), tmp_path / "a.tsv")
+    assert found["demo_0"]["behavior"] == [*["reach"] * 8, *["grasp"] * 3, "", "", ""]
+    assert found["demo_0"]["left"] == [*[""] * 10, *["grasp"] * 3, ""]
+    assert notes[2:] == [
+        "left out grasp in demo_0, a STOP at 5.1 s without its START",
+        "left out grasp in demo_0, a START at 5.3 s without its STOP",
+        "left out reach in demo_0, a START at 5.2 s without its STOP",
+    ]
+
+
+def series(name, start, end):
+    return {"start": start, "end": end, "instant": False, "timeserieslabels": [name] if name else []}
+
+
+def exported(*tasks, key="demonstration", tag="label"):
+    """A CSV of Label Studio, from (the demonstration, its regions)."""
+    rows = [
+        {"id": n, key: demo, "series": '{"step": [0, 1]}', tag: json.dumps(regions) if regions else "",
+         "annotator": 1, "annotation_id": 3 + n, "created_at": "", "updated_at": "", "lead_time": 9.1}
+        for n, (demo, regions) in enumerate(tasks)
+    ]  # fmt: skip
+    return pd.DataFrame(rows).to_csv(index=False)
+
+
+REGIONS = [series("reach", 0, 3), series("grasp", 3, 5), series("", 6, 6)]
+"""Two regions that share the sample of an edge, and one that an annotator made without a label."""
+
+
+@pytest.mark.parametrize(
+    ("regions", "unit", "said"),
+    [
+        (REGIONS, "steps", [*["reach"] * 3, *["grasp"] * 3, "", "", ""]),
+        ([series("reach", 0.1, 0.3), series("grasp", 0.4, 0.7)], "seconds", ["", *["reach"] * 3, *["grasp"] * 4, ""]),
+        ([{"ranges": [{"start": 1, "end": 4}], "timelinelabels": ["reach"]}], "steps", [*["reach"] * 4, *[""] * 5]),
+        ([{"start": 0.2, "end": 0.6, "labels": ["reach"]}], "seconds", ["", "", *["reach"] * 4, *[""] * 3]),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("data", [("demonstration", "demo_1"), ("csv", "/data/upload/2/3f6a11c0-demo_1.csv?d=a")])
+def test_label_studio(tmp_path, regions, unit, said, data):
+    """Time series, whose ends are inclusive, frames of a video from 1 on, and audio; a task may have no region."""
+    (tmp_path / "a.csv").write_text(exported((data[1], regions), ("demo_0", []), key=data[0]))
+    found = labels(Held({"demo_0": 2, "demo_1": 9}), tmp_path / "a.csv", unit=unit, columns={"demonstration": data[0]})
+    assert found[1] == {"demo_0": {"label": ["", ""]}, "demo_1": {"label": said}}
+
+
+# --- what is refused --------------------------------------------------------------------------------------------------
+
+
+def plain(*rows, start="start_s", stop="stop_s"):
+    return pd.DataFrame(rows, columns=["demonstration", "label", start, stop]).to_csv(index=False)
+
+
+COLUMNS = {"columns": {"start": "start_s", "stop": "stop_s"}}
+REACH = ("demo_1", "reach", 0.1, 0.4)
+
+
+@pytest.mark.parametrize(
+    ("text", "more", "said"),
+    [
+        (plain(("demo_2", "reach", 0, 1)), COLUMNS, "there is no demonstration 'demo_2' (did you mean 'demo_1'?)"),
+        (plain(REACH, ("demo_1", "grasp", 0.4, 5.3)), COLUMNS,
+         "demo_1: label: grasp lasts from step 4 to 53, but there are 12 steps; correct it, the unit or --fps"),
+        (plain(("demo_1", "place", 0.3, 0.8), REACH), COLUMNS,
+         "demo_1: label: place and another segment overlap at step 3; a step has one label: end one of them"),
+        (plain(("demo_1", "grasp", 0.4, 0.41)), COLUMNS, "grasp at step 4 is shorter than a step; remove or lengthen"),
+        (plain(("demo_1", "grasp", 0.4, "00:01")), COLUMNS, "row 1: the stop '00:01' is no number; correct it"),
+        (plain(("demo_1", "", 0, 1)), COLUMNS, "names no segment"),
+        (plain(REACH), {}, "its columns are demonstration, label, start_s, stop_s; say what they are with --columns "
+         "start=COLUMN,stop=COLUMN"),
+        (plain(REACH), {"columns": {"label": "skil"}}, "has no column 'skil'; there is: demonstration, label, start_s"),
+        (plain(REACH, start="start", stop="stop"), {}, "does not say the unit of its times; add --unit seconds, mill"),
+        (plain(REACH, start="start ms", stop="stop s"), {"columns": {"start": "start ms", "stop": "stop s"}},
+         "does not say the unit of its times"),
+        (plain(REACH), {"columns": {**COLUMNS["columns"], "label": "demonstration"}}, None),
+        (exported(("demo_1", REGIONS)), {}, "does not say the unit of its times"),
+        (exported(("demo_1", REGIONS), tag="a/b"), {"unit": "steps"}, "'a/b' cannot be a name of labels"),
+        (exported(("demo_1", [series("reach", 0, 3), series("grasp", 2, 5)])), {"unit": "steps"},
+         "demo_1: label: grasp and another segment overlap at step 2"),
+        (exported(("demo_1", REGIONS), key="csv"), {}, "Label Studio's table has no column 'demonstration'; say --col"),
+        (exported(("demo_1", [{"labels": ["a", "b"], "start": 0, "end": 1}])), {}, "has 2 labels; a step has one"),
+        (exported(("demo_1", [{"labels": ["a"]}])), {}, "is no table as Label Studio exports it, or is damaged"),
+        ("", {}, "cannot be read as a table, or is damaged"),
+    ],
+)  # fmt: skip
+def test_what_does_not_fit_is_refused_in_one_line(tmp_path, text, more, said):
+    (tmp_path / "a.csv").write_text(text)
+    if said is None:
+        assert labels(Held({"demo_1": 12}), tmp_path / "a.csv", **more)[0] == {"demonstration": ["demo_1"]}
+        return
+    with pytest.raises(BadInput) as refused:
+        Labelled(Held({"demo_1": 12}), LabelTable(tmp_path / "a.csv", **more))
+    assert said in str(refused.value)
+    assert str(refused.value).startswith(f"--labels {tmp_path / 'a.csv'}: ")
+    assert "\n" not in str(refused.value)
+
+
+# --- the command ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def demos(tmp_path):
+    """Two demonstrations whose labels were written by ``segment``, with other names, and no frequency."""
+    path = tmp_path / "demos.hdf5"
+    marks = {"skill": np.ones(12, int), "skill_boundary": np.ones(12, int), "phase": np.arange(12)}
+    each = tuple(Demonstration(f"demo_{n}", {"x": np.zeros((12, 1))}, np.ones((12, 2)), marks) for n in range(2))
+    Demonstrations(each).write(path)
+    with h5py.File(path, "r+") as file:
+        file.attrs["label_names"] = json.dumps({"skill": ["control", "reach"], "phase": ["a"]})
+    return path
+
+
+def test_labels_are_imported_beside_others(demos, tmp_path):
+    out, table = tmp_path / "out.hdf5", tmp_path / "elan.txt"
+    table.write_text(ELAN)
+    ended = call("import", demos, "--labels", table, "--fps", 10, "--out", out)
+    assert ended.status == 0, ended.err
+    assert ended.out == f"{out}: 2 demonstrations, labels/skill in 1, labels/who in 1\n"
+    with h5py.File(out) as file, h5py.File(demos) as before:
+        names = json.loads(file.attrs["label_names"])
+        assert names == {"skill": ["control", "reach", "grasp"], "phase": ["a"], "who": ["left hand"]}
+        assert file.attrs["control_frequency"] == 10
+        assert set(file["data/demo_1/labels"]) == {"skill", "who", "phase"}  # boundaries of other labels are gone
+        np.testing.assert_array_equal(file["data/demo_1/labels/skill"], [-1, 1, 1, 1, 2, 2, *[-1] * 6])
+        np.testing.assert_array_equal(file["data/demo_0/labels/skill"], np.full(12, -1))
+        np.testing.assert_array_equal(file["data/demo_0/labels/phase"], before["data/demo_0/labels/phase"])
+        np.testing.assert_array_equal(file["data/demo_0/actions"], before["data/demo_0/actions"])
+
+
+def test_columns_and_the_unit_are_said(demos, tmp_path):
+    (tmp_path / "a.csv").write_text("episode,what,from,to\ndemo_1,Reach,2,4\ndemo_1,lift,4,5\n")
+    asked = ("import", demos, "--labels", tmp_path / "a.csv", "--out", tmp_path / "out.hdf5")
+    columns = ("--columns", "demonstration=episode,label=what,start=from,stop=to")
+    ended = call(*asked, *columns, "--unit", "steps")
+    assert (ended.status, ended.out) == (0, f"{tmp_path / 'out.hdf5'}: 2 demonstrations, labels/what in 1\n")
+    with h5py.File(tmp_path / "out.hdf5") as file:
+        assert json.loads(file.attrs["label_names"])["what"] == ["Reach", "lift"]
+        assert file["data/demo_1/labels/what"][:6].tolist() == [-1, -1, 0, 0, 1, -1]
+    (tmp_path / "out.hdf5").unlink()
+    for more, said in (
+        ([*columns, "--unit", "seconds"], "the demonstrations do not say how long a step is; add --fps"),
+        (["--columns", "demo=episode"], "--columns demo=episode: write demonstration=COLUMN,label=COLUMN,start=COLUMN"),
+        (columns, "does not say the unit of its times; add --unit seconds, milliseconds or steps"),
+    ):
+        ended = call(*asked, *more)
+        assert (ended.status, ended.err.count("\n"), said in ended.err) == (2, 1, True), ended.err
+    assert call("import", demos, "--fps", 10, "--out", tmp_path / "out.hdf5").status == 2
+    assert not (tmp_path / "out.hdf5").exists()
+
+
+def test_a_missing_table_is_the_file_that_is_named(demos, tmp_path):
+    (tmp_path / "folder").mkdir()
+    for path, said in (
+        (tmp_path / "no.csv", "is missing"),
+        (tmp_path / "folder", "is a folder; give a table: CSV, TSV or Parquet"),
+    ):
+        ended = call("import", demos, "--labels", path, "--out", demos.with_name("out.hdf5"))
+        assert (ended.status, ended.err) == (2, f"ddco-pyro: --labels {path}: {said}\n")
