@@ -510,7 +510,8 @@ class Folder:
                 spec = baseline_spec(spec, beside, Dimensions.of(demos))
             except SpecError as error:
                 raise SpecError(*(f"methods.{cell.of}.{problem}" for problem in error.problems)) from error
-        return with_overrides(spec, {"compare_with": []}), demos
+            return with_overrides(spec, {"compare_with": []}), demos
+        return with_overrides(spec, {"compare_with": _mixtures(spec)}), demos
 
     def _placed(self, cell: Cell, path: str) -> dict[str, Any]:
         """What a spec says of a cell's data, by key path. The path is relative: the study's folder may move."""
@@ -533,6 +534,12 @@ class Folder:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 world.collect(cell.task, seeds, count, path)
         return path
+
+
+def _mixtures(spec: Spec) -> list[dict[str, Any]]:
+    """The mixtures beside a hierarchy, which it is not to be less likely than."""
+    mixtures = (one for one in spec.compare_with if spec.hierarchy and one.kind == "mixture")
+    return [one.model_dump(exclude_unset=True) for one in mixtures]
 
 
 def _means(played: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
