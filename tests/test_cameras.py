@@ -16,8 +16,7 @@ from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.pictures import Pictures
 from ddco_pyro.data.sources.video import frames
-from ddco_pyro.encoding.autoencoder import Convolutions
-from ddco_pyro.encoding.encoder import About, Encoder, Projection
+from ddco_pyro.encoding import About, Backbone, Encoder, Projection
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.report import write_report
 from ddco_pyro.simulation import collect as collecting
@@ -93,9 +92,9 @@ def test_another_encoder_has_another_file():
     """Its weights decide what is recorded, and they lie in no source of the task."""
 
     def path(scale, observed):
-        network = Convolutions("random_conv", (48, 65, 3), seed=0)
-        about = About(encoder="random_conv", observation="camera", picture=[48, 65, 3], features=4, size=4, seed=0)
-        encoder = Encoder(about, network, Projection(np.zeros(4), scale * np.eye(4), 1.0))
+        backbone = Backbone("user_encoders:means", allow_code=True)
+        about = About(encoder=backbone.name, observation="camera", picture=[48, 65, 3], features=6, size=6)
+        encoder = Encoder(about, backbone, Projection(np.zeros(6), scale * np.eye(6), 1.0))
         coded = replace(watched, cameras={"colour": Encoded(watched.cameras["camera"], encoder, 4)})
         return collecting.cache_path(coded, TASK, DemonstrationsSpec(count=5), observed)
 

@@ -1,46 +1,28 @@
-"""Pictures encoded as vectors: against torch, scikit-learn and planted places; whole, in pieces, and after a kill."""
+"""Pictures encoded as vectors: against timm, scikit-learn and planted places, in a file and while acting."""
 
 from __future__ import annotations
 
-import json
-import os
-import shutil
-import signal
-import tracemalloc
+import sys
 
-import forked
 import h5py
 import numpy as np
 import pytest
 import torch
 from command_line import call
 from dots import SIZE, dots, followed, together
-from odd_files.hdf5 import instead
 from planted import make_spec, make_trainer, make_truth, plant
-from safetensors.torch import load_file
 from sklearn.decomposition import PCA
 from sklearn.linear_model import LinearRegression
 from sklearn.metrics import normalized_mutual_info_score
 
-import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.data.files import Damaged
-from ddco_pyro.encoding import Encoding, autoencoder, encode, load
-from ddco_pyro.encoding.encoder import principal_components
+from ddco_pyro.encoding import Backbone, encode, load, principal_components
 from ddco_pyro.errors import BadInput
-from ddco_pyro.events import DemonstrationsDone, UpdatesDone
+from ddco_pyro.events import DemonstrationsDone
 from ddco_pyro.inference import segment
 from ddco_pyro.model.batch import encode as prepare
-from ddco_pyro.spec import parse_spec
 
-OWN = "user_encoders:"
-
-
-@pytest.fixture(scope="module")
-def source(tmp_path_factory):
-    path = tmp_path_factory.mktemp("dots") / "dots.hdf5"
-    followed(24).write(path)
-    return path
+MEANS, PLACES = "user_encoders:means", "user_encoders:places"
 
 
 @pytest.fixture
@@ -48,36 +30,20 @@ def out(tmp_path):
     return tmp_path / "out.hdf5"
 
 
-def contents(out):
-    """Every byte of the file and of what is beside it."""
-    beside = {path.name: path.read_bytes() for path in out.with_name(f"{out.name}.encoder").iterdir()}
-    return out.read_bytes(), beside
+def encoded(path, out, encoder=MEANS, **options):
+    return encode(path, out, "camera", encoder, allow_code=True, **options)
 
 
 # --- what comes out ---------------------------------------------------------------------------------------------------
 
 
-def held_out_accuracy(out):
+def test_components_say_where_the_dot_is(tmp_path, out):
     """R² of the dot's place as a linear map of the features, in demonstrations that were held out of everything."""
+    followed(24).write(tmp_path / "dots.hdf5")
+    encoded(tmp_path / "dots.hdf5", out, PLACES, size=16)
     train, valid = Demonstrations.read(out).split(0.2, 0)
     places = LinearRegression().fit(together(train, "camera_features"), together(train, "place"))
-    return places.score(together(valid, "camera_features"), together(valid, "place"))
-
-
-def test_random_convolutions_say_where_the_dot_is(source, out):
-    encode(source, out, Encoding("camera", "random_conv", size=16))
-    assert held_out_accuracy(out) > 0.9
-
-
-def test_an_autoencoder_says_where_the_dot_is(source, out):
-    """It gives the picture from that: better than the best picture that never changes, which cannot show a dot."""
-    seen = []
-    encode(source, out, Encoding("camera", "autoencoder", size=16, updates=150), seen.append)
-    assert held_out_accuracy(out) > 0.9
-    pictures = together(Demonstrations.read(source).split(0.2, 0)[0], "camera") / 255
-    losses = [event.loss for event in seen if isinstance(event, UpdatesDone)]
-    assert len(losses) == 3
-    assert losses[-1] < 0.8 * pictures.var(0).mean()
+    assert places.score(together(valid, "camera_features"), together(valid, "place")) > 0.9
 
 
 def test_options_are_recovered_from_features(tmp_path, out):
@@ -86,7 +52,7 @@ def test_options_are_recovered_from_features(tmp_path, out):
     demos, choices = plant(truth, 40, 20, seed=1)
     drawn = [Demonstration(demo.name, {"camera": dots(demo.observations["state"])}, demo.actions) for demo in demos]
     Demonstrations(tuple(drawn)).write(tmp_path / "planted.hdf5")
-    encode(tmp_path / "planted.hdf5", out, Encoding("camera", size=8, name="state"))
+    encoded(tmp_path / "planted.hdf5", out, PLACES, size=8, name="state")
     spec = make_spec((3,), epochs=300, restarts=1, initialize="vq_controls")
     found = make_trainer(spec, Demonstrations.read(out), tmp_path / "fit").run()
     batch = prepare(Demonstrations.read(out), found.encoder, found.scaling)
@@ -95,12 +61,12 @@ def test_options_are_recovered_from_features(tmp_path, out):
 
 
 def test_all_but_the_pictures_stays(few_dots, out):
-    before = Demonstrations.read(few_dots)
-    assert encode(few_dots, out, Encoding("camera", size=5)).demonstrations == 6
+    before, seen = Demonstrations.read(few_dots), []
+    encoded(few_dots, out, size=4, on_event=seen.append)
+    assert seen == [DemonstrationsDone(done, 6) for done in range(1, 7)]
     after = Demonstrations.read(out)
-    assert (after.masks, after.names) == (before.masks, before.names)
-    assert before.attributes.items() <= after.attributes.items()
-    assert after.observation_shapes == {"other": (4, 4, 2), "place": (2,), "camera_features": (5,)}
+    assert (after.masks, after.names, after.attributes) == (before.masks, before.names, before.attributes)
+    assert after.observation_shapes == {"other": (4, 4, 2), "place": (2,), "camera_features": (4,)}
     labelled = [Demonstrations.read(path, labels=["phase"]) for path in (few_dots, out)]
     for demo, other in zip(*labelled, strict=True):
         np.testing.assert_array_equal(demo.actions, other.actions)
@@ -110,20 +76,6 @@ def test_all_but_the_pictures_stays(few_dots, out):
         assert demo.attributes == other.attributes
     with h5py.File(out) as file:
         assert file["data/demo_0/obs/camera_features"].dtype == np.float32
-
-
-def test_random_convolutions_written_out(few_dots, out):
-    folder = encode(few_dots, out, Encoding("camera", seed=3)).folder
-    weights, picture = load_file(folder / "encoder.safetensors"), together(Demonstrations.read(few_dots), "camera")[7]
-    maps = torch.from_numpy(picture).permute(2, 0, 1)[None] / 255
-    for layer, stride, padding in (("0", 2, 2), ("1", 1, 1)):
-        weight, bias = (weights[f"network/network.convolutions.0.{layer}.{name}"] for name in ("weight", "bias"))
-        maps = torch.relu(torch.nn.functional.conv2d(maps, weight, bias, stride, padding))
-    share = torch.exp(maps[0]) / torch.exp(maps[0]).sum((1, 2), keepdim=True)
-    axis = torch.linspace(-1, 1, SIZE // 2)
-    expected = torch.stack([(share.sum(2) * axis).sum(1), (share.sum(1) * axis).sum(1)], 1).flatten()
-    assert expected.shape == (128,)
-    np.testing.assert_allclose(load(folder).extractor.encode(picture[None])[0], expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("size", [1, 4, 9])
@@ -141,19 +93,19 @@ def test_principal_components_are_those_of_all_rows_at_once(size):
 
 
 def test_components_see_the_training_demonstrations_alone(few_dots, out):
-    folder = encode(few_dots, out, Encoding("camera", "user_encoders:Means", size=2), allow_code=True).folder
+    projection = encoded(few_dots, out, size=2).projection
     train, _ = Demonstrations.read(few_dots).split(0.2, 0)
     pictures = together(train, "camera").astype(float)
     rows = np.concatenate([pictures.mean((1, 2)), pictures[:, : SIZE // 2].mean((1, 2))], 1)
-    everything = load_file(folder / "encoder.safetensors")
-    np.testing.assert_allclose(everything["mean"], rows.mean(0), rtol=1e-6)
-    np.testing.assert_allclose(everything["components"].abs(), np.abs(PCA(2).fit(rows).components_), atol=1e-4)
+    np.testing.assert_allclose(projection.mean, rows.mean(0), rtol=1e-6)
+    np.testing.assert_allclose(np.abs(projection.components), np.abs(PCA(2).fit(rows).components_), atol=1e-4)
 
 
-@pytest.mark.parametrize("encoder", ["random_conv", "autoencoder", "user_encoders:Means"])
-def test_a_picture_that_is_seen_while_acting(few_dots, out, encoder):
-    folder = encode(few_dots, out, Encoding("camera", encoder, size=3, updates=2), allow_code=True).folder
-    loaded, pictures = load(folder, allow_code=True), together(Demonstrations.read(few_dots), "camera")
+@pytest.mark.parametrize(("encoder", "size"), [(MEANS, None), (MEANS, 3), (PLACES, None)])
+def test_a_picture_that_is_seen_while_acting(few_dots, out, encoder, size):
+    about = encoded(few_dots, out, encoder, size=size).about
+    assert (about.features, about.size < 5) == ({MEANS: 4, PLACES: 80}[encoder], True)
+    loaded, pictures = load(out, allow_code=True), together(Demonstrations.read(few_dots), "camera")
     one_by_one = np.stack([loaded(picture) for picture in pictures])
     assert one_by_one.dtype == np.float32
     np.testing.assert_allclose(one_by_one, together(Demonstrations.read(out), "camera_features"), rtol=1e-4, atol=1e-5)
@@ -161,75 +113,61 @@ def test_a_picture_that_is_seen_while_acting(few_dots, out, encoder):
         loaded(pictures[0] / 255)
 
 
-# --- in pieces --------------------------------------------------------------------------------------------------------
+def test_a_second_camera_is_encoded_by_a_second_call(tmp_path, out):
+    demos = followed(4)
+    both = [
+        Demonstration(
+            demo.name, {"camera": demo.observations["camera"], "wrist": demo.observations["camera"]}, demo.actions
+        )
+        for demo in demos
+    ]
+    Demonstrations(tuple(both)).write(tmp_path / "both.hdf5")
+    encoded(tmp_path / "both.hdf5", tmp_path / "first.hdf5", size=1)
+    encode(tmp_path / "first.hdf5", out, "wrist", MEANS, size=2, allow_code=True)
+    for key, size in (("camera_features", 1), ("wrist_features", 2)):
+        encoder = load(out, key, allow_code=True)
+        np.testing.assert_allclose(
+            encoder(both[0].observations["camera"][0]), Demonstrations.read(out)[0].observations[key][0], rtol=1e-4
+        )
+        assert encoder.about.size == size
+    with pytest.raises(
+        BadInput, match="there is no encoder of one observation alone; there is: camera_features, wrist_f"
+    ):
+        load(out)
 
 
-@pytest.mark.parametrize("encoder", ["random_conv", "autoencoder"])
-def test_blocks_of_any_size(few_dots, tmp_path, monkeypatch, encoder):
-    encoding, results = Encoding("camera", encoder, size=4, updates=3), []
-    for size in (2**24, 1, 3 * SIZE * SIZE * 2):
-        monkeypatch.setattr("ddco_pyro.data.pictures.BLOCK_BYTES", size)
-        encode(few_dots, tmp_path / f"{size}.hdf5", encoding)
-        results.append(contents(tmp_path / f"{size}.hdf5"))
-    assert results[0] == results[1] == results[2]
-
-
-def test_memory_holds_a_block_of_pictures(tmp_path, out, monkeypatch):
-    """Of a demonstration of 17 MB."""
-    pictures, controls = np.zeros((400, 120, 120, 3), np.uint8), np.zeros((400, 1))
-    Demonstrations((Demonstration("demo_0", {"camera": pictures}, controls),)).write(tmp_path / "long.hdf5")
-    monkeypatch.setattr("ddco_pyro.data.pictures.BLOCK_BYTES", 2**20)
-    tracemalloc.start()
-    try:
-        encode(tmp_path / "long.hdf5", out, Encoding("camera", f"{OWN}Means"), allow_code=True)
-        assert tracemalloc.get_traced_memory()[1] < pictures.nbytes / 2
-    finally:
-        tracemalloc.stop()
-
-
-def killed(path, out, encoding, kind, after):
-    """Encode in another process, which kills itself at an event."""
-    left = after
-
-    def strike(event):
-        nonlocal left
-        left -= isinstance(event, kind)
-        if left == 0:
-            os.kill(os.getpid(), signal.SIGKILL)
-
-    assert forked.run(lambda: encode(path, out, encoding, strike)).status == -signal.SIGKILL
-    assert not out.exists()
-
-
-def test_killed_again_and_again(few_dots, tmp_path, monkeypatch):
-    monkeypatch.setattr(autoencoder, "SHOWN_EVERY", 2)
-    encoding = Encoding("camera", "autoencoder", size=4, updates=9)
-    encode(few_dots, tmp_path / "whole.hdf5", encoding)
-    out, seen = tmp_path / "killed.hdf5", []
-    killed(few_dots, out, encoding, UpdatesDone, 3)
-    killed(few_dots, out, encoding, DemonstrationsDone, 2)
-    killed(few_dots, out, encoding, DemonstrationsDone, 2)
-    encode(few_dots, out, encoding, seen.append)
-    assert [event.done for event in seen if isinstance(event, DemonstrationsDone)] == [5, 6]
-    assert contents(out) == contents(tmp_path / "whole.hdf5")
-    left = {path.name for path in tmp_path.iterdir() if "killed" in path.name}
-    assert left == {"killed.hdf5", "killed.hdf5.encoder"}
+def test_models_of_timm(monkeypatch):
+    """Of a picture of the size that the model was trained with: what timm's own preprocessing gives."""
+    timm, pil = pytest.importorskip("timm"), pytest.importorskip("PIL.Image")
+    torch.manual_seed(0)
+    network = timm.create_model("resnet18.a1_in1k", pretrained=False, num_classes=0).eval()
+    monkeypatch.setattr(timm, "create_model", lambda name, *, pretrained, num_classes: network)
+    backbone = Backbone("timm:resnet18.a1_in1k")
+    pictures = np.random.default_rng(0).integers(0, 256, (2, 224, 224, 3), dtype=np.uint8)
+    settings = timm.data.resolve_model_data_config(network) | {"crop_pct": 1.0}
+    prepare = timm.data.create_transform(**settings, is_training=False)
+    with torch.no_grad():
+        expected = network(torch.stack([prepare(pil.fromarray(picture)) for picture in pictures])).numpy()
+    np.testing.assert_allclose(backbone(pictures), expected, rtol=1e-4, atol=1e-5)
+    assert backbone.try_out(pictures[:, ::3, ::2]) == 512
 
 
 def test_the_command(few_dots, out):
-    arguments = ("encode", few_dots, "--observation", "camera", "--size", 6, "--out", out)
-    ended = call(*arguments)
+    arguments = ("encode", few_dots, "--observation", "camera", "--encoder", MEANS, "--allow-code", "--size", 3)
+    ended = call(*arguments, "--out", out)
     assert ended.status == 0
-    assert ended.out.startswith(f"{out}: 6 demonstrations, obs/camera_features: 6 of 128 features, 9")
-    before = contents(out)
-    assert call(*arguments).status == 0
-    assert contents(out) == before
-    other = call(*arguments, "--seed", 1)
-    assert (other.status, contents(out)) == (2, before)
-    assert "is there already and is not this encoding; choose another --out" in other.err
+    assert ended.out.startswith(f"{out}: obs/camera_features: 3 of 4 features, ")
+    before = out.read_bytes()
+    other = call(*arguments, "--out", out)
+    assert (other.status, out.read_bytes()) == (2, before)
+    assert f"{out}: is there already; remove it, or choose another --out" in other.err
+    assert [path.name for path in out.parent.iterdir()] == ["out.hdf5"]
 
 
 # --- what cannot be encoded -------------------------------------------------------------------------------------------
+
+
+OWN = "user_encoders:"
 
 
 @pytest.mark.parametrize(
@@ -237,36 +175,30 @@ def test_the_command(few_dots, out):
     [
         (["--observation", "camra"], "there is no observation 'camra' (did you mean 'camera'?); pictures are: camera"),
         (["--observation", "place"], "obs/place is float64 [8, 2]; pictures are uint8 [steps, height, width"),
-        (["--size", "129"], "--size 129: encoder 'random_conv' gives 128 features; take at most as many"),
-        (["--size", "60"], "--size 60: there are 35 training pictures; take at most as many"),
+        (["--size", "129"], "--size 129: encoder 'user_encoders:means' gives 4 features; take at most as many"),
+        (["--size", "60", "--encoder", PLACES], "--size 60: there are 35 training pictures; take at most as many"),
         (["--as", "place"], "obs/place is there already; choose another name with --as"),
-        (["--encoder", "random"], "there is no encoder 'random' (did you mean 'random_conv'?); take random_conv, "),
-        (["--encoder", f"{OWN}Nothing"], "cannot be imported or made: module 'user_encoders' has no attribute"),
-        (["--encoder", f"{OWN}NotMade"], "cannot be imported or made: no weights"),
-        (["--encoder", f"{OWN}NotCallable"], "cannot be called; it needs __call__(pictures)"),
-        (["--encoder", f"{OWN}Raises"], "fails on pictures [8, 20, 20, 2]: expected 224 x 224 pixels"),
-        (["--encoder", f"{OWN}Integers"], "gives int64; it has to give floats"),
-        (["--encoder", f"{OWN}Flat"], "gives shape (8,) for 8 pictures; it has to be (8, features)"),
-        (["--encoder", f"{OWN}NotFinite"], "gives features that are NaN or infinite"),
-        (["--encoder", f"{OWN}Noisy"], "gives other features when it is called again"),
-        (["--encoder", f"{OWN}Together"], "gives other features of a picture among others than alone"),
+        (["--encoder", "resnet18"], "there is no encoder 'resnet18'; take timm:NAME, such as timm:resnet18.a1_in1k"),
+        (["--encoder", f"{OWN}nothing"], "cannot be loaded: module 'user_encoders' has no attribute"),
+        (["--encoder", "no_such_module:encoder"], "cannot be loaded: No module named 'no_such_module'"),
+        (["--encoder", f"{OWN}not_callable"], "cannot be called; it has to be a function of pictures"),
+        (["--encoder", f"{OWN}raises"], "fails on pictures [8, 20, 20, 2]: expected 224 x 224 pixels"),
+        (["--encoder", f"{OWN}integers"], "gives int64; it has to give floats"),
+        (["--encoder", f"{OWN}flat"], "gives shape (8,) for 8 pictures; it has to be (8, features)"),
+        (["--encoder", f"{OWN}not_finite"], "gives features that are NaN or infinite"),
+        (["--encoder", f"{OWN}noisy"], "gives other features when it is called again"),
+        (["--encoder", f"{OWN}together"], "gives other features of a picture among others than alone"),
     ],
 )
-@pytest.mark.filterwarnings("ignore:divide by zero")
 def test_what_cannot_be_used(few_dots, out, options, message):
-    refused(call("encode", few_dots, "--observation", "camera", "--allow-code", *options, "--out", out), out, message)
-    assert not list(out.parent.iterdir())
+    given = ["--observation", "camera", "--encoder", MEANS, "--allow-code", *options]
+    refused(call("encode", few_dots, *given, "--out", out), out, message)
 
 
-def test_what_was_not_written_here_stays(few_dots, out):
-    out.write_bytes(b"mine")
-    assert call("encode", few_dots, "--observation", "camera", "--out", out).status == 2
-    assert out.read_bytes() == b"mine"
-    out.unlink()
-    (out.parent / "out.hdf5.encoder").mkdir()
-    ended = call("encode", few_dots, "--observation", "camera", "--out", out)
-    assert (ended.status, ended.err.count("\n")) == (2, 1)
-    assert "out.hdf5.encoder: is there already" in ended.err
+def test_timm_is_an_extra(few_dots, out, monkeypatch):
+    monkeypatch.setitem(sys.modules, "timm", None)
+    ended = call("encode", few_dots, "--observation", "camera", "--encoder", "timm:resnet18.a1_in1k", "--out", out)
+    refused(ended, out, "needs timm; install it with: pip install 'ddco-pyro[timm]'")
 
 
 def test_features_that_only_later_pictures_spoil(tmp_path, out):
@@ -274,159 +206,35 @@ def test_features_that_only_later_pictures_spoil(tmp_path, out):
     demos[1].observations["camera"][:] = 255
     demos.write(tmp_path / "bright.hdf5")
     with pytest.raises(BadInput, match="gives features that are NaN or infinite in float32"):
-        encode(tmp_path / "bright.hdf5", out, Encoding("camera", f"{OWN}LaterNotFinite"), allow_code=True)
+        encoded(tmp_path / "bright.hdf5", out, f"{OWN}later_not_finite")
     assert not out.exists()
-    assert not out.with_name("out.hdf5.encoder").exists()
+
+
+def test_features_that_do_not_fit_into_memory(few_dots, out, monkeypatch):
+    monkeypatch.setenv("DDCO_PYRO_MEMORY", "1kB")
+    ended = call("encode", few_dots, "--observation", "camera", "--encoder", MEANS, "--allow-code", "--out", out)
+    refused(ended, out, "take an encoder that gives fewer, or allow more with DDCO_PYRO_MEMORY")
 
 
 def test_user_code_needs_permission(few_dots, out):
-    ended = call("encode", few_dots, "--observation", "camera", "--encoder", f"{OWN}Means", "--out", out)
+    ended = call("encode", few_dots, "--observation", "camera", "--encoder", MEANS, "--out", out)
     refused(ended, out, "would import user code; pass --allow-code")
-    folder = encode(few_dots, out, Encoding("camera", f"{OWN}Means"), allow_code=True).folder
+    encoded(few_dots, out)
     with pytest.raises(BadInput, match="would import user code"):
-        load(folder)
+        load(out)
 
 
 def test_a_damaged_encoder(few_dots, out):
-    folder = encode(few_dots, out, Encoding("camera", size=2)).folder
-    weights = bytearray((folder / "encoder.safetensors").read_bytes())
-    weights[-1] ^= 1
-    (folder / "encoder.safetensors").write_bytes(weights)
-    with pytest.raises(Damaged, match="write it again with ddco-pyro encode"):
-        load(folder)
-    about = json.loads((folder / "encoder.json").read_text())
-    (folder / "encoder.json").write_text(json.dumps(about | {"version": 2}))
-    with pytest.raises(Damaged, match=r"encoder\.json: is damaged"):
-        load(folder)
-    with pytest.raises(BadInput, match="is no encoder"):
-        load(folder.parent)
-
-
-# --- the network of a fit as an encoder -------------------------------------------------------------------------------
-
-
-SEES = {"network": "conv", "filters": 3, "pool": "flatten", "hidden": [5], "activation": "tanh", "standardize": True}
-BRANCHES = {"network": "branches", "of": {"camera": SEES, "place": {"network": "mlp", "hidden": [4]}}, "hidden": [6]}
-SHARED = BRANCHES | {"of": BRANCHES["of"] | {"camera": SEES | {"shared": True}}}
-LSTM = {"network": "lstm", "over": SEES | {"inputs": ["camera"]}, "hidden": [4]}
-CUT = {"crop": [2, 1, 16, 18], "resize": [8, 9]}
-
-
-def flat(policy):
-    return {"baseline": {"kind": "flat", "policy": policy}}
-
-
-def options(trunk, whole=None, **policy):
-    level = {"name": "option", "count": 2, "termination": {"network": "linear"}, "policy": {"network": "linear"}}
-    level |= {"trunk": trunk} if trunk else {}
-    meta_policy = {"network": "linear", "inputs": [] if whole else ["place"]}
-    return {"hierarchy": {"trunk": whole, "levels": [level | policy], "meta_policy": meta_policy}}
-
-
-MODELS = {
-    "a flat policy": (flat(BRANCHES), {}, lambda networks: networks["meta_policy"].of[0]),
-    "cut pictures": (flat(BRANCHES), CUT, lambda networks: networks["meta_policy"].of[0]),
-    "options that share it": (options(SHARED), {}, lambda networks: networks["levels.0.trunk"].of[0]),
-    "read by all": (options(None, BRANCHES), {}, lambda networks: networks["trunk"].of[0]),
-    "under an LSTM": (flat(LSTM), {}, lambda networks: networks["meta_policy"].over),
-    "by itself": (flat(SEES | {"inputs": ["camera"]}), {}, lambda networks: networks["meta_policy"].layers[1]),
-}
-
-
-def fitted(few_dots, folder, model, camera=None):
-    observations = [{"key": "camera", **(camera or {})}, {"key": "place"}]
-    spec = {"demonstrations": {"path": str(few_dots)}, "observations": observations, "training": {"epochs": 1}}
-    return ddco_pyro.fit(parse_spec(spec | model), out=folder)
-
-
-@pytest.fixture(scope="module")
-def branched(few_dots, tmp_path_factory):
-    """The folder of a run whose flat policy has a branch for pictures; nobody changes it."""
-    return fitted(few_dots, tmp_path_factory.mktemp("runs") / "run", flat(BRANCHES)).folder
-
-
-def within(fit, network, demo):
-    """What the last hidden layer of a network of the fit gives at each step of a demonstration."""
-    given = []
-    handle = network.register_forward_hook(
-        lambda _, __, output: given.append(output[0] if isinstance(output, tuple) else output)
-    )
-    with torch.no_grad():
-        fit.hierarchy(fit.hierarchy.encoder.inputs([demo.observations]).loaded())
-    handle.remove()
-    return torch.cat([part.reshape(-1, part.shape[-1]) for part in given]).numpy()
-
-
-@pytest.mark.parametrize("name", MODELS)
-def test_features_are_those_of_the_fit(few_dots, tmp_path, name):
-    model, camera, network = MODELS[name]
-    run, out = tmp_path / "run", tmp_path / "out.hdf5"
-    fit = fitted(few_dots, run, model, camera)
-    folder = encode(few_dots, out, Encoding("camera", str(run))).folder
-    shutil.rmtree(run)  # the encoder holds what it needs
-    demos, encoder = Demonstrations.read(few_dots), load(folder)
-    for before, after in zip(demos, Demonstrations.read(out), strict=True):
-        expected = within(fit, network(fit.hierarchy.networks()), before)
-        features = after.observations["camera_features"]
-        np.testing.assert_allclose(features, expected, rtol=1e-4, atol=1e-6)
-        np.testing.assert_allclose([encoder(one) for one in before.observations["camera"]], features, atol=1e-5)
-    assert np.ptp(together(Demonstrations.read(out), "camera_features"), axis=0).max() > 0.01
-
-
-def test_an_encoder_that_names_user_code_is_damaged(few_dots, branched, tmp_path):
-    about = encode(few_dots, tmp_path / "out.hdf5", Encoding("camera", str(branched))).folder / "encoder.json"
-    said = json.loads(about.read_text())
-    said["reader"]["network"] = {"network": "user_networks:Stateful", "inputs": ["camera"]}
-    about.write_text(json.dumps(said))
-    with pytest.raises(Damaged, match="has to be convolutions over one observation"):
-        load(about.parent)
-
-
-def test_another_fit_is_another_encoding(few_dots, branched, tmp_path):
-    out, run = tmp_path / "out.hdf5", shutil.copytree(branched, tmp_path / "run")
-    arguments = ("encode", few_dots, "--observation", "camera", "--encoder", run, "--out", out)
-    assert call(*arguments).out.startswith(f"{out}: 6 demonstrations, obs/camera_features: 5 of 5 features")
-    assert call(*arguments).status == 0
-    shutil.rmtree(run)
-    fitted(few_dots, run, flat(BRANCHES | {"hidden": [7]}))
-    again = call(*arguments)
-    assert (again.status, "is not this encoding" in again.err) == (2, True)
-
-
-ALONE = {"network": "mlp", "hidden": [4], "inputs": ["place"]}
-
-
-@pytest.mark.parametrize(
-    ("model", "camera", "message"),
-    [
-        (flat(ALONE), {}, "its lowest policy has no convolutions that read camera alone; make them a branch"),
-        (options(BRANCHES), {}, "each option has a network of its own for camera; take a flat policy"),
-        (flat(BRANCHES), {"frames": 2}, "this fit sees 2 pictures at once; take one with frames: 1"),
-    ],
-)
-def test_fits_that_have_no_encoder(few_dots, tmp_path, model, camera, message):
-    out, run = tmp_path / "out.hdf5", tmp_path / "run"
-    fitted(few_dots, run, model, camera)
-    ended = call("encode", few_dots, "--observation", "camera", "--encoder", run, "--out", out)
-    refused(ended, out, f"{run}: {message}")
-
-
-def test_pictures_that_the_fit_does_not_know(few_dots, branched, tmp_path):
-    out, run = tmp_path / "out.hdf5", shutil.copytree(branched, tmp_path / "run")
-    other = call("encode", few_dots, "--observation", "other", "--encoder", run, "--out", out)
-    refused(other, out, f"{run}: this fit observes no pictures 'other'; the pictures it observes: camera")
-    with h5py.File(few_dots) as source, h5py.File(tmp_path / "cut.hdf5", "w") as file:
-        source.copy("data", file)
-        for demo in file["data"].values():
-            instead(demo, "obs/camera", demo["obs/camera"][:, 1:])
-    cut = call("encode", tmp_path / "cut.hdf5", "--observation", "camera", "--encoder", run, "--out", out)
-    refused(cut, out, f"{run}: this fit observed camera of (20, 20, 2), and these are (19, 20, 2)")
-    (run / "model.safetensors").unlink()
-    unfinished = call("encode", few_dots, "--observation", "camera", "--encoder", run, "--out", out)
-    refused(unfinished, out, "an unfinished run")
+    encoded(few_dots, out)
+    with h5py.File(out, "r+") as file:
+        file["encoders/camera_features"].attrs["about"] = "{}"
+    with pytest.raises(BadInput, match=r"out\.hdf5: /encoders/camera_features is damaged .* encode the file again"):
+        load(out, allow_code=True)
+    with pytest.raises(BadInput, match="there is no encoder of one observation alone; there is: none"):
+        load(few_dots)
 
 
 def refused(ended, out, message):
     assert (ended.status, ended.err.count("\n")) == (2, 1)
     assert message in ended.err
-    assert not [path for path in out.parent.iterdir() if "out" in path.name]
+    assert not list(out.parent.iterdir())

@@ -63,7 +63,7 @@ COMMANDS = {
     "fit": Command("fit toy.yaml --out", "toy.yaml", folder=True),
     "collect": Command("collect toy.yaml --out", "toy.yaml"),
     "init": Command("init demos.hdf5 --force --out", "demos.hdf5"),
-    "encode": Command("encode demos.hdf5 --observation camera --out", "demos.hdf5"),
+    "encode": Command("encode demos.hdf5 --observation camera --encoder timm:resnet18.a1_in1k --out", "demos.hdf5"),
     "import": Command("import demos.hdf5 --out", "demos.hdf5"),
 }
 

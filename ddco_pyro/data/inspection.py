@@ -42,7 +42,7 @@ from ddco_pyro.data.controls import (
     same,
 )
 from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError, outside_files
-from ddco_pyro.data.pictures import MOVED, blocks
+from ddco_pyro.data.pictures import blocks
 from ddco_pyro.data.sources import Column, Source, open_source
 from ddco_pyro.data.sources.metadata import rate
 from ddco_pyro.data.sources.recording import UNKNOWN, label_names
@@ -242,16 +242,6 @@ class Inspection:
     def actions(self) -> Field | None:
         """The control."""
         return self.fields.get("actions")
-
-    @property
-    def versions(self) -> dict[str, str]:
-        """Key of each vector that has versions from shifted pictures, and the key of these versions."""
-        pairs = ((field, self.fields.get(f"obs/{field.key}{MOVED}")) for field in self.observations)
-        return {
-            field.key: other.key
-            for field, other in pairs
-            if other and other.shape[1:] == field.shape and not other.affected and self.everywhere(other)
-        }
 
     def everywhere(self, array: Field) -> bool:
         """Whether every demonstration has this array."""

@@ -213,12 +213,6 @@ class Parts:
         self._parts |= {recording.name: part for recording in self._open}
         self._open, self._bytes = [], 0
 
-    @contextmanager
-    def column(self, name: str, place: str) -> Iterator[Column]:
-        """An array of a safe demonstration, such as ``obs/camera``."""
-        with opened(self._parts[name]) as file:
-            yield of_dataset(file[f"{name}/{place}"], f"{name}: {place}")
-
     def attributes(self) -> list[dict[str, Attribute]]:
         """The attributes of every safe demonstration."""
         attributes = []
