@@ -21,7 +21,6 @@ from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.report import write_report
 from ddco_pyro.simulation import collect as collecting
 from ddco_pyro.simulation.cameras import Encoded
-from ddco_pyro.simulation.environments import TaskEnvironment
 from ddco_pyro.simulation.episodes import play, run_episode
 from ddco_pyro.spec import DemonstrationsSpec, RolloutSpec, parse_spec
 from ddco_pyro.training.data import dimensions
@@ -138,12 +137,3 @@ def test_a_spec_with_a_camera_is_checked_fitted_and_rolled_out(tmp_path):
         watched, Controller.from_spec(fit.hierarchy, RolloutSpec()), range(1000, 1002), fit.hierarchy.encoder.shapes
     )
     assert [one.outcome["success"] for one in alone].count(1.0) == measured.successes
-
-
-def test_a_gymnasium_environment_has_the_cameras_it_is_asked_for():
-    environment = TaskEnvironment(TASK, observed=["camera"])
-    assert environment.observation_space["camera"].shape == (48, 65, 3)
-    seen, _ = environment.reset(seed=1)
-    assert environment.observation_space.contains({key: np.asarray(value) for key, value in seen.items()})
-    assert "camera" not in TaskEnvironment(TASK).reset(seed=1)[0]
-    environment.close()
