@@ -43,10 +43,6 @@ def _act(path: Path, names: Collection[str]) -> bool:
     )
 
 
-def _d4rl(path: Path, names: Collection[str]) -> bool:
-    return {"actions", "observations"} <= {*names} and bool({"terminals", "timeouts"} & {*names})
-
-
 FORMATS = {
     "lerobot": Format(
         "lerobot:open_lerobot",
@@ -73,7 +69,6 @@ FORMATS = {
         "an HDF5 file of ManiSkill",
     ),
     "act": Format("hdf5_layouts:Act", _act, "the folder of ACT's episodes", "episode_0.hdf5"),
-    "d4rl": Format("hdf5_layouts:D4RL", _d4rl, "an HDF5 file of D4RL"),
     "jigsaws": Format(
         "jigsaws:Jigsaws",
         lambda path, names: (path / "kinematics" / "AllGestures").is_dir(),

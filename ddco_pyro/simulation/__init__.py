@@ -1,1 +1,1 @@
-"""Tasks in simulation: their interface, episodes, collection of demonstrations, videos, Gymnasium environments as tasks."""
+"""Tasks in simulation: their interface, episodes, collection of demonstrations, videos, Gymnasium."""
