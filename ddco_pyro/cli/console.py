@@ -344,7 +344,6 @@ def inspection(facts: Inspection) -> None:
         f"{facts.path}: {facts.format}, {len(facts.lengths)} demonstrations of {lengths}",
         f"control frequency: {f'{facts.frequency:g} Hz' if facts.frequency else UNKNOWN_FREQUENCY}",
         *(f"mask/{name}: {len(names)} demonstrations" for name, names in facts.masks.items()),
-        *(f"names another file as a part of it: {path}" for path in facts.external),
     ]
     for line in lines:
         say(printable(line))

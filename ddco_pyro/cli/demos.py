@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ddco_pyro.cli import AllowCode, AllowExternal, Overrides, SpecPath, hint, out_file, written
+from ddco_pyro.cli import AllowCode, Overrides, SpecPath, hint, out_file, written
 from ddco_pyro.data.files import Output, check_outputs, write_text
 from ddco_pyro.data.formats import FORMATS
 from ddco_pyro.errors import BadInput, Failed, command
@@ -212,7 +212,6 @@ def import_(
     skip_broken: Annotated[
         bool, typer.Option("--skip-broken", help="Leave out demonstrations that cannot be used, and list them.")
     ] = False,
-    allow_external: AllowExternal = False,
 ) -> None:
     """Write demonstrations of another format into this project's layout; an interrupted import is continued.
 
@@ -226,7 +225,7 @@ def import_(
         raise BadInput("--fps says how long the steps of --labels are; give both, or --hz for another rate")
     check_outputs([Output("--out", out, "file")], [source, *([labels] if labels else [])])
     size = (image_size, image_size) if image_size else None
-    choice = Choice(tuple(observations), mask, videos, size, hz, skip_broken, allow_external, tuple(actions))
+    choice = Choice(tuple(observations), mask, videos, size, hz, skip_broken, tuple(actions))
     given: list[Labelled] = []
 
     def seen_as(source: Source) -> Source:

@@ -36,7 +36,6 @@ class Choice:
     :param hz: the rate to import at, Hz; None for that of the source. Numbers are means over the source's frames; a
         picture, a label and a discrete action are those of one frame.
     :param skip_broken: whether unusable demonstrations are left out rather than refused.
-    :param allow_external: whether parts of an HDF5 file may be in other files.
     :param actions: names in the source of the arrays that are the control together; if empty, the usual ones.
     """
 
@@ -46,7 +45,6 @@ class Choice:
     image_size: tuple[int, int] | None = None
     hz: float | None = None
     skip_broken: bool = False
-    allow_external: bool = False
     actions: tuple[str, ...] = ()
 
 
@@ -81,7 +79,7 @@ def import_demonstrations(
     :raises DemonstrationsError: the source cannot be read, or a demonstration cannot be used.
     :raises BadInput: ``out`` exists and is not this import, or another process is writing it.
     """
-    with open_source(source, form, choice.allow_external, choice.actions) as whole:
+    with open_source(source, form, choice.actions) as whole:
         opened_source = seen_as(whole)
         identity = _identity(opened_source, choice)
         if out.exists():

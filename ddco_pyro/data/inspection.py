@@ -10,7 +10,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 
 from ddco_pyro.data.checks import (
@@ -41,7 +40,7 @@ from ddco_pyro.data.controls import (
     number,
     same,
 )
-from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError, outside_files
+from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError
 from ddco_pyro.data.pictures import blocks
 from ddco_pyro.data.sources import Column, Source, open_source
 from ddco_pyro.data.sources.metadata import rate
@@ -184,7 +183,6 @@ class Inspection:
     :param leaks: observations, ``obs/<key>``, that hold nothing but controls still to be predicted.
     :param excluded: names of demonstrations that were skipped.
     :param unreadable: names of demonstrations that could not be read.
-    :param external: other files that the HDF5 file names as parts of itself; they are not read.
     :param turns: the angles in radians and the first numbers of quaternions that jump, by place of the array.
     :param odd: names of demonstrations that are dead or padded and change the model of all, and why.
     :param attributes: of each demonstration by its name.
@@ -202,7 +200,6 @@ class Inspection:
     leaks: tuple[str, ...] = ()
     excluded: tuple[str, ...] = ()
     unreadable: tuple[str, ...] = ()
-    external: tuple[str, ...] = ()
     odd: Mapping[str, str] = field(default_factory=dict)
     turns: Mapping[str, tuple[tuple[int, ...], tuple[int, ...]]] = field(default_factory=dict)
     attributes: Mapping[str, Mapping[str, Attribute]] = field(default_factory=dict)
@@ -257,7 +254,6 @@ class Inspection:
             "masks": {name: list(names) for name, names in self.masks.items()},
             "fields": [array.as_json() for array in self.fields.values()],
             "control_dimensions": [dimension.as_data() for dimension in self.control],
-            "external": list(self.external),
             "odd": dict(self.odd),
             "notes": self.notes,
             "problems": self.problems,
@@ -379,7 +375,6 @@ class _Inspector:
             messages[0] if len(messages) == 1 else f"{messages[0]}; the first of {len(messages)} such"
             for messages in self.problems.values()
         )
-        external = {name for file in source.files if h5py.is_hdf5(file) for name in outside_files(file)}
         return Inspection(
             path=path,
             format=source.format,
@@ -394,7 +389,6 @@ class _Inspector:
             leaks=tuple(p for p, array in fields.items() if self.coincidences.leaks(p, varying, array.constant)),
             excluded=exclude,
             unreadable=tuple(unreadable),
-            external=tuple(sorted(external)),
             odd=self._odd(dimensions),
             attributes=self.attributes,
         )

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ddco_pyro.data.checks import check, check_trained, reading, with_values
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError, extent
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError, bytes_of_a_fit
 from ddco_pyro.data.memory import refuse_too_much
 from ddco_pyro.data.sources.recording import Recording
 from ddco_pyro.data.sources.robomimic import open_robomimic
@@ -210,4 +210,4 @@ def _refuse_what_cannot_be_read(spec: Spec, path: Path) -> None:
         raise DemonstrationsError(f"demonstrations.path: {path}: there is no such file; {_needed(spec)}")
     remedy = "leave observations out, or make its demonstrations fewer, shorter or equally long"
     what = f"{path}: a fit to {', '.join(spec.observed)}"
-    refuse_too_much(extent(path, spec.observed, spec.demonstrations.exclude).fitting, what, remedy)
+    refuse_too_much(bytes_of_a_fit(path, spec.observed, spec.demonstrations.exclude), what, remedy)

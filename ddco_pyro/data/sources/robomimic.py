@@ -45,14 +45,13 @@ class Robomimic:
 
     format = "robomimic"
 
-    def __init__(self, path: Path, file: h5py.File, external: bool = False) -> None:
-        self._external = external
-        self._data = member(file, "data", h5py.Group, "", external)
+    def __init__(self, path: Path, file: h5py.File) -> None:
+        self._data = member(file, "data", h5py.Group, "")
         self.files = (path,)
         self.names = tuple(sorted((name for name in self._data if _may_be_group(self._data, name)), key=natural))
         if not self.names:
             raise DemonstrationsError("the group 'data' holds no demonstrations; at least one is needed")
-        masks = member(file, "mask", h5py.Group, "", external) if named(file, "mask") else {}
+        masks = member(file, "mask", h5py.Group, "") if named(file, "mask") else {}
         self.masks: Mapping[str, tuple[str, ...]] = {name: self._mask(masks, name) for name in masks}
         known = attributes_of(self._data) | attributes_of(file)
         self.attributes: Mapping[str, Attribute] = {name: known[name] for name in known if name != ALL_STEPS}
@@ -61,7 +60,7 @@ class Robomimic:
     def _first(self) -> Mapping[str, Attribute]:
         """The attributes of the first demonstration; none where it cannot be read."""
         try:
-            return attributes_of(member(self._data, self.names[0], h5py.Group, "", self._external))
+            return attributes_of(member(self._data, self.names[0], h5py.Group, ""))
         except DemonstrationsError:
             return {}
 
@@ -72,9 +71,9 @@ class Robomimic:
 
         :param observations: keys to open; all if None.
         :param labels: names to open; all if None, and then none are required.
-        :raises DemonstrationsError: a part is missing, is in another file, or claims more than is stored.
+        :raises DemonstrationsError: a part is missing, is elsewhere, or claims more than is stored.
         """
-        group = member(self._data, name, h5py.Group, "", self._external)
+        group = member(self._data, name, h5py.Group, "")
         actions = self._column(group, "", "actions", name)
         attributes = attributes_of(group)
         claimed = attributes.pop(STEPS, actions.shape[0])
@@ -88,16 +87,16 @@ class Robomimic:
     def _columns(self, group: h5py.Group, folder: str, keys: Sequence[str] | None, name: str) -> dict[str, Column]:
         if keys is not None and not keys:
             return {}
-        members = member(group, folder, h5py.Group, f"{name}: ", self._external)
-        known = datasets(members, f"{name}: {folder}/", self._external) if keys is None else keys
+        members = member(group, folder, h5py.Group, f"{name}: ")
+        known = datasets(members, f"{name}: {folder}/") if keys is None else keys
         return {key: self._column(members, f"{folder}/", key, name) for key in known}
 
     def _column(self, group: h5py.Group, folder: str, key: str, name: str) -> Column:
-        dataset = dataset_at(group, key, f"{name}: {folder}", self._external)
+        dataset = dataset_at(group, key, f"{name}: {folder}")
         return of_dataset(dataset, f"{name}: {folder}{key}")
 
     def _mask(self, masks: h5py.Group, mask: str) -> tuple[str, ...]:
-        dataset = dataset_at(masks, mask, "mask/", self._external)
+        dataset = dataset_at(masks, mask, "mask/")
         names = of_dataset(dataset, f"mask/{mask}").array().ravel().tolist()
         return tuple(name.decode(errors="replace") if isinstance(name, bytes) else str(name) for name in names)
 
@@ -112,14 +111,13 @@ def _may_be_group(data: h5py.Group, name: str) -> bool:
 
 
 @contextmanager
-def open_robomimic(path: Path, external: bool = False) -> Iterator[Robomimic]:
+def open_robomimic(path: Path) -> Iterator[Robomimic]:
     """Open a file.
 
-    :param external: whether parts of the file may be in other files.
     :raises DemonstrationsError: the file cannot be read, or holds no demonstrations.
     """
     with opened(path) as file:
-        yield Robomimic(path, file, external)
+        yield Robomimic(path, file)
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------
