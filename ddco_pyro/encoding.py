@@ -6,7 +6,7 @@ import hashlib
 import importlib
 import math
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from pkgutil import resolve_name
@@ -76,21 +76,12 @@ class Backbone:
             )
         try:
             self._call: Any = _pretrained(rest) if module == TIMM else resolve_name(name)
-        except ModuleNotFoundError as error:
-            if module == TIMM and error.name == TIMM:
-                raise BadInput(
-                    f"encoder {name!r} needs timm; install it with: pip install 'ddco-pyro[timm]'"
-                ) from error
-            raise self._unusable(error) from error
         except Exception as error:  # whatever the network's code raises
-            raise self._unusable(error) from error
+            timm = "; check the name, the connection, and: pip install 'ddco-pyro[timm]' (torchvision has to fit torch)"
+            remedy = timm if module == TIMM else ""
+            raise BadInput(f"encoder {name!r} cannot be loaded: {_message(error)}{remedy}") from error
         if not callable(self._call):
             raise BadInput(f"encoder {name!r}: cannot be called; it has to be a function of pictures")
-
-    def _unusable(self, error: Exception) -> BadInput:
-        timm = "; check the name, the connection, and that torchvision is built for this torch"
-        remedy = timm if self.name.startswith(f"{TIMM}:") else ""
-        return BadInput(f"encoder {self.name!r} cannot be loaded: {_message(error)}{remedy}")
 
     @property
     def code(self) -> bytes:
@@ -171,21 +162,17 @@ class Projection:
         return ((features - self.mean) @ self.components.T).astype(np.float32)
 
 
-def principal_components(blocks: Iterable[np.ndarray], size: int, least: float = 0.0) -> Projection:
-    """The ``size`` principal components of rows, from one pass over blocks [M, F] of at least ``size`` rows in all.
+def principal_components(blocks: Sequence[np.ndarray], size: int, least: float = 0.0) -> Projection:
+    """The ``size`` principal components of the rows of blocks [M, F], at least ``size`` in all.
 
     The entry of each component that is largest in magnitude is positive.
 
     :param least: components with a smaller share of the first one's variance are left out.
     """
-    number, total, products, origin = 0, np.zeros(0), np.zeros((0, 0)), np.zeros(0)
+    origin = blocks[0][0].astype(np.float64)  # near the mean, so that subtracting that loses little
+    number, total, products = sum(map(len, blocks)), np.zeros(len(origin)), np.zeros((len(origin), len(origin)))
     for block in blocks:
-        if not number:
-            features = block.shape[1]
-            origin = block[0].astype(np.float64)  # near the mean, so that subtracting that loses little
-            total, products = np.zeros(features), np.zeros((features, features))
         rows = block - origin
-        number += len(rows)
         total += rows.sum(0)
         products += rows.T @ rows
     offset = total / number
@@ -317,30 +304,30 @@ def encode(
         training = _checked(source, recordings, observation)
         if key in recordings[source.names[0]].observations:
             raise DemonstrationsError(f"obs/{key} is there already; choose another name with --as")
-        backbone = Backbone(encoder, allow_code)
         pictures = {own: recording.observations[observation] for own, recording in recordings.items()}
+        backbone = Backbone(encoder, allow_code)
         number = backbone.try_out(next(_batches(pictures[training[0]])))
         steps = sum(pictures[own].shape[0] for own in training)
-        for limit, what in ((number, f"encoder {encoder!r} gives {number} features"),
-                            (steps, f"there are {steps} training pictures")):  # fmt: skip
-            if size is not None and size > limit:
-                raise BadInput(f"--size {size}: {what}; take at most as many")
+        if size is not None and size > number:
+            raise BadInput(f"--size {size}: encoder {encoder!r} gives {number} features; take at most as many")
+        if size is not None and size > steps:
+            raise BadInput(f"--size {size}: there are {steps} training pictures; take at most as many")
         every = sum(column.shape[0] for column in pictures.values())
-        refuse_too_much(4 * number * every + 4 * 8 * number**2, f"{number} features of {every} pictures",
-                        "take an encoder that gives fewer")  # fmt: skip
+        what = f"{number} features of {every} pictures"
+        refuse_too_much(4 * number * every + 4 * 8 * number**2, what, "take an encoder that gives fewer")
         features = dict[str, np.ndarray]()
         for own, column in pictures.items():
             features[own] = np.concatenate([backbone(batch) for batch in _batches(column)])
-            if features[own].shape[1] != number:
+            if (there := features[own].shape[1]) != number:
                 raise BadInput(
-                    f"encoder {encoder!r} gives {features[own].shape[1]} features in {own}, and {number} in "
-                    f"{training[0]}; it has to give as many of every picture"
+                    f"encoder {encoder!r} gives {there} features in {own}, and {number} in {training[0]}; it has to "
+                    "give as many of every picture"
                 )
             on_event(DemonstrationsDone(len(features), len(pictures)))
         projection = None
         if size is not None or number > min(SIZE, steps):
             with one_thread():  # same bits
-                rows = (features[own] for own in training)
+                rows = [features[own] for own in training]
                 projection = principal_components(rows, size or min(SIZE, steps), NOISE if size is None else 0.0)
         about = About(
             encoder=encoder,
@@ -362,7 +349,7 @@ def encode(
     return made
 
 
-def _checked(source: Robomimic, recordings: dict[str, Recording], key: str) -> tuple[str, ...]:
+def _checked(source: Robomimic, recordings: Mapping[str, Recording], key: str) -> tuple[str, ...]:
     """The names of the training demonstrations.
 
     :raises DemonstrationsError: the observation is missing or no picture, or the demonstrations are refused or differ.

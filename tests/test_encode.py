@@ -198,7 +198,7 @@ def test_what_cannot_be_used(few_dots, out, options, message):
 def test_timm_is_an_extra(few_dots, out, monkeypatch):
     monkeypatch.setitem(sys.modules, "timm", None)
     ended = call("encode", few_dots, "--observation", "camera", "--encoder", "timm:resnet18.a1_in1k", "--out", out)
-    refused(ended, out, "needs timm; install it with: pip install 'ddco-pyro[timm]'")
+    refused(ended, out, "pip install 'ddco-pyro[timm]'")
 
 
 def test_features_that_only_later_pictures_spoil(tmp_path, out):

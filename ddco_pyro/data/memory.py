@@ -53,7 +53,7 @@ def needed(demonstrations: Iterable[Mapping[str, Array]], copies: float = COPIES
     number, longest, size, features = 0, 0, 0, 0
     for arrays in demonstrations:
         number, numbers = number + 1, 0
-        longest = max(longest, *arrays["actions"].shape[:1])
+        longest = max(longest, *arrays["actions"].shape[:1], 0)
         for place, array in arrays.items():
             plain = array.dtype == np.uint8
             if getattr(array, "kept", None) is None:
