@@ -28,7 +28,7 @@ from ddco_pyro.data.inspection import inspect
 from ddco_pyro.data.sources.video import _frames
 from ddco_pyro.errors import BadInput
 
-ROBOMIMIC, LEROBOT = Path(__file__).parent / "fixtures" / "robomimic.hdf5", odd.FIXTURE
+ROBOMIMIC, LEROBOT = Path(__file__).parents[1] / "fixtures" / "robomimic.hdf5", odd.FIXTURE
 
 
 @pytest.fixture
