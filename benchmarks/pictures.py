@@ -1,4 +1,4 @@
-"""Parts of the benchmark about pictures: reading, encoding, training on them, in chunks of time.
+"""Parts of the benchmark about pictures: reading, training on them, in chunks of time.
 
 Reading goes on in other processes and is compared by the clock; the rest by the time of this process's processor, which
 other work on the machine changes little.
@@ -22,8 +22,6 @@ from torch.utils.data import DataLoader, Dataset
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.pictures import Job, Readers, Transform
-from ddco_pyro.encoding import Encoding, encode
-from ddco_pyro.encoding.autoencoder import Convolutions
 from ddco_pyro.events import EpochEnded, Event
 from ddco_pyro.inference import log_likelihood
 from ddco_pyro.model import hierarchy as networks
@@ -117,26 +115,6 @@ def reading() -> Iterator[Row]:
 def _job(demo: Demonstration, number: int) -> Job:
     pictures = {"camera": (demo.observations["camera"],)}
     return Job((number,), pictures, slice(0, len(demo)), {"camera": Transform()}, {})
-
-
-def encoding() -> Iterator[Row]:
-    """``ddco-pyro encode`` on a file, over its network alone on the same frames in memory."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "demos.hdf5"
-        made(NUMBER, STEPS).write(path)
-        network = Convolutions("random_conv", SIZE, 0)
-        frames = [np.asarray(demo.observations["camera"]) for demo in Demonstrations.read(path)]
-
-        def alone() -> None:
-            with one_thread():
-                for block in frames:
-                    network.encode(block)
-
-        def whole() -> None:
-            with tempfile.TemporaryDirectory() as out:
-                encode(path, Path(out) / "out.hdf5", Encoding("camera"))
-
-        yield side_by_side(("encode", "its network in memory"), whole, alone, ROUNDS)
 
 
 def training() -> Iterator[Row]:
@@ -236,4 +214,4 @@ def chunks() -> Iterator[Row]:
         yield side_by_side((f"gradient of {name} in chunks", "in one piece"), *calls, ROUNDS)
 
 
-PARTS = {"reading": reading, "encoding": encoding, "pictures": training, "chunks": chunks}
+PARTS = {"reading": reading, "pictures": training, "chunks": chunks}

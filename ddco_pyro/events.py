@@ -46,14 +46,6 @@ class EpochEnded(Event):
 
 
 @dataclass(frozen=True)
-class UpdatesDone(Event):
-    """``done`` gradient steps are done; ``loss`` is the mean over the latest steps."""
-
-    done: int
-    loss: float
-
-
-@dataclass(frozen=True)
 class RestartStopped(Event):
     """A restart far behind the likeliest was stopped after ``epochs`` epochs of its last stage."""
 

@@ -1,8 +1,7 @@
-"""Pushing from pictures (paper §5.1, SM 1.2, SM 1.5): goals against demonstrations, the same over the features of a
-flat policy (``encoded``), of pictures as the camera has them beside small ones (``large``), against options, and
-augmentation.
+"""Pushing from pictures (paper §5.1, SM 1.2, SM 1.5): goals against demonstrations, the same of pictures as the
+camera has them beside small ones (``large``), against options, and augmentation.
 
-    python studies/pushing_pictures.py demonstrations|encoded|large|options|augmentation [--seeds 3]
+    python studies/pushing_pictures.py demonstrations|large|options|augmentation [--seeds 3]
         [--methods ff ff_flat ...] [--counts 80 40 20 10] [--options 1 2 4] [--updates 4000] [--episodes 5]
         [--set KEY=VALUE]... [--summarize] [--jobs 1] [--runs DIR]
 
@@ -32,15 +31,13 @@ from study import Cell, Row, Settings, described
 
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.data.pictures import MOVED, Transform, shifted
-from ddco_pyro.encoding.fitted import FittedReader, from_fit
+from ddco_pyro.data.pictures import Transform
 from ddco_pyro.errors import BadInput
 from ddco_pyro.fitting.fitted import Fit
-from ddco_pyro.simulation.cameras import Camera, Encoded
+from ddco_pyro.simulation.cameras import Camera
 from ddco_pyro.simulation.episodes import play, run_episode
 from ddco_pyro.simulation.task import Task
 from ddco_pyro.spec import Spec, load_spec, with_overrides
-from ddco_pyro.study.cells import work_of
 from ddco_pyro.training.devices import device_of
 from ddco_pyro.training.networks import Dimensions, baseline_spec, parameters
 from ddco_pyro.training.restarts import Trainer, train_model
@@ -53,28 +50,13 @@ METHODS = {
     **dict.fromkeys(("ff", "ff_flat", "ff_two", "ff_two_flat", "ff_large", "ff_large_flat"), "pushing_image_ff"),
     **dict.fromkeys(("rnn", "rnn_flat"), "pushing_image_rnn"),
     **{"ff_hybrid": "pushing_image_ff_hybrid", "rnn_hybrid": "pushing_image_rnn_hybrid"},
-    **dict.fromkeys(("encoded", "encoded_flat"), "pushing_mlp"),
 }
 """The spec of each method. ``_flat``: as many parameters as the hierarchy beside it has with the options of its spec;
-``ff_two``: of two pictures side by side instead of one; ``ff_large``: of pictures as the camera has them; ``encoded``:
-perceptrons over what the convolutions of ``ff_flat``, fitted to the same demonstrations, give of a picture, or in
-training of one that is moved."""
-
-ENCODED = (
-    "observations=[{key: camera_features, augment: {versions: camera_features_moved}}]",
-    "control.std=0.35",
-    "training.optimizer={name: adam, lr: 1.0e-3, schedule: cosine}",
-    "training.batch_size=16",
-)
-"""What is changed in ``pushing_mlp.yaml`` to read features. Of σ of 1, 0.5, 0.35 and 0.25 this one is the likeliest
-on the held-out demonstrations of a development seed, for options and flat policy alike."""
+``ff_two``: of two pictures side by side instead of one; ``ff_large``: of pictures as the camera has them."""
 
 REDUCING = [{"filters": 16, "kernel": 5, "stride": 5}, {"filters": 16, "kernel": 5, "stride": 2, "padding": 2}]
 """Two convolutions before those of the spec, by which pictures of ``LARGE`` have maps of ``SIZE``: a network of
 ``ff_large`` learns to reduce its pictures."""
-
-VERSIONS = 24
-"""How many versions of the features of each demonstration there are, of pictures moved as ``ff_flat`` sees them."""
 
 DEVELOPMENT = 7
 """The first training seed by which nothing but settings is chosen."""
@@ -104,10 +86,6 @@ class PictureCell(Cell):
         device_of(spec_of(self, settings).training)  # what is wrong is said before anything is drawn
         own, tasks = settings.values, (watched(pushing.task, self.camera), watched(pushing.limited, self.camera))
         demos, test = self.demonstrations(settings), held_out(settings.runs, self.seed, self.camera)
-        if self.method.startswith("encoded"):
-            reader = self._reader(settings)
-            demos, test = encoded(reader, demos, VERSIONS, self.seed), encoded(reader, test)
-            tasks = tuple(_seen_through(reader, task) for task in tasks)
         begun, before = time.perf_counter(), time.process_time()
         spec, trained = self.fitted(settings, demos, folder)
         fitted, cpu = time.perf_counter(), time.process_time() - before
@@ -161,23 +139,14 @@ class PictureCell(Cell):
         spec = spec if self.options else baseline_spec(spec, spec.compare_with[-1], size)
         return spec, train_model(spec, size, demos, checkpoints=folder)
 
-    def _reader(self, settings: Settings) -> FittedReader:
-        """The convolutions of the flat policy of the same demonstrations, which is fitted as its own cell has it."""
-        flat, plain = PictureCell("ff_flat", 0, self.count, self.seed), replace(settings, overrides=())
-        spec, trained = flat.fitted(plain, flat.demonstrations(plain), work_of(flat.path(plain)) / "fit")
-        return from_fit(Fit(spec, trained.hierarchy), "camera", (*SIZE, 3))
-
 
 def spec_of(cell: PictureCell, settings: Settings) -> Spec:
     """The spec of a cell, whose pictures are small already."""
-    features = cell.method.startswith("encoded")
     changed: dict[str, Any] = {"seed": cell.seed, "demonstrations.count": cell.count}
     if cell.options:
         changed["hierarchy.levels.0.count"] = cell.options
-    if not features:
-        changed |= {"observations.0.resize": None, "observations.0.frames": 2 if "_two" in cell.method else 1}
-    always = ("training.device=auto", *(ENCODED if features else ()))
-    base = load_spec(SPECS / f"{METHODS[cell.method]}.yaml", [*always, *settings.overrides])
+    changed |= {"observations.0.resize": None, "observations.0.frames": 2 if "_two" in cell.method else 1}
+    base = load_spec(SPECS / f"{METHODS[cell.method]}.yaml", ["training.device=auto", *settings.overrides])
     if cell.method.startswith("ff_large"):
         changed |= _large(base)
     spec = with_overrides(base, changed)
@@ -238,27 +207,6 @@ def drawn(camera: Camera, first: int, count: int) -> Demonstrations:
     return Demonstrations(tuple(one.record for one in episodes))
 
 
-def encoded(reader: FittedReader, demos: Demonstrations, versions: int = 0, seed: int = 0) -> Demonstrations:
-    """Features in the place of the pictures, and so many versions of them, each of pictures that are moved alike."""
-    shift = load_spec(SPECS / "pushing_image_ff.yaml").observations[0].augment.shift
-    moves = np.random.default_rng(seed).integers(-shift, shift + 1, (len(demos), versions, 2)).tolist()
-    copies = []
-    for demo, own in zip(demos, moves, strict=True):
-        pictures = np.asarray(demo.observations["camera"])
-        seen = {"camera_features": reader.encode(pictures)}
-        if own:
-            each = [reader.encode(shifted(pictures, *by)) for by in own]
-            seen[f"camera_features{MOVED}"] = np.stack(each, axis=1)
-        copies.append(replace(demo, observations=seen))
-    return replace(demos, demonstrations=tuple(copies))
-
-
-def _seen_through(reader: FittedReader, task: Task) -> Task:
-    """The same task, whose pictures are encoded."""
-    seen = Encoded(CAMERA, lambda picture: reader.encode(picture[None])[0], reader.features)
-    return replace(task, cameras={"camera_features": seen})
-
-
 def _in_memory(demo: Demonstration) -> Demonstration:
     """So small that it need not be read from the file in each epoch."""
     return replace(demo, observations={key: np.asarray(values) for key, values in demo.observations.items()})
@@ -266,13 +214,12 @@ def _in_memory(demo: Demonstration) -> Demonstration:
 
 STUDIES = {
     "demonstrations": ("ff_flat", "ff", "rnn_flat", "rnn", "ff_two_flat", "ff_two"),
-    "encoded": ("ff_flat", "encoded_flat", "encoded"),
     "large": ("ff_flat", "ff_large_flat", "ff", "ff_large"),
     "options": ("ff", "rnn"),
     "augmentation": ("ff", "ff_hybrid", "rnn", "rnn_hybrid"),
 }
 """The methods of each."""
-OWN_OPTIONS = {"ff": 2, "rnn": 4, "encoded": 2}
+OWN_OPTIONS = {"ff": 2, "rnn": 4}
 """What the supplement says; the text has them the other way round."""
 COUNT = 40
 """Demonstrations where their number is not what is varied."""

@@ -16,13 +16,11 @@ from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.pictures import Pictures
 from ddco_pyro.data.sources.video import frames
-from ddco_pyro.encoding.autoencoder import Convolutions
-from ddco_pyro.encoding.encoder import About, Encoder, Projection
+from ddco_pyro.encoding import About, Backbone, Encoder, Projection
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.report import write_report
 from ddco_pyro.simulation import collect as collecting
 from ddco_pyro.simulation.cameras import Encoded
-from ddco_pyro.simulation.environments import TaskEnvironment
 from ddco_pyro.simulation.episodes import play, run_episode
 from ddco_pyro.spec import DemonstrationsSpec, RolloutSpec, parse_spec
 from ddco_pyro.training.data import dimensions
@@ -93,9 +91,9 @@ def test_another_encoder_has_another_file():
     """Its weights decide what is recorded, and they lie in no source of the task."""
 
     def path(scale, observed):
-        network = Convolutions("random_conv", (48, 65, 3), seed=0)
-        about = About(encoder="random_conv", observation="camera", picture=[48, 65, 3], features=4, size=4, seed=0)
-        encoder = Encoder(about, network, Projection(np.zeros(4), scale * np.eye(4), 1.0))
+        backbone = Backbone("user_encoders:means", allow_code=True)
+        about = About(encoder=backbone.name, observation="camera", picture=[48, 65, 3], features=6, size=6)
+        encoder = Encoder(about, backbone, Projection(np.zeros(6), scale * np.eye(6), 1.0))
         coded = replace(watched, cameras={"colour": Encoded(watched.cameras["camera"], encoder, 4)})
         return collecting.cache_path(coded, TASK, DemonstrationsSpec(count=5), observed)
 
@@ -139,12 +137,3 @@ def test_a_spec_with_a_camera_is_checked_fitted_and_rolled_out(tmp_path):
         watched, Controller.from_spec(fit.hierarchy, RolloutSpec()), range(1000, 1002), fit.hierarchy.encoder.shapes
     )
     assert [one.outcome["success"] for one in alone].count(1.0) == measured.successes
-
-
-def test_a_gymnasium_environment_has_the_cameras_it_is_asked_for():
-    environment = TaskEnvironment(TASK, observed=["camera"])
-    assert environment.observation_space["camera"].shape == (48, 65, 3)
-    seen, _ = environment.reset(seed=1)
-    assert environment.observation_space.contains({key: np.asarray(value) for key, value in seen.items()})
-    assert "camera" not in TaskEnvironment(TASK).reset(seed=1)[0]
-    environment.close()

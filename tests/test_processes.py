@@ -25,7 +25,7 @@ from random_demonstrations import of_states
 
 from ddco_pyro.data.files import only_one
 from ddco_pyro.errors import Failed
-from ddco_pyro.events import SeedFitted, UpdatesDone
+from ddco_pyro.events import DemonstrationsDone, SeedFitted
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.jobs import Workers, processes, run_all
 from ddco_pyro.spec import dump_spec
@@ -279,14 +279,14 @@ def test_processes_that_are_there_make_the_calls_of_a_block(modules) -> None:
 def test_events_come_call_after_call_and_the_wait_is_announced_once(jobs) -> None:
     def tell(number, on_event):  # pickled by value, as it is in no module
         on_event(SeedFitted(number))
-        on_event(UpdatesDone(number, 0.5))
+        on_event(DemonstrationsDone(number, 3))
 
     told, calls = [], {n: partial(tell, n) for n in range(3)}
     waiting = {n: SeedFitted(n) for n in calls}
     with run_all(calls, Workers(jobs), "worked", told.append, beside=1, waiting=waiting) as results:
         order = [number for number, _ in results]
     assert order == ([0, 1, 2] if jobs == 1 else [1, 0, 2])
-    assert told == [event for n in order for event in (SeedFitted(n), UpdatesDone(n, 0.5))]
+    assert told == [event for n in order for event in (SeedFitted(n), DemonstrationsDone(n, 3))]
 
 
 @pytest.mark.parametrize("modules", [(), ("json",)])

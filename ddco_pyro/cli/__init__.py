@@ -89,9 +89,6 @@ Overrides = Annotated[
 RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="The folder of a finished fit.", show_default=False)]
 Scheduler = Annotated[str | None, typer.Option(help="Address of the dask scheduler, tcp://HOST:PORT.")]
 Level = Annotated[str | None, typer.Option(help="Name of their level; by default the lowest.")]
-AllowExternal = Annotated[
-    bool, typer.Option("--allow-external", help="Read the parts of an HDF5 file that lie in other files.")
-]
 AllowCode = Annotated[
     bool, typer.Option("--allow-code", help="Import the user code (module:name) that the spec names.")
 ]

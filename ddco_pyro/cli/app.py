@@ -45,7 +45,7 @@ EXAMPLES: dict[Callable[..., None], str] = {
     demos.inspect: "inspect mine.hdf5",
     demos.init: "init mine.hdf5 --out mine.yaml",
     demos.import_: "import pusht --out demos.hdf5",
-    demos.encode: "encode demos.hdf5 --observation camera --encoder random_conv --out encoded.hdf5",
+    demos.encode: "encode demos.hdf5 --observation camera --encoder timm:resnet18.a1_in1k --out encoded.hdf5",
     runs.segment: "segment runs/mine mine.hdf5 --html segments.html",
     label.label: "label runs/mine mine.hdf5 --out labelled.hdf5",
     runs.export: "export runs/mine --out controller --onnx",

@@ -35,7 +35,6 @@ from ddco_pyro.events import (
     SeedFitted,
     TrainingBegan,
     TrainingEnded,
-    UpdatesDone,
 )
 from ddco_pyro.names import label_name, method, numbered_name, option_name
 
@@ -103,8 +102,6 @@ class Progress:
                 self._begin(f"training {method(name)} {further}".rstrip(), epochs)
             case EpochEnded():
                 self._advance(note=f"{event.stage}: training {event.train:.3f}, tuning {event.tune:.3f} nats/step")
-            case UpdatesDone(done, loss):
-                self._advance(done=done, note=f"loss {loss:.2g}")
             case RestartStopped(restart, epochs):
                 self._say(f"restart {restart}: stopped at epoch {epochs} (far behind the likeliest)")
             case RestartDiverged(restart, why):
@@ -347,7 +344,6 @@ def inspection(facts: Inspection) -> None:
         f"{facts.path}: {facts.format}, {len(facts.lengths)} demonstrations of {lengths}",
         f"control frequency: {f'{facts.frequency:g} Hz' if facts.frequency else UNKNOWN_FREQUENCY}",
         *(f"mask/{name}: {len(names)} demonstrations" for name, names in facts.masks.items()),
-        *(f"names another file as a part of it: {path}" for path in facts.external),
     ]
     for line in lines:
         say(printable(line))

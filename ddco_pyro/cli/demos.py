@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from ddco_pyro.cli import AllowCode, AllowExternal, Overrides, SpecPath, hint, out_file, written
+from ddco_pyro.cli import AllowCode, Overrides, SpecPath, hint, out_file, written
 from ddco_pyro.data.files import Output, check_outputs, write_text
 from ddco_pyro.data.formats import FORMATS
 from ddco_pyro.errors import BadInput, Failed, command
@@ -224,7 +224,6 @@ def import_(
     skip_broken: Annotated[
         bool, typer.Option("--skip-broken", help="Leave out demonstrations that cannot be used, and list them.")
     ] = False,
-    allow_external: AllowExternal = False,
 ) -> None:
     """Write demonstrations of another format into this project's layout.
 
@@ -240,7 +239,7 @@ def import_(
     check_outputs([Output("--out", out, "file")], [source, *([labels] if labels else [])])
     size = (image_size, image_size) if image_size else None
     table = LabelTable(labels, _columns(columns), unit, fps) if labels else None
-    choice = Choice(tuple(observations), mask, videos, size, hz, skip_broken, allow_external, tuple(actions), table)
+    choice = Choice(tuple(observations), mask, videos, size, hz, skip_broken, tuple(actions), table)
     with console.Progress("importing") as progress:
         imported = import_demonstrations(source, out, form, choice, lambda *done: progress(DemonstrationsDone(*done)))
     for name, reason in imported.left_out.items():
@@ -264,10 +263,15 @@ def _columns(text: str | None) -> dict[str, str]:
 def encode(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="An HDF5 file of demonstrations.")],
     observation: Annotated[str, typer.Option(metavar="KEY", help="The pictures to encode.", show_default=False)],
-    out: Annotated[Path, written(out_file, "The HDF5 file to write.", show_default=False)],
     encoder: Annotated[
-        str, typer.Option(metavar="NAME", help="random_conv, autoencoder, the folder of a fit, or module:Class.")
-    ] = "random_conv",
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="timm:NAME, such as timm:resnet18.a1_in1k, or your own module:function.",
+            show_default=False,
+        ),
+    ],
+    out: Annotated[Path, written(out_file, "The HDF5 file to write.", show_default=False)],
     size: Annotated[
         int | None,
         typer.Option(
@@ -278,34 +282,19 @@ def encode(
         str | None,
         typer.Option("--as", metavar="NAME", help="The new observation; KEY_features by default.", show_default=False),
     ] = None,
-    updates: Annotated[int, typer.Option(min=1, help="Gradient steps of the autoencoder.")] = 2000,
-    moved: Annotated[
-        int, typer.Option(min=0, help="Further versions of each demonstration, with shifted pictures.")
-    ] = 0,
-    shift: Annotated[int, typer.Option(min=0, help="Largest shift of a picture, in pixels.")] = 0,
-    seed: Annotated[
-        int, typer.Option(min=0, max=2**32 - 2, help="Seed of weights, order of pictures, and shifts.")
-    ] = 0,
     allow_code: Annotated[
         bool, typer.Option("--allow-code", help="Import the user code that --encoder names.")
     ] = False,
 ) -> None:
-    """Write demonstrations with a vector of features in place of pictures; an interrupted command is continued.
+    """Write demonstrations with a vector of features in place of pictures.
 
-    The encoder is written to OUT.encoder; ddco_pyro.encoding.load reads it for acting.
+    The file holds the encoder, too; ddco_pyro.encoding.load reads it for acting.
     """
     from ddco_pyro.cli import console
-    from ddco_pyro.encoding import Encoding
     from ddco_pyro.encoding import encode as write
-    from ddco_pyro.encoding.writing import encoder_folder
 
-    places = [Output("--out", out, "file"), Output("--out", encoder_folder(out), "folder")]
-    check_outputs(places, [file, *([Path(encoder)] if Path(encoder).exists() else [])])
-    encoding = Encoding(observation, encoder, size, seed, name, updates, moved, shift)
+    check_outputs([Output("--out", out, "file")], [file])
     with console.Progress("encoding") as progress:
-        encoded = write(file, out, encoding, progress, allow_code)
-    about = encoded.about
+        about = write(file, out, observation, encoder, size, name, progress, allow_code).about
     of = f"{about.size} of {about.features} features, {about.explained:.1%} of their variance"
-    versions = f"; of moved pictures, {moved} times: obs/{encoding.key}_moved" if moved else ""
-    what = f"obs/{encoding.key}: {of}{versions}"
-    print(f"{out}: {encoded.demonstrations} demonstrations, {what}; the encoder: {encoded.folder}")
+    print(f"{out}: obs/{name or f'{observation}_features'}: {of}")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import typer
 
-from ddco_pyro.cli import BRACKET, AllowCode, AllowExternal, Level, Overrides, RunPath, out_file, out_folder, written
+from ddco_pyro.cli import BRACKET, AllowCode, Level, Overrides, RunPath, out_file, out_folder, written
 from ddco_pyro.data.files import Output, check_outputs
 from ddco_pyro.errors import BadInput, command
 
@@ -278,7 +278,6 @@ def segment(
             show_default=False,
         ),
     ] = None,
-    allow_external: AllowExternal = False,
     allow_code: AllowCode = False,
 ) -> None:
     """Label every step of demonstrations with a run's options, and write them in the formats that you name.
@@ -295,10 +294,6 @@ def segment(
     places = [Output(form.option, outputs[form.option], form.kind) for form in FORMATS if form.option in outputs]
     if in_place:
         places.append(Output("--in-place", demos, "file"))
-    labelled = in_place or "--out" in outputs
-    if labelled and allow_external:  # a copy lacks the other files, and labels could go into them
-        again = command("import", demos, "--allow-external", "--out", "whole.hdf5")
-        raise BadInput(f"{demos}: labels go into whole files only; first: {again}")
     from ddco_pyro.cli import console
     from ddco_pyro.data.sources import open_source
     from ddco_pyro.evaluation.agreement import agreement_table, tolerances
@@ -319,7 +314,7 @@ def segment(
         with console.Progress() as progress:
             others = {name: cut(fit, name, progress) for name in GRANULARITIES}
         fit = others.pop(granularity)
-    with open_source(demos, external=allow_external) as source, console.Progress("segmenting") as progress:
+    with open_source(demos) as source, console.Progress("segmenting") as progress:
         beside = baseline_labels(fit) if baselines else ()
         beside += tuple(f"{level}_{name}" for level in fit.names for name in others)
         asked = Asked(fit, run, demos, source, level or next(iter(fit.names), ""), beside)

@@ -21,7 +21,7 @@ from ddco_pyro.data.checks import (
     unknown,
 )
 from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError
-from ddco_pyro.data.memory import PROGRAM, Extent, refuse_too_much
+from ddco_pyro.data.memory import needed, refuse_too_much
 from ddco_pyro.data.pictures import Observed, Pictures
 from ddco_pyro.data.sources import refuse_foreign
 from ddco_pyro.data.sources.recording import Recording
@@ -151,9 +151,10 @@ class Demonstrations(Sequence[Demonstration]):
         :raises DemonstrationsError: the file cannot be read, lacks something asked for, or does not fit into memory.
         """
         with _opened(path_of(path, "demonstrations")) as source:
-            needed = PROGRAM + _extent(source, observations, labels, exclude).size
-            refuse_too_much(needed, "reading it", "read only some observations, or scale pictures down")
-            read = tuple(Demonstration(**vars(each)) for each in _recordings(source, observations, labels, exclude))
+            recordings = list(_recordings(source, observations, labels, exclude))
+            bytes_read = needed((dict(recording.columns()) for recording in recordings), copies=0)
+            refuse_too_much(bytes_read, "reading it", "read only some observations, or scale pictures down")
+            read = tuple(Demonstration(**vars(recording)) for recording in recordings)
             masks = {mask: tuple(name for name in names if name not in exclude) for mask, names in source.masks.items()}
             return cls(read, masks, source.attributes)
 
@@ -247,25 +248,19 @@ def not_demonstrations(given: object) -> DemonstrationsError:
     )
 
 
-def extent(path: str | Path, observations: Sequence[str], exclude: Sequence[str] = ()) -> Extent:
-    """The size of these observations and of the controls, by the file's headers alone.
+def bytes_of_a_fit(path: str | Path, observations: Sequence[str], exclude: Sequence[str] = ()) -> float:
+    """Bytes that a fit to these observations needs, by the file's headers alone.
 
     :raises DemonstrationsError: the file cannot be read, or lacks an observation.
     """
     with _opened(Path(path)) as source:
-        return _extent(source, observations, (), exclude)
+        return needed(dict(recording.columns()) for recording in _recordings(source, observations, (), exclude))
 
 
 def _opened(path: Path) -> AbstractContextManager[Robomimic]:
     if path.is_file():
         refuse_foreign(path)
     return open_robomimic(path)
-
-
-def _extent(
-    source: Robomimic, observations: Sequence[str] | None, labels: Sequence[str] | None, exclude: Sequence[str]
-) -> Extent:
-    return Extent.of(dict(recording.columns()) for recording in _recordings(source, observations, labels, exclude))
 
 
 def _recordings(

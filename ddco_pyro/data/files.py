@@ -56,8 +56,7 @@ class Output:
     """A place that a command writes to.
 
     :param option: its name in messages, such as ``--html``.
-    :param kind: ``folder``; ``file``; or ``stream``, a file written from start to end, which may be a character device
-        such as ``/dev/null``.
+    :param kind: ``folder``; ``file``; or ``stream``, a file that never replaces an HDF5 file.
     """
 
     option: str
@@ -131,7 +130,7 @@ def _check_kind(output: Output) -> None:
             raise output.refused("is a file", "name a folder")
     elif stat.S_ISDIR(mode):
         raise output.refused("is a folder", "name a file")
-    elif not (stat.S_ISREG(mode) or (stat.S_ISCHR(mode) and output.kind == "stream")):
+    elif not stat.S_ISREG(mode):
         raise output.refused("is no regular file")
 
 
@@ -145,11 +144,8 @@ def _is_hdf5(path: Path) -> bool:
 def _check_writable(output: Output) -> None:
     """Refuse a place in which a file of the longest temporary name cannot be made."""
     place = output.place
-    if _is_device(output.path) or place.is_file():
-        if not os.access(output.path, os.W_OK):
-            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
-        if _is_device(output.path):
-            return
+    if place.is_file() and not os.access(place, os.W_OK):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
     there = next(path for path in (place, *place.parents) if path.is_dir())
     names = (*place.relative_to(there).parts, _temporary_name(place))
     if max(len(os.fsencode(name)) for name in names) > os.pathconf(there, "PC_NAME_MAX"):
@@ -161,23 +157,16 @@ def _check_writable(output: Output) -> None:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES)) from error
 
 
-def _is_device(path: Path) -> bool:
-    return path.exists() and stat.S_ISCHR(path.stat().st_mode)
-
-
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
     """A temporary file that replaces ``path`` when the block ends without an error.
 
-    Behind a link, the target is replaced. A character device is written to.
+    Behind a link, the target is replaced.
 
     :raises NoSpace: the disk is full.
     :raises NotWritable: nothing may be written there.
     """
     with _explained(path):
-        if _is_device(path):
-            yield path
-            return
         if path.exists() and not path.is_file():
             raise Output("", path).refused("is no regular file")
         place = _target(path)

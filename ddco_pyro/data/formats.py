@@ -20,15 +20,14 @@ class Format(NamedTuple):
     :param fits: whether a path has the format; also given the names at the top of an HDF5 file, else none.
     :param text: the path in words, such as ``the folder of a Minari dataset``.
     :param sign: what tells a folder of this format, in words.
-    :param options: further arguments of the reader: ``external``, whether parts of an HDF5 file may be in other files,
-        and ``actions``, names of the arrays that are the control together.
+    :param parts: whether the control may have parts, whose names are the reader's argument ``actions``.
     """
 
     reader: str
     fits: Callable[[Path, Collection[str]], bool]
     text: str
     sign: str = ""
-    options: Collection[str] = ()
+    parts: bool = False
 
 
 def _minari(path: Path, names: Collection[str]) -> bool:
@@ -43,24 +42,20 @@ def _act(path: Path, names: Collection[str]) -> bool:
     )
 
 
-def _d4rl(path: Path, names: Collection[str]) -> bool:
-    return {"actions", "observations"} <= {*names} and bool({"terminals", "timeouts"} & {*names})
-
-
 FORMATS = {
     "lerobot": Format(
         "lerobot:open_lerobot",
         lambda path, names: (path / "meta" / "info.json").is_file(),
         "the folder of a LeRobot dataset",
         "meta/info.json",
-        options=["actions"],
+        parts=True,
     ),
     "minari": Format(
         "minari:open_minari",
         _minari,
         "the folder of a Minari dataset",
         "data/metadata.json",
-        options=["external", "actions"],
+        parts=True,
     ),
     "ogbench": Format(
         "ogbench:open_ogbench",
@@ -73,7 +68,6 @@ FORMATS = {
         "an HDF5 file of ManiSkill",
     ),
     "act": Format("hdf5_layouts:Act", _act, "the folder of ACT's episodes", "episode_0.hdf5"),
-    "d4rl": Format("hdf5_layouts:D4RL", _d4rl, "an HDF5 file of D4RL"),
     "jigsaws": Format(
         "jigsaws:Jigsaws",
         lambda path, names: (path / "kinematics" / "AllGestures").is_dir(),
@@ -84,7 +78,6 @@ FORMATS = {
         "robomimic:open_robomimic",
         lambda path, names: path.is_file(),
         "an HDF5 file of robomimic's layout",
-        options=["external"],
     ),
 }
 """By name, in the order in which they are recognised; the reader of robomimic's files reports what is no HDF5 file."""

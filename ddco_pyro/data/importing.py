@@ -33,7 +33,6 @@ class Choice:
     :param hz: the rate to import at, Hz; None for that of the source. Numbers are means over the source's frames; a
         picture, a label and a discrete action are those of one frame.
     :param skip_broken: whether unusable demonstrations are left out rather than refused.
-    :param allow_external: whether parts of an HDF5 file may be in other files.
     :param actions: names in the source of the arrays that are the control together; if empty, the usual ones.
     :param labels: a table of segments that become labels.
     """
@@ -44,7 +43,6 @@ class Choice:
     image_size: tuple[int, int] | None = None
     hz: float | None = None
     skip_broken: bool = False
-    allow_external: bool = False
     actions: tuple[str, ...] = ()
     labels: LabelTable | None = None
 
@@ -83,7 +81,7 @@ def import_demonstrations(
     """
     if out.exists():
         raise BadInput(f"{out}: is there already; choose another --out, or remove it")
-    with open_source(source, form, choice.allow_external, choice.actions) as whole:
+    with open_source(source, form, choice.actions) as whole:
         labelled = Labelled(whole, choice.labels) if choice.labels else None
         chosen = labelled or whole
         masks: dict[str, tuple[str, ...]] = {}

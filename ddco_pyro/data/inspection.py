@@ -10,7 +10,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 
 from ddco_pyro.data.checks import (
@@ -40,8 +39,8 @@ from ddco_pyro.data.controls import (
     notes,
     same,
 )
-from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError, outside_files
-from ddco_pyro.data.pictures import MOVED, blocks
+from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError
+from ddco_pyro.data.pictures import blocks
 from ddco_pyro.data.sources import Column, Source, open_source
 from ddco_pyro.data.sources.metadata import rate
 from ddco_pyro.data.sources.recording import UNKNOWN, label_names
@@ -183,7 +182,6 @@ class Inspection:
     :param leaks: observations, ``obs/<key>``, that hold nothing but controls still to be predicted.
     :param excluded: names of demonstrations that were skipped.
     :param unreadable: names of demonstrations that could not be read.
-    :param external: other files that the HDF5 file names as parts of itself; they are not read.
     :param turns: the angles in radians and the first numbers of quaternions that jump, by place of the array.
     :param odd: names of demonstrations that are dead or change the kind of a control dimension, and why.
     :param attributes: of each demonstration by its name.
@@ -201,7 +199,6 @@ class Inspection:
     leaks: tuple[str, ...] = ()
     excluded: tuple[str, ...] = ()
     unreadable: tuple[str, ...] = ()
-    external: tuple[str, ...] = ()
     odd: Mapping[str, str] = field(default_factory=dict)
     turns: Mapping[str, tuple[tuple[int, ...], tuple[int, ...]]] = field(default_factory=dict)
     attributes: Mapping[str, Mapping[str, Attribute]] = field(default_factory=dict)
@@ -242,16 +239,6 @@ class Inspection:
         """The control."""
         return self.fields.get("actions")
 
-    @property
-    def versions(self) -> dict[str, str]:
-        """Key of each vector that has versions from shifted pictures, and the key of these versions."""
-        pairs = ((field, self.fields.get(f"obs/{field.key}{MOVED}")) for field in self.observations)
-        return {
-            field.key: other.key
-            for field, other in pairs
-            if other and other.shape[1:] == field.shape and not other.affected and self.everywhere(other)
-        }
-
     def everywhere(self, array: Field) -> bool:
         """Whether every demonstration has this array."""
         return array.demonstrations == len(self.lengths)
@@ -266,7 +253,6 @@ class Inspection:
             "masks": {name: list(names) for name, names in self.masks.items()},
             "fields": [array.as_json() for array in self.fields.values()],
             "control_dimensions": [dimension.as_data() for dimension in self.control],
-            "external": list(self.external),
             "odd": dict(self.odd),
             "notes": self.notes,
             "problems": self.problems,
@@ -388,7 +374,6 @@ class _Inspector:
             messages[0] if len(messages) == 1 else f"{messages[0]}; the first of {len(messages)} such"
             for messages in self.problems.values()
         )
-        external = {name for file in source.files if h5py.is_hdf5(file) for name in outside_files(file)}
         return Inspection(
             path=path,
             format=source.format,
@@ -403,7 +388,6 @@ class _Inspector:
             leaks=tuple(p for p, array in fields.items() if self.coincidences.leaks(p, varying, array.constant)),
             excluded=exclude,
             unreadable=tuple(unreadable),
-            external=tuple(sorted(external)),
             odd=self._odd(dimensions),
             attributes=self.attributes,
         )

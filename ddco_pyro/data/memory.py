@@ -9,7 +9,6 @@ import math
 import os
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -43,44 +42,26 @@ class Array(Protocol):
         """The type of its numbers."""
 
 
-@dataclass(frozen=True)
-class Extent:
-    """The size of demonstrations, by their headers.
+def needed(demonstrations: Iterable[Mapping[str, Array]], copies: float = COPIES) -> float:
+    """Bytes for demonstrations, by their headers: the arrays as read, and copies padded to the longest demonstration.
 
-    :param lengths: number of steps of each demonstration.
-    :param size: bytes of all arrays in memory, without pictures that stay in their file.
-    :param numbers: numbers per step, without pictures.
+    Pictures that stay in their file count for nothing.
+
+    :param demonstrations: arrays by place (``actions``, ``obs/<key>``, ``labels/<name>``).
+    :param copies: bytes of a number beyond the array as read.
     """
-
-    lengths: tuple[int, ...]
-    size: int
-    numbers: int
-
-    @classmethod
-    def of(cls, demonstrations: Iterable[Mapping[str, Array]]) -> Extent:
-        """The size of demonstrations given as arrays by place (``actions``, ``obs/<key>``, ``labels/<name>``)."""
-        lengths, size, numbers = [], 0, 0
-        for arrays in demonstrations:
-            lengths.append(arrays["actions"].shape[0] if arrays["actions"].shape else 0)
-            features = 0
-            for place, array in arrays.items():
-                plain = array.dtype == np.uint8
-                if getattr(array, "kept", None) is None:
-                    size += math.prod(array.shape) * (1 if plain else 8)
-                if not place.startswith("labels/") and not (plain and len(array.shape) == 4):
-                    features += math.prod(array.shape[1:])
-            numbers = max(numbers, features)
-        return cls(tuple(lengths), size, numbers)
-
-    @property
-    def fitting(self) -> float:
-        """Bytes of a fit: the arrays as read, and copies padded to the longest demonstration."""
-        return PROGRAM + self.size + COPIES * self.numbers * len(self.lengths) * max(1, *self.lengths)
-
-    @property
-    def segmenting(self) -> float:
-        """Bytes of inference over all steps at once."""
-        return PROGRAM + self.size + (COPIES * self.numbers + INFERENCE) * sum(self.lengths)
+    number, longest, size, features = 0, 0, 0, 0
+    for arrays in demonstrations:
+        number, numbers = number + 1, 0
+        longest = max(longest, *arrays["actions"].shape[:1], 0)
+        for place, array in arrays.items():
+            plain = array.dtype == np.uint8
+            if getattr(array, "kept", None) is None:
+                size += math.prod(array.shape) * (1 if plain else 8)
+            if not place.startswith("labels/") and not (plain and len(array.shape) == 4):
+                numbers += math.prod(array.shape[1:])
+        features = max(features, numbers)
+    return PROGRAM + size + copies * features * number * longest
 
 
 SMALL = 1e6
@@ -104,14 +85,10 @@ def _free(root: Path = Path("/")) -> float:
     try:
         available = re.search(r"^MemAvailable:\s+(\d+) kB$", (root / "proc/meminfo").read_text(), re.MULTILINE)
         found += [float(available[1]) * 1024] if available else []
-        for line in (root / "proc/self/cgroup").read_text().splitlines():
-            _, controllers, group = line.split(":", 2)
-            if not controllers or "memory" in controllers.split(","):
-                name = "memory.limit_in_bytes" if controllers else "memory.max"
-                top = root / "sys/fs/cgroup" / ("memory" if controllers else "")
-                own = top / group.strip("/")
-                limits = (part / name for part in (own, *own.parents) if part == top or top in part.parents)
-                found += [float(file.read_text()) for file in limits if file.exists() and file.read_text() != "max\n"]
+        group, top = (root / "proc/self/cgroup").read_text().strip().rpartition("::")[2], root / "sys/fs/cgroup"
+        own = top / group.strip("/")
+        limits = [part / "memory.max" for part in (own, *own.parents) if part.is_relative_to(top)]
+        found += [float(file.read_text()) for file in limits if file.exists() and file.read_text() != "max\n"]
     except (OSError, ValueError):
         pass  # not Linux
     return min(found)

@@ -28,9 +28,6 @@ PICTURE_DIMENSIONS = 3
 CHANNELS = (1, 3, 4)
 """Grey; red, green and blue; three colours with transparency or depth."""
 
-MOVED = "_moved"
-"""Suffix of the key that holds features of shifted pictures."""
-
 
 class TransformError(BadInput):
     """Pictures cannot be cropped or scaled as asked."""

@@ -128,7 +128,7 @@ def starting_spec(
         raise DemonstrationsError(f"{inspection.path}: actions {wrong}; repair them first ({look})")
     if all(dimension.constant for dimension in inspection.control):
         raise DemonstrationsError(f"{inspection.path}: {all_constant(inspection.control)}")
-    observed = [field for field in inspection.observations if field.key not in inspection.versions.values()]
+    observed = inspection.observations
     used = [field for field in observed if not _left_out(inspection, field)]
     if not used:
         why = next((f": {field.place} {_left_out(inspection, field)}" for field in observed), "")
@@ -178,7 +178,7 @@ def _filled(
     vectors, images = ([field for field in used if field.image is image] for image in (False, True))
     recipe = VECTORS if vectors else PICTURES
     batch = _batch(np.array(lengths), recipe)
-    em = bool(vectors) and not images and not inspection.versions
+    em = bool(vectors) and not images
     unusable_labels = [(field.key, why) for field in inspection.labels if (why := _unusable(inspection, field))]
     return environment.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
         path=path,
@@ -191,7 +191,6 @@ def _filled(
         steps=sum(lengths),
         unusable_labels=unusable_labels,
         vectors=vectors,
-        versions=inspection.versions,
         turns=inspection.turns,
         zip=zip,
         images=images,

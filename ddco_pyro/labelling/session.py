@@ -380,7 +380,7 @@ class Session:
             waiting = self.proposals.waiting
             kept = {name: np.where(np.isin(own, waiting), own, FREE) for name, own in self._shown_now().items()}
             trained, count = replace(self.fit, given=None), len(self.document.names)
-        keys = trained.spec.trained_with
+        keys = trained.spec.observed
         demos = Demonstrations(
             tuple(replace(demo, observations={key: demo.observations[key] for key in keys}) for demo in self.demos),
             attributes=self.demos.attributes,

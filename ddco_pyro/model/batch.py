@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -33,13 +33,11 @@ class Batch:
     :param inputs: what networks see of the observations.
     :param actions: the control dimensions that vary, in scaled units, [N, T, A'].
     :param lengths: steps of each demonstration, [N].
-    :param versions: other versions of vectors, one of which training may see, [N, V, T, F_key] by name.
     """
 
     inputs: Inputs
     actions: Tensor
     lengths: Tensor
-    versions: Mapping[str, Tensor] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.lengths)
@@ -70,19 +68,13 @@ class Batch:
         return Batch(self.inputs.part(rows, slice(0, steps)), self.actions[rows, :steps], lengths)
 
     def varied(self, most: Mapping[str, int], seed: int) -> Batch:
-        """An augmented batch: pictures shifted at random, vectors replaced by one of their versions at random.
+        """An augmented batch, with pictures shifted at random.
 
         :param most: by observation, the most pixels of a shift along either axis.
         """
         random = np.random.default_rng(seed)
         shifts = {key: random.integers(-pixels, pixels + 1, (len(self), 2)) for key, pixels in most.items()}
-        vectors = dict(self.inputs.vectors)
-        for key, others in self.versions.items():
-            chosen = torch.as_tensor(random.integers(-1, others.shape[1], len(self)))
-            (rows,) = torch.where(chosen >= 0)
-            vectors[key] = vectors[key].index_copy(0, rows, others[rows, chosen[rows]])
-        varied = Batch(Inputs(vectors, self.inputs.images, self.inputs.time), self.actions, self.lengths)
-        return varied._with(lambda images: replace(images, shifts=shifts))
+        return self._with(lambda images: replace(images, shifts=shifts))
 
     def read_by(self, readers: Readers) -> Batch:
         """The batch whose pictures in files are read by ``readers``."""

@@ -13,7 +13,7 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.pictures import PICTURE_DIMENSIONS, Observed, Pictures, Transform, TransformError
 from ddco_pyro.model.networks import Inputs, InputShape, ShapeError
 from ddco_pyro.model.networks.inputs import Frames
-from ddco_pyro.spec import STEP, AugmentSpec, ObservationSpec
+from ddco_pyro.spec import STEP, ObservationSpec
 
 Shapes = Mapping[str, tuple[int, ...]]
 
@@ -205,23 +205,6 @@ class ObservationEncoder(nn.Module):
         images = Frames(pictures, self.transforms, rows, slice(0, steps)) if pictures else {}
         return Inputs(by_key, images, torch.arange(steps))
 
-    def versions(self, demonstrations: Demonstrations) -> dict[str, Tensor]:
-        """The versions of the vectors that ``augment.versions`` names, as networks see them, [N, V, T, F_key]."""
-        named = {spec.key: spec.augment.versions for spec in self.specs if spec.augment and spec.augment.versions}
-        return {
-            key: torch.stack(
-                [
-                    self.inputs(
-                        {**demo.observations, key: np.asarray(demo.observations[name])[:, version]}
-                        for demo in demonstrations
-                    ).vectors[key]
-                    for version in range(demonstrations.observation_shapes[name][0])
-                ],
-                dim=1,
-            )
-            for key, name in named.items()
-        }
-
 
 def _turned(values: np.ndarray, spec: ObservationSpec) -> np.ndarray:
     """Numbers [T, n] with sines and cosines of angles, and products of quaternions, behind all others."""
@@ -258,33 +241,14 @@ def _seen_shape(spec: ObservationSpec, shapes: Shapes) -> tuple[int, ...]:
             f"observations: {spec.key!r} has shape {list(stored)} at each step: angles and quaternions name numbers of "
             f"a vector, counted from 0, and there is no number {last}"
         )
-    if spec.augment:
-        _refuse_other_versions(spec.key, spec.augment, shapes)
+    if spec.augment and spec.augment.shift and len(stored) != PICTURE_DIMENSIONS:
+        raise ShapeError(
+            f"observations: {spec.key!r} has shape {list(stored)} at each step: augment.shift is for pictures"
+        )
     try:
         return _transform(spec).shape(stored)
     except TransformError as error:
         raise ShapeError(f"observations: {spec.key!r} {error}") from error
-
-
-def _refuse_other_versions(key: str, augment: AugmentSpec, shapes: Shapes) -> None:
-    """Check that an observation can be augmented so; a model that is loaded has no versions.
-
-    :raises ShapeError: it cannot.
-    """
-    stored, versions = shapes[key], augment.versions
-    picture = len(stored) == PICTURE_DIMENSIONS
-    if augment.shift and not picture:
-        raise ShapeError(f"observations: {key!r} has shape {list(stored)} at each step: augment.shift is for pictures")
-    if versions is None:
-        return
-    if picture:
-        raise ShapeError(f"observations: {key!r} has pictures: augment.versions is for vectors; shift moves pictures")
-    there = shapes.get(versions)
-    if there is not None and (not there or not there[0] or there[1:] != stored):
-        raise ShapeError(
-            f"observations: {key!r} augment.versions: {versions!r} has shape {list(there)} at each step, it has to be "
-            f"[versions{''.join(f', {size}' for size in stored)}]"
-        )
 
 
 def _as_pictures(values: Observed) -> Observed:

@@ -13,7 +13,7 @@ import numpy as np
 from ddco_pyro.data.checks import check_fitted
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.hdf5 import DemonstrationsError
-from ddco_pyro.data.memory import Extent, refuse_too_much
+from ddco_pyro.data.memory import INFERENCE, needed, refuse_too_much
 from ddco_pyro.data.sources import Recording, Source, open_source
 from ddco_pyro.data.sources.recording import label_names
 from ddco_pyro.drawing.colours import option_colour
@@ -291,10 +291,10 @@ def _demonstrations(
 def _refuse_too_long(recording: Recording, fit: Fit, before: int) -> None:
     known = recording.observations
     seen = {f"obs/{key}": known[key] for key in fit.hierarchy.encoder.shapes if key in known}
-    extent = Extent.of([{"actions": recording.actions, **seen}])
-    (steps,) = extent.lengths
-    needed = extent.segmenting + FOUND * fit.hierarchy.depth * (before + steps)
-    refuse_too_much(needed, f"{recording.name}: segmenting its {steps} steps", "divide it, or the file")
+    steps = recording.actions.shape[0]
+    inferred = INFERENCE * steps + FOUND * fit.hierarchy.depth * (before + steps)
+    whole = needed([{"actions": recording.actions, **seen}]) + inferred
+    refuse_too_much(whole, f"{recording.name}: segmenting its {steps} steps", "divide it, or the file")
 
 
 def _demonstration(recording: Recording, fit: Fit) -> Demonstration:

@@ -92,9 +92,6 @@ class AugmentSpec(Model):
     shift: int = Field(default=0, ge=0)
     """For pictures: the largest shift in pixels along either axis. In an epoch all pictures of a trajectory have the
     same shift; edge pixels are repeated."""
-    versions: Text | None = None
-    """For vectors: the key of V other versions, [T, V, ...], such as features of shifted pictures. In an epoch a whole
-    trajectory is read as it is or as one of the versions, all equally likely."""
 
 
 Size = Annotated[Items[Count], Field(min_length=2, max_length=2)]
@@ -144,7 +141,7 @@ class ObservationSpec(Model):
                 yield key, "name a number twice; each is part of one angle or quaternion"
                 break
         if self.key == STEP and self.augment:
-            yield "augment", f"{STEP} is computed and has no versions; leave it out"
+            yield "augment", f"{STEP} is computed and is no picture; leave it out"
 
     def turned(self, size: int) -> int:
         """For vectors: numbers of a step of ``size`` numbers, with angles and quaternions in their place."""

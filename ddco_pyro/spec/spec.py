@@ -73,12 +73,6 @@ class Spec(Model):
         """Names of the observations that demonstrations must hold: all except the built-in ``step``."""
         return [observation.key for observation in self.observations if observation.key != STEP]
 
-    @property
-    def trained_with(self) -> list[str]:
-        """Names of the observations that training demonstrations must hold: ``observed`` and their other versions."""
-        versions = (observation.augment.versions for observation in self.observations if observation.augment)
-        return list(dict.fromkeys([*self.observed, *filter(None, versions)]))
-
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         """A mixture in place of a hierarchy becomes that hierarchy; EM trains linear networks by default."""
@@ -89,8 +83,7 @@ class Spec(Model):
             if baseline.levels:
                 raise invalid(("baseline.levels", "is for a mixture in compare_with; leave it out"))
             spec = spec.model_copy(update={"hierarchy": baseline.as_hierarchy, "baseline": None})
-        versions = any(observation.augment and observation.augment.versions for observation in self.observations)
-        if not (training.optimizer.name == "em" or training.takes_gradient_steps or versions) and spec._is_linear:
+        if not (training.optimizer.name == "em" or training.takes_gradient_steps) and spec._is_linear:
             optimizer = training.optimizer.model_copy(update={"name": "em"})
             spec = spec.model_copy(update={"training": training.model_copy(update={"optimizer": optimizer})})
         if problems := list(spec.problems()) or list(_grid_problems(spec)):
@@ -154,10 +147,6 @@ class Spec(Model):
         for index, key in enumerate(keys):
             if key in keys[:index]:
                 yield f"observations.{index}.key", f"{key!r} is given twice; keep one"
-        for index, observation in enumerate(self.observations):
-            if self.training.optimizer.name == "em" and observation.augment and observation.augment.versions:
-                text = "em sees all demonstrations at once, as they are; leave it out"
-                yield f"observations.{index}.augment.versions", text
         if not self.observed:
             yield "observations", f"{STEP} alone says nothing about the state; name an observation beside it"
         for key in dict.fromkeys(path.key for path in self.report.trajectory or ()):

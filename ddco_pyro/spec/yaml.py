@@ -123,10 +123,10 @@ def spec_schema() -> dict[str, Any]:
 def read_yaml(content: bytes | str) -> Any:
     """Plain data in YAML text.
 
-    :raises SpecError: the text is not YAML, or expands to more than a spec can be.
+    :raises SpecError: the text is not YAML.
     """
     try:
-        return plain(_constructed(content))
+        return plain(yaml.load(content, _Loader))
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         where = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
@@ -139,43 +139,6 @@ def read_yaml(content: bytes | str) -> Any:
 
 MOST_BYTES = 256 * 1024
 """Largest spec file; an ordinary one has a few thousand bytes. Reading the largest takes seconds."""
-
-MOST_VALUES = 10_000
-"""Most keys and values of a spec with its aliases expanded; an ordinary spec has a few hundred."""
-
-DEEPEST = 100
-
-
-def _constructed(content: bytes | str) -> Any:
-    loader = _Loader(content)
-    try:
-        node = loader.get_single_node()
-        if node is None:
-            return None
-        _extent(node, {})
-        return loader.construct_document(node)
-    finally:
-        loader.dispose()
-
-
-def _extent(node: yaml.Node, known: dict[yaml.Node, tuple[int, int]]) -> tuple[int, int]:
-    """Number of keys and values of a node with its aliases expanded, and their depth.
-
-    :param known: results for earlier nodes; an alias is the node that it refers to.
-    :raises RecursionError: the node is nested too deeply, or contains itself.
-    """
-    if node not in known:
-        parts = [] if isinstance(node, yaml.ScalarNode) else node.value
-        nodes = [part for pair in parts for part in pair] if isinstance(node, yaml.MappingNode) else parts
-        extents = [_extent(part, known) for part in nodes]
-        size, depth = 1 + sum(size for size, _ in extents), 1 + max((depth for _, depth in extents), default=0)
-        if depth > DEEPEST:
-            raise RecursionError
-        if size > MOST_VALUES:
-            problem = f"holds more than {MOST_VALUES} values where its aliases are written out; refer to it less often"
-            raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark)
-        known[node] = size, depth
-    return known[node]
 
 
 def _parse_override(text: str) -> tuple[str, Any]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ddco_pyro.data.checks import check, check_trained, reading, with_values
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError, extent
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError, bytes_of_a_fit
 from ddco_pyro.data.memory import refuse_too_much
 from ddco_pyro.data.sources.recording import Recording
 from ddco_pyro.data.sources.robomimic import open_robomimic
@@ -119,7 +119,7 @@ def demonstrations(spec: Spec, on_event: OnEvent = ignore) -> Demonstrations:
     if path is None or not in_file(spec):
         path = collect(str(spec.demonstrated_task), sought, path, on_event, spec.observed)
     _refuse_what_cannot_be_read(spec, path)
-    return _set_apart(spec, Demonstrations.read(path, spec.trained_with, _labels(spec), sought.exclude))
+    return _set_apart(spec, Demonstrations.read(path, spec.observed, _labels(spec), sought.exclude))
 
 
 def outline(spec: Spec) -> Demonstrations:
@@ -132,7 +132,7 @@ def outline(spec: Spec) -> Demonstrations:
     _refuse_what_cannot_be_read(spec, path)
     controls = Demonstrations.read(path, (), _labels(spec), spec.demonstrations.exclude)
     with open_robomimic(path) as source:
-        outlined = (_outlined(source.recording(demo.name, spec.trained_with, ()), demo) for demo in controls)
+        outlined = (_outlined(source.recording(demo.name, spec.observed, ()), demo) for demo in controls)
         return _set_apart(spec, replace(controls, demonstrations=tuple(outlined)))
 
 
@@ -151,7 +151,7 @@ def seen(spec: Spec, demos: Demonstrations) -> Demonstrations:
 
     :raises DemonstrationsError: an observation, a label or an excluded demonstration is missing.
     """
-    keys, labels, exclude = spec.trained_with, _labels(spec), set(spec.demonstrations.exclude)
+    keys, labels, exclude = spec.observed, _labels(spec), set(spec.demonstrations.exclude)
     first = demos[0]
     if (first.observations.keys(), first.labels.keys(), exclude) == ({*keys}, {*labels}, set()):
         return _set_apart(spec, demos)
@@ -197,7 +197,7 @@ def _labels(spec: Spec) -> tuple[str, ...]:
 
 def _needed(spec: Spec) -> str:
     """The remedy for a missing file."""
-    read = ["actions", *(f"obs/{key}" for key in spec.trained_with), *(f"labels/{name}" for name in _labels(spec))]
+    read = ["actions", *(f"obs/{key}" for key in spec.observed), *(f"labels/{name}" for name in _labels(spec))]
     return (
         "put it there, or fit to another with --set demonstrations.path=FILE; it has to be HDF5 in robomimic's layout, "
         f"with {', '.join(read)} in each data/<demonstration>"
@@ -209,5 +209,5 @@ def _refuse_what_cannot_be_read(spec: Spec, path: Path) -> None:
     if not path.exists():
         raise DemonstrationsError(f"demonstrations.path: {path}: there is no such file; {_needed(spec)}")
     remedy = "leave observations out, or make its demonstrations fewer, shorter or equally long"
-    what = f"{path}: a fit to {', '.join(spec.trained_with)}"
-    refuse_too_much(extent(path, spec.trained_with, spec.demonstrations.exclude).fitting, what, remedy)
+    what = f"{path}: a fit to {', '.join(spec.observed)}"
+    refuse_too_much(bytes_of_a_fit(path, spec.observed, spec.demonstrations.exclude), what, remedy)

@@ -138,14 +138,13 @@ class Trainer:
         encoder, scaling = self.hierarchy.encoder, self.hierarchy.scaling
         encoder.fit(train)
         scaling.fit(train)
-        varied = replace(encode(train, encoder, scaling), versions=encoder.versions(train))
-        encoded = varied, encode(tune, encoder, scaling)
+        encoded = encode(train, encoder, scaling), encode(tune, encoder, scaling)
         fitted = encoder.state_dict(), scaling.state_dict()
         self.data = TrainingData(spec, dimensions, *encoded, train.names, *fitted, Labels.of(spec, train, tune))
         self.ridge = ridge = spec.training.optimizer.ridge.policy
         by_em = optimizer_of(spec.training.optimizer, self.hierarchy) == "em"
         if by_em and spec.training.optimizer.ridge.cross_validated:
-            self.ridge = cross_validated(self.hierarchy, varied, ridge, self.data.seed(0))
+            self.ridge = cross_validated(self.hierarchy, encoded[0], ridge, self.data.seed(0))
             raised = with_overrides(spec, {"training.optimizer.ridge.policy": self.ridge})
             self.data = replace(self.data, spec=raised)
         self.recognition: Recognition | None = None

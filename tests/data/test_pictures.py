@@ -195,6 +195,10 @@ def test_pictures_that_a_device_holds_are_those_that_are_read(kept: Path, stored
     [
         ({"key": "camera", "crop": [3, 3, 10, 4]}, r"'camera' crop: \[3, 3, 10, 4\] is not within 12 × 10 pixels"),
         ({"key": "pose", "frames": 2}, r"'pose' has shape \[3\] at each step: crop, resize and frames are for"),
+        (
+            {"key": "pose", "augment": {"shift": 1}},
+            r"'pose' has shape \[3\] at each step: augment.shift is f",
+        ),
         ({"key": "camera", "bins": 4}, r"'camera' has pictures: bins are for vectors"),
     ],
 )

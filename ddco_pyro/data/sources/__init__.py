@@ -51,13 +51,10 @@ class Source(Protocol):
 
 
 @contextmanager
-def open_source(
-    path: str | Path, form: str | None = None, external: bool = False, actions: Sequence[str] = ()
-) -> Iterator[Source]:
+def open_source(path: str | Path, form: str | None = None, actions: Sequence[str] = ()) -> Iterator[Source]:
     """Open a file or folder.
 
     :param form: its format, of :data:`~ddco_pyro.data.formats.FORMATS`; recognised if None.
-    :param external: whether parts of an HDF5 file may be in other files.
     :param actions: names of the arrays that are the control together, where a LeRobot or Minari dataset has several.
     :raises DemonstrationsError: the source cannot be read, or has another format.
     """
@@ -66,12 +63,11 @@ def open_source(
     if form not in FORMATS:
         known = ", ".join(FORMATS)
         raise DemonstrationsError(f"{path}: there is no format {form!r}{nearest(form, FORMATS)}; there is: {known}")
-    if actions and "actions" not in FORMATS[form].options:
-        several = " or ".join(about.text for about in FORMATS.values() if "actions" in about.options)
+    if actions and not FORMATS[form].parts:
+        several = " or ".join(about.text for about in FORMATS.values() if about.parts)
         raise DemonstrationsError(f"{path}: has the format {form}, with one control; --action is for {several}")
-    given = {"external": external, "actions": actions}
     reader = resolve_name(f"{__name__}.{FORMATS[form].reader}")
-    opened = reader(path, **{option: given[option] for option in FORMATS[form].options})
+    opened = reader(path, actions=actions) if FORMATS[form].parts else reader(path)
     with opened if isinstance(opened, AbstractContextManager) else nullcontext(opened) as source:
         yield source
 

@@ -1,10 +1,9 @@
-"""HDF5 files of ManiSkill, ACT and D4RL, read in blocks."""
+"""HDF5 files of ManiSkill and ACT, read in blocks."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from itertools import pairwise
 from pathlib import Path
 from shlex import quote
 
@@ -115,42 +114,6 @@ class Act(_Source):
             if key.startswith("images/") and column.dtype == np.uint8 and len(column.shape) == 2 and column.shape[0]:
                 observations[key] = _decoded(column, f"{name}: observations/{key}")
         return Recording(name, observations, actions)
-
-
-class D4RL(_Source):
-    """Concatenated demonstrations: ``observations`` [N, ...], ``actions`` [N, A], ``terminals`` [N], ``timeouts`` [N].
-
-    A demonstration ends at a true terminal or timeout, and at the end of the file.
-    """
-
-    format = "d4rl"
-
-    def _found(self) -> dict[str, tuple[Path, str]]:
-        with opened(self.path) as file:
-            if "timeouts" not in file:
-                raise DemonstrationsError(
-                    "has no timeouts, which mark the ends of demonstrations without a terminal state; take a later "
-                    "version of the dataset"
-                )
-            steps = len(dataset_at(file, "actions", ""))
-            ends = np.zeros(steps, bool)
-            for key in ("terminals", "timeouts"):
-                values = _column(file, key, "").array().reshape(-1) if key in file else ends
-                if len(values) != steps:
-                    raise DemonstrationsError(f"{key} has {len(values)} steps, but actions has {steps}")
-                ends |= values.astype(bool)
-        self._spans = spans(ends)
-        return dict.fromkeys(self._spans, (self.path, "/"))
-
-    def _read(self, name: str, group: h5py.Group) -> Recording:
-        observations, actions = (_column(group, key, name, self._spans[name]) for key in ("observations", "actions"))
-        return Recording(name, {BARE: observations}, actions)
-
-
-def spans(ends: np.ndarray) -> dict[str, slice]:
-    """The steps of each demonstration by name, from the steps [N] that end one; so does the last step."""
-    bounds = [0, *(np.flatnonzero(ends[:-1]) + 1).tolist(), len(ends)]
-    return {f"demo_{number}": slice(*span) for number, span in enumerate(pairwise(bounds)) if len(ends)}
 
 
 def _observed(group: h5py.Group, name: str) -> dict[str, str]:

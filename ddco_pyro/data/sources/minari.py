@@ -32,8 +32,8 @@ class Minari:
     frequency: float | None = None
     masks: Mapping[str, tuple[str, ...]] = {}
 
-    def __init__(self, folder: Path, storage: Any, external: bool, actions: Sequence[str]) -> None:
-        self.folder, self._storage, self._external, self._actions = folder, storage, external, actions
+    def __init__(self, folder: Path, storage: Any, actions: Sequence[str]) -> None:
+        self.folder, self._storage, self._actions = folder, storage, actions
         stored = _stored(folder)
         self._missing = first_missing(folder, storage.total_episodes, stored, "the dataset")
         self.names = tuple(f"demo_{index}" for index in sorted({*stored, *self._missing}))
@@ -92,10 +92,10 @@ class Minari:
         path = self.folder / "main_data.hdf5"
         if path.is_file():
             with opened(path) as file:
-                episode = member(file, f"episode_{index}", h5py.Group, "", self._external)
-                for key in datasets(episode, f"episode_{index}/", self._external):
-                    if member(episode, key, h5py.Dataset, "", self._external).shape:
-                        dataset_at(episode, key, f"episode_{index}/", self._external)
+                episode = member(file, f"episode_{index}", h5py.Group, "")
+                for key in datasets(episode, f"episode_{index}/"):
+                    if member(episode, key, h5py.Dataset, "").shape:
+                        dataset_at(episode, key, f"episode_{index}/")
 
 
 def _leaves(nested: Any, key: str, bare: str) -> Iterator[tuple[str, np.ndarray]]:
@@ -123,10 +123,9 @@ def _stored(folder: Path) -> set[int]:
 
 
 @contextmanager
-def open_minari(path: Path, external: bool = False, actions: Sequence[str] = ()) -> Iterator[Minari]:
+def open_minari(path: Path, actions: Sequence[str] = ()) -> Iterator[Minari]:
     """Open a dataset's folder, its folder ``data``, or the file ``main_data.hdf5``.
 
-    :param external: whether parts of the HDF5 file may be in other files.
     :param actions: names of nested actions that are the control together; all if empty.
     :raises DemonstrationsError: Minari is not installed, or cannot read the dataset.
     """
@@ -145,4 +144,4 @@ def open_minari(path: Path, external: bool = False, actions: Sequence[str] = ())
         storage = MinariStorage.read(folder)
     except (*DAMAGE, AssertionError, ImportError, AttributeError, RecursionError) as error:
         raise damaged(folder, "", error) from error
-    yield Minari(folder, storage, external, actions)
+    yield Minari(folder, storage, actions)

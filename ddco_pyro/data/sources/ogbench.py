@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from zipfile import BadZipFile, ZipFile
 from zlib import error as ZlibError
@@ -16,7 +17,7 @@ from ddco_pyro.data.checks import NUMBERS
 from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError
 from ddco_pyro.data.memory import refuse_too_much
 from ddco_pyro.data.pictures import channels_last, turned
-from ddco_pyro.data.sources.hdf5_layouts import BARE, spans
+from ddco_pyro.data.sources.hdf5_layouts import BARE
 from ddco_pyro.data.sources.metadata import stored_keys
 from ddco_pyro.data.sources.recording import Column, Recording, damaged
 
@@ -91,6 +92,12 @@ class OGBench:
             yield turned(self._array(key)[span].reshape(shape))
 
         return Column(channels_last(shape, dtype), dtype, blocks, named=key, aside=key not in (OBSERVATIONS, ACTIONS))
+
+
+def spans(ends: np.ndarray) -> dict[str, slice]:
+    """The steps of each demonstration by name, from the steps [N] that end one; so does the last step."""
+    bounds = [0, *(np.flatnonzero(ends[:-1]) + 1).tolist(), len(ends)]
+    return {f"demo_{number}": slice(*span) for number, span in enumerate(pairwise(bounds)) if len(ends)}
 
 
 def _headers(archive: ZipFile) -> dict[str, tuple[tuple[int, ...], np.dtype]]:

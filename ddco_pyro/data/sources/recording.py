@@ -215,8 +215,6 @@ def of_dataset(dataset: h5py.Dataset, where: str, part: slice = slice(None)) -> 
 
     Each pass opens the file unless it is open: a folder can have more files than may be open. Reading the column raises
     :class:`DemonstrationsError` if the file is damaged.
-
-    :raises DemonstrationsError: one step, or one HDF5 chunk, takes more memory than is allowed.
     """
     start, stop, _ = part.indices(len(dataset))
     at_once = block_steps(dataset.shape[1:], dataset.dtype)
@@ -224,8 +222,6 @@ def of_dataset(dataset: h5py.Dataset, where: str, part: slice = slice(None)) -> 
     path, place = os.path.abspath(dataset.file.filename), dataset.name  # absolute for readers in another folder
     lazy = is_image(shape, dataset.dtype) and shape[0] == len(dataset)
     kept = Pictures(path, place, where, dataset.shape) if lazy else None
-    least = dataset.dtype.itemsize * max(math.prod(dataset.shape[1:]), math.prod(dataset.chunks or ()))
-    refuse_too_much(least, f"{where}: to read one step", "store it in smaller steps or chunks")
 
     def read() -> Iterator[np.ndarray]:
         with nullcontext(dataset.file) if dataset else opened(path) as file:

@@ -7,15 +7,14 @@ Optional datasets ``mask/<name>`` list names of demonstrations (robomimic: filte
 from __future__ import annotations
 
 import json
-import shutil
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 import h5py
 import numpy as np
 
-from ddco_pyro.data.files import leftovers, only_one, whole_file, write_text
+from ddco_pyro.data.files import whole_file
 from ddco_pyro.data.hdf5 import (
     Attribute,
     DemonstrationsError,
@@ -45,14 +44,13 @@ class Robomimic:
 
     format = "robomimic"
 
-    def __init__(self, path: Path, file: h5py.File, external: bool = False) -> None:
-        self._external = external
-        self._data = member(file, "data", h5py.Group, "", external)
+    def __init__(self, path: Path, file: h5py.File) -> None:
+        self._data = member(file, "data", h5py.Group, "")
         self.files = (path,)
         self.names = tuple(sorted((name for name in self._data if _may_be_group(self._data, name)), key=natural))
         if not self.names:
             raise DemonstrationsError("the group 'data' holds no demonstrations; at least one is needed")
-        masks = member(file, "mask", h5py.Group, "", external) if named(file, "mask") else {}
+        masks = member(file, "mask", h5py.Group, "") if named(file, "mask") else {}
         self.masks: Mapping[str, tuple[str, ...]] = {name: self._mask(masks, name) for name in masks}
         known = attributes_of(self._data) | attributes_of(file)
         self.attributes: Mapping[str, Attribute] = {name: known[name] for name in known if name != ALL_STEPS}
@@ -61,7 +59,7 @@ class Robomimic:
     def _first(self) -> Mapping[str, Attribute]:
         """The attributes of the first demonstration; none where it cannot be read."""
         try:
-            return attributes_of(member(self._data, self.names[0], h5py.Group, "", self._external))
+            return attributes_of(member(self._data, self.names[0], h5py.Group, ""))
         except DemonstrationsError:
             return {}
 
@@ -72,9 +70,9 @@ class Robomimic:
 
         :param observations: keys to open; all if None.
         :param labels: names to open; all if None, and then none are required.
-        :raises DemonstrationsError: a part is missing, is in another file, or claims more than is stored.
+        :raises DemonstrationsError: a part is missing, is elsewhere, or claims more than is stored.
         """
-        group = member(self._data, name, h5py.Group, "", self._external)
+        group = member(self._data, name, h5py.Group, "")
         actions = self._column(group, "", "actions", name)
         attributes = attributes_of(group)
         claimed = attributes.pop(STEPS, actions.shape[0])
@@ -88,16 +86,16 @@ class Robomimic:
     def _columns(self, group: h5py.Group, folder: str, keys: Sequence[str] | None, name: str) -> dict[str, Column]:
         if keys is not None and not keys:
             return {}
-        members = member(group, folder, h5py.Group, f"{name}: ", self._external)
-        known = datasets(members, f"{name}: {folder}/", self._external) if keys is None else keys
+        members = member(group, folder, h5py.Group, f"{name}: ")
+        known = datasets(members, f"{name}: {folder}/") if keys is None else keys
         return {key: self._column(members, f"{folder}/", key, name) for key in known}
 
     def _column(self, group: h5py.Group, folder: str, key: str, name: str) -> Column:
-        dataset = dataset_at(group, key, f"{name}: {folder}", self._external)
+        dataset = dataset_at(group, key, f"{name}: {folder}")
         return of_dataset(dataset, f"{name}: {folder}{key}")
 
     def _mask(self, masks: h5py.Group, mask: str) -> tuple[str, ...]:
-        dataset = dataset_at(masks, mask, "mask/", self._external)
+        dataset = dataset_at(masks, mask, "mask/")
         names = of_dataset(dataset, f"mask/{mask}").array().ravel().tolist()
         return tuple(name.decode(errors="replace") if isinstance(name, bytes) else str(name) for name in names)
 
@@ -112,14 +110,13 @@ def _may_be_group(data: h5py.Group, name: str) -> bool:
 
 
 @contextmanager
-def open_robomimic(path: Path, external: bool = False) -> Iterator[Robomimic]:
+def open_robomimic(path: Path) -> Iterator[Robomimic]:
     """Open a file.
 
-    :param external: whether parts of the file may be in other files.
     :raises DemonstrationsError: the file cannot be read, or holds no demonstrations.
     """
     with opened(path) as file:
-        yield Robomimic(path, file, external)
+        yield Robomimic(path, file)
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------
@@ -165,123 +162,3 @@ def write_recording(data: h5py.Group, recording: Recording) -> None:
         for block in column.blocks():
             dataset[at : at + len(block)] = block
             at += len(block)
-
-
-# --- resumable writing ------------------------------------------------------------------------------------------------
-
-PART_BYTES = 64 * 2**20
-"""A part is closed from about this size on, or from ``at_most`` recordings on."""
-
-PART_RECORDINGS = 64
-
-_IDENTITY = "identity.json"
-
-
-class Parts:
-    """A file that is written in parts, made by :func:`parts_of`.
-
-    While ``demos.hdf5`` is made, the folder ``.demos.hdf5.parts`` holds HDF5 files of some demonstrations each. A
-    killed process leaves whole parts, from which the next process goes on.
-    """
-
-    def __init__(self, path: Path, folder: Path, at_most: int = PART_RECORDINGS) -> None:
-        self.path, self.folder, self.at_most = path, folder, at_most
-        self._parts = {name: part for part in self._files() for name in _names(part)}
-        self._open: list[Recording] = []
-        self._bytes = 0
-
-    @property
-    def done(self) -> Collection[str]:
-        """The names of the demonstrations that are safe."""
-        return self._parts.keys()
-
-    def _files(self) -> list[Path]:
-        return sorted(self.folder.glob("*.hdf5"))
-
-    def add(self, recording: Recording) -> None:
-        """Add a demonstration, which is safe once its part is closed."""
-        self._open.append(recording)
-        self._bytes += sum(column.dtype.itemsize * int(np.prod(column.shape)) for _, column in recording.columns())
-        if self._bytes >= PART_BYTES or len(self._open) >= self.at_most:
-            self.close()
-
-    def close(self) -> None:
-        """Write the open part."""
-        if not self._open:
-            return
-        part = self.folder / f"{len(self._files()):06d}.hdf5"
-        with whole_file(part) as temporary, written(temporary) as file:
-            for recording in self._open:
-                write_recording(file, recording)
-        self._parts |= {recording.name: part for recording in self._open}
-        self._open, self._bytes = [], 0
-
-    @contextmanager
-    def column(self, name: str, place: str) -> Iterator[Column]:
-        """An array of a safe demonstration, such as ``obs/camera``."""
-        with opened(self._parts[name]) as file:
-            yield of_dataset(file[f"{name}/{place}"], f"{name}: {place}")
-
-    def attributes(self) -> list[dict[str, Attribute]]:
-        """The attributes of every safe demonstration."""
-        attributes = []
-        for part in self._files():
-            with opened(part) as file:
-                attributes += [attributes_of(file[name]) for name in sorted(file, key=natural)]
-        return attributes
-
-    def finish(self, attributes: Mapping[str, Attribute], masks: Mapping[str, Sequence[str]]) -> None:
-        """Join the parts to the file."""
-        self.close()
-        with robomimic_file(self.path, attributes, masks) as data:
-            for part in self._files():
-                with opened(part) as source:
-                    for name in sorted(source, key=natural):
-                        source.copy(source[name], data, name)
-
-
-def _names(part: Path) -> list[str]:
-    with opened(part) as file:
-        return sorted(file, key=natural)
-
-
-@contextmanager
-def parts_of(path: Path, identity: str, wait: bool = False, at_most: int = PART_RECORDINGS) -> Iterator[Parts | None]:
-    """The parts of a file to be made; None if the file exists once no other process makes it.
-
-    :param identity: what determines the contents; parts with another identity are removed.
-    :param wait: wait for another process that makes the file, rather than refuse.
-    :param at_most: most demonstrations in a part, and most that an interruption can lose.
-    :raises Busy: another process is making this file.
-    """
-    folder = _folder(path)
-    with only_one(folder, wait):
-        if path.exists():
-            shutil.rmtree(folder)
-            yield None
-            return
-        known = folder / _IDENTITY
-        if not known.exists() or known.read_text(encoding="utf-8") != identity:
-            for old in folder.iterdir():
-                old.unlink()
-            write_text(known, identity)
-        for old in leftovers(folder):
-            old.unlink()
-        parts = Parts(path, folder, at_most)
-        try:
-            yield parts
-        finally:
-            if path.exists() or {entry.name for entry in folder.iterdir()} <= {_IDENTITY}:
-                shutil.rmtree(folder)
-
-
-def discard(path: Path) -> None:
-    """Remove the parts of a complete file, which a killed process may have left."""
-    folder = _folder(path)
-    if folder.exists():
-        with only_one(folder):
-            shutil.rmtree(folder)
-
-
-def _folder(path: Path) -> Path:
-    return path.with_name(f".{path.name}.parts")

@@ -54,16 +54,14 @@ def spoil(path: Path, place: str, chunk: int = 0) -> None:
     path.write_bytes(content)
 
 
-# --- parts in other files ---------------------------------------------------------------------------------------------
+# --- parts elsewhere --------------------------------------------------------------------------------------------------
 
 
-def raw(group: h5py.Group, folder: Path, size: int | None = STEPS * 2 * 8) -> None:
-    """Controls in a raw file of this size; None where it is missing."""
+def raw(group: h5py.Group, folder: Path) -> None:
+    """Controls in a raw file."""
+    (folder / "actions.raw").write_bytes(group["actions"][:].tobytes())
     del group["actions"]
-    path = folder / "actions.raw"
-    group.create_dataset("actions", (STEPS, 2), "f8", external=[(str(path), 0, STEPS * 2 * 8)])
-    if size is not None:
-        path.write_bytes(bytes(size))
+    group.create_dataset("actions", (STEPS, 2), "f8", external=[(str(folder / "actions.raw"), 0, STEPS * 2 * 8)])
 
 
 def linked(group: h5py.Group, folder: Path, place: str, key: str) -> None:
@@ -71,43 +69,18 @@ def linked(group: h5py.Group, folder: Path, place: str, key: str) -> None:
     instead(group.file, key, h5py.ExternalLink("other.hdf5", place))
 
 
-def link_to(group: h5py.Group, folder: Path, name: str) -> None:
-    pipe(folder, "pipe.hdf5")
-    instead(group, "obs/offsets", h5py.ExternalLink(name, "/x"))
-
-
-def virtual(
-    group: h5py.Group, folder: Path, source: str = "other.hdf5", rows: int = STEPS, there: int = STEPS, key: str = "x"
-) -> None:
-    """An observation whose first ``rows`` are those of another file, which has ``there``, and perhaps another key."""
+def virtual(group: h5py.Group, folder: Path) -> None:
+    """An observation that is that of another file."""
     layout = h5py.VirtualLayout((STEPS, 4), "f8")
-    layout[:rows] = h5py.VirtualSource(source, "x", (rows, 4))
-    del group["obs/offsets"]
-    group.create_virtual_dataset("obs/offsets", layout)
+    layout[:] = h5py.VirtualSource("other.hdf5", "x", (STEPS, 4))
     with h5py.File(folder / "other.hdf5", "w") as file:
-        file[key] = np.ones((there, 4))
-
-
-def virtual_here(group: h5py.Group, folder: Path, *parts: tuple[slice | int, int]) -> None:
-    """An observation whose rows are those of others in the same file: (rows, number of the demonstration)."""
-    layout = h5py.VirtualLayout((STEPS, 4), "f8")
-    for rows, number in parts:
-        layout[rows] = h5py.VirtualSource(".", f"/data/demo_{number}/obs/offsets", (STEPS, 4))[rows]
+        file["x"] = group["obs/offsets"][:]
     del group["obs/offsets"]
     group.create_virtual_dataset("obs/offsets", layout)
-
-
-# --- links ------------------------------------------------------------------------------------------------------------
 
 
 def soft(group: h5py.Group, folder: Path, key: str, target: str) -> None:
     instead(group.file, key, h5py.SoftLink(target))
-
-
-def soft_and_external(group: h5py.Group, folder: Path) -> None:
-    linked(group, folder, "/data/demo_0/obs", "data/demo_1/obs")
-    group["obs_again"] = h5py.SoftLink("obs")
-    soft(group, folder, "data/demo_0/obs/offsets", "/data/demo_1/obs_again/offsets")
 
 
 def twice(group: h5py.Group, folder: Path) -> None:
@@ -116,22 +89,6 @@ def twice(group: h5py.Group, folder: Path) -> None:
 
 def circle(group: h5py.Group, folder: Path) -> None:
     group["obs/again"] = group["obs"]
-
-
-def diamonds(group: h5py.Group, folder: Path) -> None:
-    """Four thousand million paths to thirty groups."""
-    group = group["obs"]
-    for _ in range(30):
-        below = group.create_group("left")
-        group["right"] = below
-        group = below
-
-
-def nested(group: h5py.Group, folder: Path) -> None:
-    group = group["obs"]
-    for _ in range(3000):
-        group = group.create_group("in")
-    group["x"] = np.zeros((STEPS, 1))
 
 
 # --- what is claimed --------------------------------------------------------------------------------------------------
@@ -208,49 +165,27 @@ def text(content: str) -> Callable[[Path], Path]:
     return make
 
 
-BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
-    f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]\n" for n in range(1, 12)
-)
-ELSEWHERE = r"demo_.* lies in another file: \S+/{}; where you trust that, .*import \S+ --allow-external"
 SPEC = "demonstrations: {{path: {}}}\nobservations: [x]\nbaseline: {{kind: flat}}\n"
-RAW, OTHER = ELSEWHERE.format("actions.raw"), ELSEWHERE.format("other.hdf5")
-EVEN_AND_ODD = (slice(0, None, 2), 0), (slice(1, None, 2), 2)
-FIRST_TWICE = tuple((step, 0) for step in (0, 0, *range(2, STEPS)))
-"""As many rows as there are."""
+REPACK = r"{}, which is not read; .*: h5repack --merge -l CONTI \S+ whole.hdf5"
+LINK = REPACK.format(r"demo_1.* is a link to {}")
 
 ROWS: dict[str, Row] = {
     "ordinary": Row(changed(lambda *_: None), None),
-    "external storage": Row(changed(raw), RAW),
-    "external storage that is missing": Row(changed(raw, None), RAW),
-    "external link to an array": Row(changed(linked, "/data/demo_0/obs/offsets", "data/demo_1/obs/offsets"), OTHER),
-    "external link to a group": Row(changed(linked, "/data/demo_0/obs", "data/demo_1/obs"), OTHER),
-    "external link to a demonstration": Row(changed(linked, "/data/demo_0", "data/demo_1"), OTHER),
-    "external link to all": Row(changed(linked, "/data", "data"), r"data lies in another file: \S+/other.hdf5"),
-    "soft link to an external link": Row(changed(soft_and_external), OTHER),
-    "external link to a pipe": Row(changed(link_to, "pipe.hdf5"), ELSEWHERE.format("pipe.hdf5")),
-    "external link to a device": Row(changed(link_to, "/dev/zero"), r"demo_1.* lies in another file: /dev/zero"),
-    "virtual, of another file": Row(changed(virtual), OTHER),
-    "virtual, of this file": Row(changed(virtual_here, *EVEN_AND_ODD), None),
-    "virtual, of itself": Row(changed(virtual_here, (slice(None), 1)), r"demo_1: obs/offsets is virtual.* in a circle"),
-    "virtual, with a row of no source": Row(
-        changed(virtual_here, *FIRST_TWICE), r"demo_1: obs/offsets is virtual, and a part of it has no source"
+    "external storage": Row(changed(raw), REPACK.format("demo_1: actions is stored in another file")),
+    "virtual": Row(changed(virtual), REPACK.format("demo_1: obs/offsets is virtual")),
+    "external link to an array": Row(
+        changed(linked, "/data/demo_0/obs/offsets", "data/demo_1/obs/offsets"), LINK.format("/data/demo_0/obs/offsets")
     ),
-    "virtual, of nothing in this file": Row(changed(virtual, "."), r"demo_1: obs/offsets is virtual: x is missing"),
-    "dangling array": Row(
-        changed(soft, "data/demo_1/obs/offsets", "/nowhere"),
-        r"demo_1: obs/offsets is a link to /nowhere, which leads nowhere",
+    "external link to a demonstration": Row(
+        changed(linked, "/data/demo_0", "data/demo_1"), LINK.format("/data/demo_0")
     ),
-    "dangling demonstration": Row(
-        changed(soft, "data/demo_1", "demo_9"), r"demo_1 is a link to demo_9, which leads nowhere"
+    "external link to all": Row(changed(linked, "/data", "data"), REPACK.format("data is a link to /data")),
+    "soft link": Row(
+        changed(soft, "data/demo_1/obs/offsets", "/data/demo_0/obs/offsets"), LINK.format("/data/demo_0/obs/offsets")
     ),
-    "soft link to itself": Row(
-        changed(soft, "data/demo_1/obs/offsets", "/data/demo_1/obs/offsets"), r"demo_1: obs/offsets is a link to"
-    ),
-    "soft link": Row(changed(soft, "data/demo_1/obs/offsets", "/data/demo_0/obs/offsets"), None),
+    "dangling link": Row(changed(soft, "data/demo_1", "demo_9"), LINK.format("demo_9")),
     "hard link": Row(changed(twice), None),
     "a group in itself": Row(changed(circle), r"demo_1: obs/again/.*: its groups go in a circle"),
-    "thirty groups of two links": Row(changed(diamonds), r"demo_1: obs/.*: its groups go in a circle"),
-    "3000 groups": Row(changed(nested), r"demo_1: obs/in/in/.* nested more than 32 deep"),
     "1e12 rows": Row(changed(rows_claimed), r"demo_1: actions claims 16000000000000 bytes, but the file holds \d+"),
     "a million rows": Row(
         changed(rows_claimed, 10**6), r"demo_1: actions claims 100 chunks, but the file holds 1; write it again"
@@ -266,8 +201,6 @@ ROWS: dict[str, Row] = {
     "spec: a pipe": Row(pipe, r"is no file of at most 256 kB"),
     "spec: a device": Row(endless, r"is no file of at most 256 kB"),
     "spec: large": Row(text("a: [" + "1, " * 500_000 + "]"), r"is no file of at most 256 kB"),
-    "spec: many values": Row(text("a: [" + "1, " * 12_000 + "]"), r"holds more than 10000 values"),
-    "spec: aliases of aliases": Row(text(BOMB), r"holds more than 10000 values where its aliases are written out"),
     "spec: nested": Row(text("[" * 2_000), r"nested too deeply"),
     "spec: of a pipe": Row(text(SPEC.format("PIPE")), r"is no regular file"),
     "spec: of a device": Row(text(SPEC.format("/dev/zero")), r"is no regular file"),

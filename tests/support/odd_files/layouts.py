@@ -91,24 +91,6 @@ def act_twice(folder: Path) -> Path:
     return dataset
 
 
-def d4rl(folder: Path, *without: str) -> Path:
-    """A flat file: the first demonstration reaches its goal, the second runs out of time, the last is cut."""
-    path = folder / "kitchen.hdf5"
-    ends = np.cumsum(LENGTHS) - 1
-    steps = np.arange(sum(LENGTHS))
-    arrays = {
-        "observations": np.concatenate([state(number) for number in range(len(LENGTHS))]),
-        "actions": np.concatenate([control(number) for number in range(len(LENGTHS))]),
-        "rewards": np.zeros(len(steps), np.float32),
-        "terminals": steps == ends[0],
-        "timeouts": steps == ends[1],
-    }
-    with h5py.File(path, "w") as file:
-        for name in arrays.keys() - set(without):
-            file[name] = arrays[name]
-    return path
-
-
 def ogbench(folder: Path, **more: np.ndarray) -> Path:
     """An npz file as OGBench writes it, with the poses of its simulator."""
     path = folder / "cube-single-play-v0.npz"
@@ -198,10 +180,6 @@ ROWS = {
     "act link": Row(act_linked, "episode_1.hdf5 leads out of the dataset"),
     "act twice": Row(
         act_twice, r"episode_1\.hdf5: has the number of episode_01\.hdf5|episode_01\.hdf5: has the number"
-    ),
-    "d4rl": Row(d4rl, IMPORT),
-    "d4rl without timeouts": Row(
-        lambda folder: d4rl(folder, "timeouts"), "has no timeouts, which mark the ends of demonstrations"
     ),
     "ogbench": Row(ogbench, IMPORT),
     "npz of other arrays": Row(

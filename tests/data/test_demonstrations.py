@@ -18,7 +18,7 @@ from random_demonstrations import demonstration, demonstrations
 from ddco_pyro.data.checks import LARGEST
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
 
-METAWORLD = Path(__file__).parents[2] / "shared" / "data" / "metaworld_pick_place.hdf5"
+METAWORLD = Path(__file__).parents[3] / "shared" / "data" / "metaworld_pick_place.hdf5"
 
 
 @pytest.fixture

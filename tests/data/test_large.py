@@ -14,8 +14,7 @@ from command_line import call
 from large import measured, zeros
 from random_demonstrations import demonstrations as random_demonstrations
 
-from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
-from ddco_pyro.data.inspection import inspect
+from ddco_pyro.data.demonstrations import DemonstrationsError
 from ddco_pyro.data.memory import PROGRAM, allowed
 from ddco_pyro.errors import BadInput
 from ddco_pyro.spec import parse_spec
@@ -121,39 +120,6 @@ def test_a_demonstration_that_cannot_be_segmented_is_refused(toy_run, tmp_path: 
     assert (ended.status, ended.err.count("\n")) == (2, 1)
     assert ended.err.startswith(f"ddco-pyro: {path}: demo_0: segmenting its 1000000 steps takes about")
     assert "divide it" in ended.err
-
-
-# --- what no block of it can be read ----------------------------------------------------------------------------------
-
-
-def nothing(group: h5py.Group, place: str, shape: tuple[int, ...], chunk: tuple[int, ...]) -> None:
-    """An array of which no chunk is stored."""
-    group.create_dataset(place, shape, "f8", chunks=chunk, compression="gzip")
-
-
-MUCH = "demo_0: obs/state: to read one step takes about 0.1 GB of memory, and 0.01 are allowed; store"
-
-
-@pytest.mark.parametrize(
-    ("make", "shape", "chunk", "message"),
-    [
-        (zeros, (3, 2 * 10**6), (1, 10**6), MUCH),
-        (zeros, (300, 10**4), (300, 10**4), MUCH),
-        (nothing, (3, 10**9), (1, 10**6), "demo_0: obs/state claims 24000000000 bytes, but the file holds 0; write it"),
-    ],
-    ids=["one step", "one chunk", "nothing stored"],
-)
-def test_what_cannot_be_read_in_blocks(make, shape, chunk, message: str, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setenv("DDCO_PYRO_MEMORY", "10MB")
-    path = tmp_path / "demos.hdf5"
-    with h5py.File(path, "w") as file:
-        for number in range(3):
-            group = file.create_group(f"data/demo_{number}")
-            group["actions"] = np.zeros((3, 2))
-            make(group, "obs/state", shape, chunk)
-    assert message in " ".join(inspect(path).problems)
-    with pytest.raises(DemonstrationsError, match=message):
-        Demonstrations.read(path)
 
 
 # --- what is streamed -------------------------------------------------------------------------------------------------

@@ -77,17 +77,6 @@ def test_the_base_of_a_mobile_robot_is_part_of_its_control(tmp_path: Path) -> No
         np.testing.assert_array_equal(demo.actions, np.hstack([odd.control(number), -odd.control(number)]))
 
 
-@pytest.mark.parametrize("block", [24, 10**9], ids=["two steps at a time", "all at once"])
-def test_d4rl(block: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ddco_pyro.data.pictures.BLOCK_BYTES", block)
-    path = odd.d4rl(tmp_path)
-    assert inspect(path).format == "d4rl"
-    demos = imported(path, tmp_path)
-    same_controls(demos)
-    for number, demo in enumerate(demos):
-        np.testing.assert_array_equal(demo.observations["state"], odd.state(number))
-
-
 @pytest.mark.parametrize("asked", [(), ("qpos", "observations"), ("state", "qpos")])
 def test_ogbench(asked: tuple[str, ...], tmp_path: Path) -> None:
     path, out = odd.ogbench(tmp_path), tmp_path / "demos.hdf5"

@@ -1,0 +1,383 @@
+"""Features of pictures: a frozen backbone and principal components, in a file and while a policy acts."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import math
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from pkgutil import resolve_name
+from typing import Any
+
+import h5py
+import numpy as np
+import torch
+from pydantic import ValidationError
+from torch.nn.functional import interpolate
+
+from ddco_pyro.data.checks import check, check_alike, problems_of_masks
+from ddco_pyro.data.hdf5 import DemonstrationsError, opened
+from ddco_pyro.data.memory import refuse_too_much
+from ddco_pyro.data.sources import Column, Recording, refuse_foreign
+from ddco_pyro.data.sources.recording import of_array
+from ddco_pyro.data.sources.robomimic import Robomimic, open_robomimic, robomimic_file, write_recording
+from ddco_pyro.errors import BadInput, nearest
+from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
+from ddco_pyro.spec.base import Count, Items, Model
+from ddco_pyro.training.devices import one_thread
+
+__all__ = ["Encoder", "encode", "load"]
+
+TIMM = "timm"
+
+AT_ONCE = 32
+"""Most pictures of a call of the backbone."""
+
+SIZE = 64
+"""Most principal components unless their number is given."""
+
+NOISE = 1e-4
+"""Share of the first component's variance below which a component is noise: a hundredth of its spread. All components
+have the unit of the features; standardised one by one, noise would count as much as what moves."""
+
+TOLERANCE = 1e-3
+"""Largest difference between two calls on the same picture, as a part of the largest feature."""
+
+ENCODERS = "encoders"
+"""Group of a file: the encoder of each observation that was encoded."""
+
+
+# --- backbones --------------------------------------------------------------------------------------------------------
+
+
+class Backbone:
+    """A frozen network: uint8 pictures [N, H, W, C] to features [N, F].
+
+    :param name: ``timm:NAME`` for a pretrained model of timm, or a user's ``module:function``.
+    :raises BadInput: it cannot be had, or is user code and that is not allowed; at a call, it fails or gives no
+        features.
+    """
+
+    def __init__(self, name: str, allow_code: bool = False) -> None:
+        self.name = name
+        module, _, rest = name.partition(":")
+        if not rest:
+            raise BadInput(
+                f"there is no encoder {name!r}; take timm:NAME, such as timm:resnet18.a1_in1k, or your own "
+                "module:function"
+            )
+        if module != TIMM and not allow_code:
+            raise BadInput(
+                f"encoder {name!r} would import user code; pass --allow-code if you trust it (in Python: "
+                "allow_code=True)"
+            )
+        try:
+            self._call: Any = _pretrained(rest) if module == TIMM else resolve_name(name)
+        except Exception as error:  # whatever the network's code raises
+            timm = "; check the name, the connection, and: pip install 'ddco-pyro[timm]' (torchvision has to fit torch)"
+            remedy = timm if module == TIMM else ""
+            raise BadInput(f"encoder {name!r} cannot be loaded: {_message(error)}{remedy}") from error
+        if not callable(self._call):
+            raise BadInput(f"encoder {name!r}: cannot be called; it has to be a function of pictures")
+
+    @property
+    def code(self) -> bytes:
+        """The source of the module; empty where that is not one file."""
+        module = sys.modules.get(self.name.partition(":")[0])
+        return Path(module.__file__).read_bytes() if module is not None and module.__file__ else b""
+
+    def __call__(self, pictures: np.ndarray) -> np.ndarray:
+        """Features of each picture, float32 [N, F]."""
+        try:
+            values, count = np.asarray(self._call(pictures)), len(pictures)
+        except Exception as error:
+            raise BadInput(f"encoder {self.name!r} fails on pictures {[*pictures.shape]}: {_message(error)}") from error
+        if values.dtype.kind != "f":
+            raise BadInput(f"encoder {self.name!r} gives {values.dtype}; it has to give floats")
+        if values.ndim != 2 or len(values) != count or not values.shape[1]:
+            had = f"shape {values.shape} for {count} pictures; it has to be ({count}, features)"
+            raise BadInput(f"encoder {self.name!r} gives {had}")
+        values = values.astype(np.float32)
+        if not np.isfinite(values).all():
+            raise BadInput(f"encoder {self.name!r} gives features that are NaN or infinite in float32")
+        return values
+
+    def try_out(self, pictures: np.ndarray) -> int:
+        """The number of features, after comparing those of a second call, and of a picture alone.
+
+        :raises BadInput: they differ, or the backbone fails.
+        """
+        first, again, alone = self(pictures), self(pictures), self(pictures[:1])
+        for values, other, when in (
+            (first, again, "when it is called again; switch off dropout and noise"),
+            (first[:1], alone, "of a picture among others than alone; switch to evaluation mode"),
+        ):
+            if values.shape != other.shape or np.abs(values - other).max() > TOLERANCE * np.abs(first).max():
+                raise BadInput(f"encoder {self.name!r} gives other features {when}")
+        return first.shape[1]
+
+
+def _pretrained(name: str) -> Callable[[np.ndarray], np.ndarray]:
+    """timm's model of this name, without its classifier. Its weights are downloaded at the first use.
+
+    Whole pictures are scaled to the size and the colours that the model was trained with.
+    """
+    timm = importlib.import_module(TIMM)
+    network = timm.create_model(name, pretrained=True, num_classes=0).eval()
+    trained_with = timm.data.resolve_model_data_config(network)
+    mean, std = (torch.tensor(trained_with[key])[:, None, None] for key in ("mean", "std"))
+
+    @torch.no_grad()
+    def features(pictures: np.ndarray) -> np.ndarray:
+        colours = torch.from_numpy(pictures).permute(0, 3, 1, 2).float() / 255
+        scaled = interpolate(colours, trained_with["input_size"][1:], mode="bilinear", antialias=True)
+        return network((scaled - mean) / std).numpy()  # type: ignore[no-any-return]
+
+    return features
+
+
+def _message(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+# --- principal components ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Projection:
+    """The projection onto principal components: (x − ``mean`` [F]) · ``components`` [N, F]ᵀ.
+
+    :param explained: the share of the features' variance that is kept.
+    """
+
+    mean: np.ndarray
+    components: np.ndarray
+    explained: float
+
+    def __call__(self, features: np.ndarray) -> np.ndarray:
+        """[T, F] to float32 [T, N]."""
+        return ((features - self.mean) @ self.components.T).astype(np.float32)
+
+
+def principal_components(blocks: Sequence[np.ndarray], size: int, least: float = 0.0) -> Projection:
+    """The ``size`` principal components of the rows of blocks [M, F], at least ``size`` in all.
+
+    The entry of each component that is largest in magnitude is positive.
+
+    :param least: components with a smaller share of the first one's variance are left out.
+    """
+    origin = blocks[0][0].astype(np.float64)  # near the mean, so that subtracting that loses little
+    number, total, products = sum(map(len, blocks)), np.zeros(len(origin)), np.zeros((len(origin), len(origin)))
+    for block in blocks:
+        rows = block - origin
+        total += rows.sum(0)
+        products += rows.T @ rows
+    offset = total / number
+    values, vectors = np.linalg.eigh(products - number * np.outer(offset, offset))
+    variance = values.clip(0)
+    size = min(size, max(1, int((variance >= least * variance[-1]).sum())))
+    kept = vectors[:, ::-1][:, :size].T
+    largest = np.take_along_axis(kept, np.abs(kept).argmax(1)[:, None], 1)
+    explained = float(variance[::-1][:size].sum() / variance.sum()) if variance.any() else 1.0
+    return Projection(origin + offset, kept * np.where(largest < 0, -1.0, 1.0), explained)
+
+
+# --- encoders ---------------------------------------------------------------------------------------------------------
+
+
+class About(Model):
+    """The facts of an encoder.
+
+    :param encoder: ``timm:NAME`` or ``module:function``.
+    :param observation: the key of the pictures [H, W, C] it was made for.
+    :param features: their number before they are reduced to ``size``.
+    :param explained: the share of their variance in the training demonstrations that is kept.
+    """
+
+    encoder: str
+    observation: str
+    picture: Items[Count]
+    features: Count
+    size: Count
+    explained: float = 1.0
+
+
+@dataclass(frozen=True)
+class Encoder:
+    """A picture to a vector: call it with uint8 [H, W, C], and it gives float32 [size]."""
+
+    about: About
+    backbone: Backbone
+    projection: Projection | None
+
+    def __call__(self, picture: np.ndarray) -> np.ndarray:
+        """The features that a policy, fitted to them, reads in place of the picture.
+
+        :raises BadInput: the picture has another type or shape.
+        """
+        picture = np.asarray(picture)
+        if picture.dtype != np.uint8 or picture.shape != self.about.picture:
+            raise BadInput(
+                f"{self.about.observation}: is {picture.dtype} {picture.shape}; this encoder reads uint8 "
+                f"{self.about.picture}"
+            )
+        return self.reduced(self.backbone(picture[None]))[0]
+
+    def reduced(self, features: np.ndarray) -> np.ndarray:
+        """The backbone's features [T, F] as float32 [T, size]."""
+        return features if self.projection is None else self.projection(features)
+
+    def write(self, group: h5py.Group) -> None:
+        """Write the encoder into an empty group; of the backbone the name alone."""
+        group.attrs["about"] = self.about.model_dump_json()
+        if self.projection is not None:
+            group["mean"], group["components"] = self.projection.mean, self.projection.components
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of what decides the features: facts, the code of a user's module, and the projection."""
+        sha256 = hashlib.sha256(self.about.model_dump_json().encode() + self.backbone.code)
+        if self.projection is not None:
+            sha256.update(self.projection.mean.tobytes() + self.projection.components.tobytes())
+        return sha256.hexdigest()
+
+
+def load(path: str | Path, key: str | None = None, allow_code: bool = False) -> Encoder:
+    """An encoder in a file that ``ddco-pyro encode`` has written.
+
+    :param key: the observation that it gives; needed where the file has several.
+    :param allow_code: import the user's function that it names.
+    :raises BadInput: there is none, it is damaged, or it names user code and that is not allowed.
+    """
+    with opened(path) as file:
+        known = list(file.get(ENCODERS, ()))
+        if key not in known and (key is not None or len(known) != 1):
+            there = ", ".join(known) or "none"
+            raise DemonstrationsError(f"there is no encoder of {key or 'one observation alone'}; there is: {there}")
+        group = file[ENCODERS][key or known[0]]
+        try:
+            about = About.model_validate_json(group.attrs["about"])
+        except ValidationError as error:
+            raise DemonstrationsError(f"{group.name} is damaged ({_message(error)}); encode the file again") from error
+        projection = None
+        if "components" in group:
+            projection = Projection(group["mean"][()], group["components"][()], about.explained)
+    return Encoder(about, Backbone(about.encoder, allow_code), projection)
+
+
+# --- files ------------------------------------------------------------------------------------------------------------
+
+
+def encode(
+    path: str | Path,
+    out: str | Path,
+    observation: str,
+    encoder: str,
+    size: int | None = None,
+    name: str | None = None,
+    on_event: OnEvent = ignore,
+    allow_code: bool = False,
+) -> Encoder:
+    """Write the demonstrations of ``path`` to ``out``, with features in place of pictures, and return the encoder.
+
+    ``out`` holds the encoder, too. Principal components are those of the training demonstrations: ``mask/train``, else
+    all that are not in ``mask/valid``.
+
+    :param observation: the key of the pictures, uint8 [T, H, W, C].
+    :param encoder: ``timm:NAME`` or ``module:function``.
+    :param size: number of principal components. By default at most :data:`SIZE`, without those that are noise
+        (:data:`NOISE`); fewer features are not projected.
+    :param name: the new observation's key; ``<observation>_features`` by default.
+    :raises DemonstrationsError: the demonstrations cannot be used, the observation is missing or no picture, or there
+        is too little memory.
+    :raises BadInput: ``out`` is there already; the encoder cannot be used, or gives fewer features than ``size``.
+    """
+    path, out, key = Path(path), Path(out), name or f"{observation}_features"
+    if out.exists():
+        raise BadInput(f"{out}: is there already; remove it, or choose another --out")
+    refuse_foreign(path)
+    with open_robomimic(path) as source:
+        recordings = {own: source.recording(own) for own in source.names}
+        training = _checked(source, recordings, observation)
+        if key in recordings[source.names[0]].observations:
+            raise DemonstrationsError(f"obs/{key} is there already; choose another name with --as")
+        pictures = {own: recording.observations[observation] for own, recording in recordings.items()}
+        backbone = Backbone(encoder, allow_code)
+        number = backbone.try_out(next(_batches(pictures[training[0]])))
+        steps = sum(pictures[own].shape[0] for own in training)
+        if size is not None and size > number:
+            raise BadInput(f"--size {size}: encoder {encoder!r} gives {number} features; take at most as many")
+        if size is not None and size > steps:
+            raise BadInput(f"--size {size}: there are {steps} training pictures; take at most as many")
+        every = sum(column.shape[0] for column in pictures.values())
+        what = f"{number} features of {every} pictures"
+        refuse_too_much(4 * number * every + 4 * 8 * number**2, what, "take an encoder that gives fewer")
+        features = dict[str, np.ndarray]()
+        for own, column in pictures.items():
+            features[own] = np.concatenate([backbone(batch) for batch in _batches(column)])
+            if (there := features[own].shape[1]) != number:
+                raise BadInput(
+                    f"encoder {encoder!r} gives {there} features in {own}, and {number} in {training[0]}; it has to "
+                    "give as many of every picture"
+                )
+            on_event(DemonstrationsDone(len(features), len(pictures)))
+        projection = None
+        if size is not None or number > min(SIZE, steps):
+            with one_thread():  # same bits
+                rows = [features[own] for own in training]
+                projection = principal_components(rows, size or min(SIZE, steps), NOISE if size is None else 0.0)
+        about = About(
+            encoder=encoder,
+            observation=observation,
+            picture=pictures[training[0]].shape[1:],
+            features=number,
+            size=number if projection is None else len(projection.components),
+            explained=1.0 if projection is None else projection.explained,
+        )
+        made = Encoder(about, backbone, projection)
+        with robomimic_file(out, source.attributes, source.masks) as data, opened(path) as before:
+            for own, whole in recordings.items():
+                seen = {other: column for other, column in whole.observations.items() if other != observation}
+                seen[key] = of_array(made.reduced(features[own]))
+                write_recording(data, replace(whole, observations=seen))
+            if ENCODERS in before:
+                before.copy(ENCODERS, data.file)
+            made.write(data.file.create_group(f"{ENCODERS}/{key}"))
+    return made
+
+
+def _checked(source: Robomimic, recordings: Mapping[str, Recording], key: str) -> tuple[str, ...]:
+    """The names of the training demonstrations.
+
+    :raises DemonstrationsError: the observation is missing or no picture, or the demonstrations are refused or differ.
+    """
+    first = recordings[source.names[0]]
+    if key not in first.observations:
+        known = [name for name, column in first.observations.items() if column.image]
+        there = ", ".join(known) or "none"
+        raise DemonstrationsError(f"there is no observation {key!r}{nearest(key, known)}; pictures are: {there}")
+    for name, recording in recordings.items():
+        check(recording)
+        check_alike(recording, first)
+        column = recording.observations[key]
+        if not column.image or not math.prod(column.shape[1:]):
+            had = f"{column.dtype} {[*column.shape]}"
+            raise DemonstrationsError(
+                f"{name}: obs/{key} is {had}; pictures are uint8 [steps, height, width, channels]"
+            )
+    for problem in problems_of_masks(source.masks, source.names):
+        raise DemonstrationsError(problem)
+    held_out = set(source.masks.get("valid", ()))
+    training = source.masks.get("train", tuple(name for name in source.names if name not in held_out))
+    if not training:
+        raise DemonstrationsError("no demonstration is left to train with; change the masks")
+    return training
+
+
+def _batches(pictures: Column) -> Iterator[np.ndarray]:
+    """Pictures in order, [M, H, W, C] with M at most :data:`AT_ONCE`."""
+    for block in pictures.blocks():
+        yield from (block[start : start + AT_ONCE] for start in range(0, len(block), AT_ONCE))

@@ -1,0 +1,120 @@
+"""HDF5 files of which parts are elsewhere or were never stored: refused, with the command that mends them."""
+
+from __future__ import annotations
+
+import pickle
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from command_line import call
+from odd_files import Row
+from odd_files.hdf5 import ROWS, demonstrations, last_not_whole
+
+from ddco_pyro.data import memory
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.files import Damaged
+from ddco_pyro.data.hdf5 import DemonstrationsError
+
+
+@pytest.mark.parametrize("kind", ["external storage", "virtual", "external link to a demonstration", "soft link"])
+def test_parts_elsewhere_are_refused(kind: str, tmp_path: Path, toy_run) -> None:
+    odd = ROWS[kind]
+    path = odd.make(tmp_path)
+    with pytest.raises(DemonstrationsError, match=odd.says):
+        Demonstrations.read(path)
+    ended = call("segment", toy_run.folder, path, "--in-place")
+    assert (ended.status, ended.err.count("\n")) == (2, 1)
+    assert re.search(odd.says, ended.err)
+    repack = shutil.which("h5repack")
+    if repack and "link" not in kind:
+        subprocess.run([repack, "--merge", "-l", "CONTI", path, tmp_path / "whole.hdf5"], check=True)
+        with h5py.File(path) as file:
+            truth = file["data/demo_1/actions"][:], file["data/demo_1/obs/offsets"][:]
+        (copy,) = Demonstrations.read(tmp_path / "whole.hdf5").select(["demo_1"])
+        np.testing.assert_array_equal(copy.actions, truth[0])
+        np.testing.assert_array_equal(copy.observations["offsets"], truth[1])
+
+
+@pytest.mark.parametrize(
+    "row", ["dangling link", "external link to an array", "a chunk missing", "1e12 rows", "a group in itself"]
+)
+def test_skip_broken_leaves_out_what_is_not_there(row: str, tmp_path: Path) -> None:
+    odd: Row = ROWS[row]
+    ended = call("import", odd.make(tmp_path), "--out", tmp_path / "out.hdf5", "--skip-broken")
+    assert ended.status == 0
+    assert "left out demo_1: demo_1" in ended.err
+    assert Demonstrations.read(tmp_path / "out.hdf5").names == ("demo_0", "demo_2", "demo_3", "demo_4", "demo_5")
+
+
+def test_nothing_is_written_before_all_headers_are_known(tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    path = last_not_whole(tmp_path / "in")
+    assert call("import", path, "--out", tmp_path / "out.hdf5").status == 2
+    assert list(tmp_path.iterdir()) == [tmp_path / "in"]
+
+
+def test_an_array_under_two_names_is_read_twice(tmp_path: Path) -> None:
+    with demonstrations(tmp_path / "demos.hdf5") as file:
+        for group in file["data"].values():
+            group["obs/again"] = group["obs/offsets"]
+    first = Demonstrations.read(tmp_path / "demos.hdf5")[0].observations
+    assert set(first) == {"offsets", "visited", "again"}
+    np.testing.assert_array_equal(first["again"], first["offsets"])
+
+
+def test_a_minari_episode_that_is_not_whole(tmp_path: Path) -> None:
+    pytest.importorskip("minari")
+    from ddco_pyro.data.sources.minari import Minari
+
+    class Storage:
+        total_episodes, metadata = 2, {}
+
+    with h5py.File(tmp_path / "main_data.hdf5", "w") as file:
+        for index in range(2):
+            file[f"episode_{index}/infos/one"] = 1.0
+        file.create_dataset("episode_1/actions", (9, 2), "f8", chunks=(4, 2))[:4] = 1.0
+    with pytest.raises(DemonstrationsError, match=r"episode_1/actions claims 144 bytes, but the file holds 64"):
+        Minari(tmp_path, Storage(), ()).recording("demo_1")
+
+
+def test_a_damaged_file_is_said_by_another_process() -> None:
+    error = Damaged(Path("run/metrics.json"), "is no JSON", "remove it")
+    assert str(pickle.loads(pickle.dumps(error))) == str(error) == "run/metrics.json: is damaged: is no JSON; remove it"
+
+
+# --- memory -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("groups", "limits", "free"),
+    [
+        ("0::/job/step\n", {"job/memory.max": "3000000\n", "job/step/memory.max": "max\n"}, 3_000_000),
+        ("0::/job\n", {"job/memory.max": "9000000\n", "memory.max": "max\n"}, 4_096_000),
+        ("0::/\n", {}, 4_096_000),
+    ],
+)
+def test_what_is_free(groups: str, limits: dict[str, str], free: int, tmp_path: Path) -> None:
+    """A machine with 4000 kB free."""
+    files = {"proc/meminfo": "MemTotal: 8000 kB\nMemAvailable:   4000 kB\n", "proc/self/cgroup": groups}
+    for name, text in {**files, **{f"sys/fs/cgroup/{name}": text for name, text in limits.items()}}.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    assert memory._free(tmp_path) == free
+    shutil.rmtree(tmp_path / "proc")
+    assert memory._free(tmp_path) > 1e8  # all that this machine has
+
+
+def test_free_memory_decides_what_is_refused_and_no_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Chunks are cut as if 2 GB were allowed, wherever ``DDCO_PYRO_MEMORY`` is not set."""
+    monkeypatch.delenv("DDCO_PYRO_MEMORY", raising=False)
+    cut = memory.share()
+    for free in (1e9, 64e9):
+        monkeypatch.setattr(memory, "_free", lambda free=free: free)
+        assert (memory.allowed(), memory.share()) == (free, cut)
+    monkeypatch.setenv("DDCO_PYRO_MEMORY", "2GB")
+    assert (memory.allowed(), memory.share()) == (2e9, cut)

@@ -1,0 +1,240 @@
+"""Pictures encoded as vectors: against timm, scikit-learn and planted places, in a file and while acting."""
+
+from __future__ import annotations
+
+import sys
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from command_line import call
+from dots import SIZE, dots, followed, together
+from planted import make_spec, make_trainer, make_truth, plant
+from sklearn.decomposition import PCA
+from sklearn.linear_model import LinearRegression
+from sklearn.metrics import normalized_mutual_info_score
+
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.encoding import Backbone, encode, load, principal_components
+from ddco_pyro.errors import BadInput
+from ddco_pyro.events import DemonstrationsDone
+from ddco_pyro.inference import segment
+from ddco_pyro.model.batch import encode as prepare
+
+MEANS, PLACES = "user_encoders:means", "user_encoders:places"
+
+
+@pytest.fixture
+def out(tmp_path):
+    return tmp_path / "out.hdf5"
+
+
+def encoded(path, out, encoder=MEANS, **options):
+    return encode(path, out, "camera", encoder, allow_code=True, **options)
+
+
+# --- what comes out ---------------------------------------------------------------------------------------------------
+
+
+def test_components_say_where_the_dot_is(tmp_path, out):
+    """R² of the dot's place as a linear map of the features, in demonstrations that were held out of everything."""
+    followed(24).write(tmp_path / "dots.hdf5")
+    encoded(tmp_path / "dots.hdf5", out, PLACES, size=16)
+    train, valid = Demonstrations.read(out).split(0.2, 0)
+    places = LinearRegression().fit(together(train, "camera_features"), together(train, "place"))
+    assert places.score(together(valid, "camera_features"), together(valid, "place")) > 0.9
+
+
+def test_options_are_recovered_from_features(tmp_path, out):
+    """Planted in a plane, and seen as pictures of a dot alone."""
+    truth = make_truth(make_spec((3,)))
+    demos, choices = plant(truth, 40, 20, seed=1)
+    drawn = [Demonstration(demo.name, {"camera": dots(demo.observations["state"])}, demo.actions) for demo in demos]
+    Demonstrations(tuple(drawn)).write(tmp_path / "planted.hdf5")
+    encoded(tmp_path / "planted.hdf5", out, PLACES, size=8, name="state")
+    spec = make_spec((3,), epochs=300, restarts=1, initialize="vq_controls")
+    found = make_trainer(spec, Demonstrations.read(out), tmp_path / "fit").run()
+    batch = prepare(Demonstrations.read(out), found.encoder, found.scaling)
+    segments = segment(found.tabulate(batch), batch.lengths)[0]
+    assert normalized_mutual_info_score(choices.flatten(), segments.flatten()) > 0.85
+
+
+def test_all_but_the_pictures_stays(few_dots, out):
+    before, seen = Demonstrations.read(few_dots), []
+    encoded(few_dots, out, size=4, on_event=seen.append)
+    assert seen == [DemonstrationsDone(done, 6) for done in range(1, 7)]
+    after = Demonstrations.read(out)
+    assert (after.masks, after.names, after.attributes) == (before.masks, before.names, before.attributes)
+    assert after.observation_shapes == {"other": (4, 4, 2), "place": (2,), "camera_features": (4,)}
+    labelled = [Demonstrations.read(path, labels=["phase"]) for path in (few_dots, out)]
+    for demo, other in zip(*labelled, strict=True):
+        np.testing.assert_array_equal(demo.actions, other.actions)
+        np.testing.assert_array_equal(demo.labels["phase"], other.labels["phase"])
+        np.testing.assert_array_equal(demo.observations["other"], other.observations["other"])
+        np.testing.assert_array_equal(demo.observations["place"], other.observations["place"])
+        assert demo.attributes == other.attributes
+    with h5py.File(out) as file:
+        assert file["data/demo_0/obs/camera_features"].dtype == np.float32
+
+
+@pytest.mark.parametrize("size", [1, 4, 9])
+def test_principal_components_are_those_of_all_rows_at_once(size):
+    random = np.random.default_rng(0)
+    rows = 100 + random.normal(size=(500, 9)) @ random.normal(size=(9, 9))
+    ours, theirs = principal_components(np.array_split(rows.astype(np.float32), 13), size), PCA(size).fit(rows)
+    projected, expected = ours(rows), theirs.transform(rows)
+    np.testing.assert_allclose(projected * np.sign((projected * expected).sum(0)), expected, atol=1e-4)
+    np.testing.assert_allclose(ours.explained, theirs.explained_variance_ratio_.sum(), rtol=1e-6)
+    spread = theirs.explained_variance_ / theirs.explained_variance_[0]
+    for least in (0.0, 0.3, 2.0):
+        without = principal_components([rows], size, least)
+        assert len(without.components) == max(1, (spread >= least).sum())
+
+
+def test_components_see_the_training_demonstrations_alone(few_dots, out):
+    projection = encoded(few_dots, out, size=2).projection
+    train, _ = Demonstrations.read(few_dots).split(0.2, 0)
+    pictures = together(train, "camera").astype(float)
+    rows = np.concatenate([pictures.mean((1, 2)), pictures[:, : SIZE // 2].mean((1, 2))], 1)
+    np.testing.assert_allclose(projection.mean, rows.mean(0), rtol=1e-6)
+    np.testing.assert_allclose(np.abs(projection.components), np.abs(PCA(2).fit(rows).components_), atol=1e-4)
+
+
+@pytest.mark.parametrize(("encoder", "size"), [(MEANS, None), (MEANS, 3), (PLACES, None)])
+def test_a_picture_that_is_seen_while_acting(few_dots, out, encoder, size):
+    about = encoded(few_dots, out, encoder, size=size).about
+    assert (about.features, about.size < 5) == ({MEANS: 4, PLACES: 80}[encoder], True)
+    loaded, pictures = load(out, allow_code=True), together(Demonstrations.read(few_dots), "camera")
+    one_by_one = np.stack([loaded(picture) for picture in pictures])
+    assert one_by_one.dtype == np.float32
+    np.testing.assert_allclose(one_by_one, together(Demonstrations.read(out), "camera_features"), rtol=1e-4, atol=1e-5)
+    with pytest.raises(BadInput, match=r"camera: is float64 \(20, 20, 2\); this encoder reads uint8 \(20, 20, 2\)"):
+        loaded(pictures[0] / 255)
+
+
+def test_a_second_camera_is_encoded_by_a_second_call(tmp_path, out):
+    demos = followed(4)
+    both = [
+        Demonstration(
+            demo.name, {"camera": demo.observations["camera"], "wrist": demo.observations["camera"]}, demo.actions
+        )
+        for demo in demos
+    ]
+    Demonstrations(tuple(both)).write(tmp_path / "both.hdf5")
+    encoded(tmp_path / "both.hdf5", tmp_path / "first.hdf5", size=1)
+    encode(tmp_path / "first.hdf5", out, "wrist", MEANS, size=2, allow_code=True)
+    for key, size in (("camera_features", 1), ("wrist_features", 2)):
+        encoder = load(out, key, allow_code=True)
+        np.testing.assert_allclose(
+            encoder(both[0].observations["camera"][0]), Demonstrations.read(out)[0].observations[key][0], rtol=1e-4
+        )
+        assert encoder.about.size == size
+    with pytest.raises(
+        BadInput, match="there is no encoder of one observation alone; there is: camera_features, wrist_f"
+    ):
+        load(out)
+
+
+def test_models_of_timm(monkeypatch):
+    """Of a picture of the size that the model was trained with: what timm's own preprocessing gives."""
+    timm, pil = pytest.importorskip("timm"), pytest.importorskip("PIL.Image")
+    torch.manual_seed(0)
+    network = timm.create_model("resnet18.a1_in1k", pretrained=False, num_classes=0).eval()
+    monkeypatch.setattr(timm, "create_model", lambda name, *, pretrained, num_classes: network)
+    backbone = Backbone("timm:resnet18.a1_in1k")
+    pictures = np.random.default_rng(0).integers(0, 256, (2, 224, 224, 3), dtype=np.uint8)
+    settings = timm.data.resolve_model_data_config(network) | {"crop_pct": 1.0}
+    prepare = timm.data.create_transform(**settings, is_training=False)
+    with torch.no_grad():
+        expected = network(torch.stack([prepare(pil.fromarray(picture)) for picture in pictures])).numpy()
+    np.testing.assert_allclose(backbone(pictures), expected, rtol=1e-4, atol=1e-5)
+    assert backbone.try_out(pictures[:, ::3, ::2]) == 512
+
+
+def test_the_command(few_dots, out):
+    arguments = ("encode", few_dots, "--observation", "camera", "--encoder", MEANS, "--allow-code", "--size", 3)
+    ended = call(*arguments, "--out", out)
+    assert ended.status == 0
+    assert ended.out.startswith(f"{out}: obs/camera_features: 3 of 4 features, ")
+    before = out.read_bytes()
+    other = call(*arguments, "--out", out)
+    assert (other.status, out.read_bytes()) == (2, before)
+    assert f"{out}: is there already; remove it, or choose another --out" in other.err
+    assert [path.name for path in out.parent.iterdir()] == ["out.hdf5"]
+
+
+# --- what cannot be encoded -------------------------------------------------------------------------------------------
+
+
+OWN = "user_encoders:"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--observation", "camra"], "there is no observation 'camra' (did you mean 'camera'?); pictures are: camera"),
+        (["--observation", "place"], "obs/place is float64 [8, 2]; pictures are uint8 [steps, height, width"),
+        (["--size", "129"], "--size 129: encoder 'user_encoders:means' gives 4 features; take at most as many"),
+        (["--size", "60", "--encoder", PLACES], "--size 60: there are 35 training pictures; take at most as many"),
+        (["--as", "place"], "obs/place is there already; choose another name with --as"),
+        (["--encoder", "resnet18"], "there is no encoder 'resnet18'; take timm:NAME, such as timm:resnet18.a1_in1k"),
+        (["--encoder", f"{OWN}nothing"], "cannot be loaded: module 'user_encoders' has no attribute"),
+        (["--encoder", "no_such_module:encoder"], "cannot be loaded: No module named 'no_such_module'"),
+        (["--encoder", f"{OWN}not_callable"], "cannot be called; it has to be a function of pictures"),
+        (["--encoder", f"{OWN}raises"], "fails on pictures [8, 20, 20, 2]: expected 224 x 224 pixels"),
+        (["--encoder", f"{OWN}integers"], "gives int64; it has to give floats"),
+        (["--encoder", f"{OWN}flat"], "gives shape (8,) for 8 pictures; it has to be (8, features)"),
+        (["--encoder", f"{OWN}not_finite"], "gives features that are NaN or infinite"),
+        (["--encoder", f"{OWN}noisy"], "gives other features when it is called again"),
+        (["--encoder", f"{OWN}together"], "gives other features of a picture among others than alone"),
+    ],
+)
+def test_what_cannot_be_used(few_dots, out, options, message):
+    given = ["--observation", "camera", "--encoder", MEANS, "--allow-code", *options]
+    refused(call("encode", few_dots, *given, "--out", out), out, message)
+
+
+def test_timm_is_an_extra(few_dots, out, monkeypatch):
+    monkeypatch.setitem(sys.modules, "timm", None)
+    ended = call("encode", few_dots, "--observation", "camera", "--encoder", "timm:resnet18.a1_in1k", "--out", out)
+    refused(ended, out, "pip install 'ddco-pyro[timm]'")
+
+
+def test_features_that_only_later_pictures_spoil(tmp_path, out):
+    demos = followed(2)
+    demos[1].observations["camera"][:] = 255
+    demos.write(tmp_path / "bright.hdf5")
+    with pytest.raises(BadInput, match="gives features that are NaN or infinite in float32"):
+        encoded(tmp_path / "bright.hdf5", out, f"{OWN}later_not_finite")
+    assert not out.exists()
+
+
+def test_features_that_do_not_fit_into_memory(few_dots, out, monkeypatch):
+    monkeypatch.setenv("DDCO_PYRO_MEMORY", "1kB")
+    ended = call("encode", few_dots, "--observation", "camera", "--encoder", MEANS, "--allow-code", "--out", out)
+    refused(ended, out, "take an encoder that gives fewer, or allow more with DDCO_PYRO_MEMORY")
+
+
+def test_user_code_needs_permission(few_dots, out):
+    ended = call("encode", few_dots, "--observation", "camera", "--encoder", MEANS, "--out", out)
+    refused(ended, out, "would import user code; pass --allow-code")
+    encoded(few_dots, out)
+    with pytest.raises(BadInput, match="would import user code"):
+        load(out)
+
+
+def test_a_damaged_encoder(few_dots, out):
+    encoded(few_dots, out)
+    with h5py.File(out, "r+") as file:
+        file["encoders/camera_features"].attrs["about"] = "{}"
+    with pytest.raises(BadInput, match=r"out\.hdf5: /encoders/camera_features is damaged .* encode the file again"):
+        load(out, allow_code=True)
+    with pytest.raises(BadInput, match="there is no encoder of one observation alone; there is: none"):
+        load(few_dots)
+
+
+def refused(ended, out, message):
+    assert (ended.status, ended.err.count("\n")) == (2, 1)
+    assert message in ended.err
+    assert not list(out.parent.iterdir())
