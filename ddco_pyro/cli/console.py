@@ -21,7 +21,6 @@ from ddco_pyro.drawing.page import Table
 from ddco_pyro.evaluation import effort, verdicts
 from ddco_pyro.events import (
     BaselineSegmented,
-    CandidateGivenUp,
     CellDone,
     CellsBegan,
     DemonstrationsDone,
@@ -121,9 +120,6 @@ class Progress:
                 if failed:
                     self._say(f"{cell} failed: {failed}")
                 self._advance(note=cell)
-            case CandidateGivenUp(candidate, folds):
-                self._say(f"{candidate}: stopped early, {folds} folds less")
-                self._advance(by=folds)
             case SeedFitted(total):
                 self._advance("fitting with other training seeds", total)
             case EpisodeEnded(policy, total):
@@ -136,14 +132,12 @@ class Progress:
         self._rich.add_task(label, total=total, note="")
         self._task, self._last = self._rich.tasks[-1], time.monotonic()
 
-    def _advance(
-        self, label: str = "", total: int | None = None, done: int | None = None, note: str = "", by: int = 1
-    ) -> None:
-        """Count ``by`` more, or ``done`` in all; begin with this label and total where no count is open."""
+    def _advance(self, label: str = "", total: int | None = None, done: int | None = None, note: str = "") -> None:
+        """Count one more, or ``done`` in all; begin with this label and total where no count is open."""
         if self._task is None or (label and self._task.finished):
             self._begin(label, total)
         assert self._task is not None
-        task, advance = self._task, by if done is None else None
+        task, advance = self._task, 1 if done is None else None
         self._rich.update(task.id, completed=done, advance=advance, note=note)
         if not self._terminal and (task.finished or time.monotonic() - self._last > PLAIN_SECONDS):
             self._last = time.monotonic()

@@ -192,16 +192,11 @@ def select(
     folds: Annotated[int | None, typer.Option(help="Number of folds; by default the spec's selection.folds.")] = None,
     jobs: Annotated[int, typer.Option(help="Processes that train folds; -1 is one for each core.")] = -1,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the unfinished selection in --out.")] = False,
-    stop_early: Annotated[bool, typer.Option("--stop-early", help="Give hopeless candidates up.")] = False,
     backend: Annotated[Backend, typer.Option(help="Where folds are trained: loky (here) or dask.")] = Backend.LOKY,
     scheduler: Scheduler = None,
     allow_code: AllowCode = False,
 ) -> None:
-    """Choose among the candidates of the spec's grid by cross-validation; then fit the chosen one to all the data.
-
-    With --stop-early, after each fold from the third on, a candidate is given up where the paired t-test over the folds
-    so far puts it below the best so far (one-sided, p < 0.001), or where a fold of it has failed.
-    """
+    """Choose among the candidates of the spec's grid by cross-validation; then fit the chosen one to all the data."""
     number = [] if folds is None else [f"selection.folds={folds}"]
     loaded = load_spec(spec, [*overrides, *number], allow_code)
     workers = backend.workers(jobs, scheduler)
@@ -215,10 +210,9 @@ def select(
         _check_folder(folder, spec, loaded)
         demos = selection.known_demonstrations(loaded)
         selection.check(loaded, workers, demos)  # before anything is collected, trained or written
-        early = ["--stop-early"] if stop_early else []
-        again = command("select", folder / "spec.yaml", "--out", folder, "--resume", *early, *_allowed(loaded))
+        again = command("select", folder / "spec.yaml", "--out", folder, "--resume", *_allowed(loaded))
         with _continued(again, folder), console.Progress() as progress:
-            made = selection.select(loaded, folder, progress, workers, stop_early, demos, resume)
+            made = selection.select(loaded, folder, progress, workers, demos, resume)
             progress.end()
             assert made.choice.chosen is not None  # or it would have failed
             final = selection.final_spec(made.choice.chosen.candidate)

@@ -193,15 +193,6 @@ def segment(
     gripper: Annotated[
         int, typer.Option(help="The control dimension of the gripper for --baselines, from 0; by default the last.")
     ] = -1,
-    granularity: Annotated[
-        str | None,
-        typer.Option(
-            metavar="coarse|medium|fine",
-            help="How long segments are: as in the run (medium), or twice or half as long, by further fits. The other "
-            "two stand beside as labels.",
-            show_default=False,
-        ),
-    ] = None,
     allow_external: AllowExternal = False,
     allow_code: AllowCode = False,
 ) -> None:
@@ -231,25 +222,16 @@ def segment(
     from ddco_pyro.data.sources import open_source
     from ddco_pyro.evaluation.agreement import agreement_table, tolerances
     from ddco_pyro.fitting.fitted import load
-    from ddco_pyro.segmenting import baseline_labels, beside_baselines, beside_others, segments
+    from ddco_pyro.segmenting import baseline_labels, beside_baselines, segments
     from ddco_pyro.segmenting.baselines import BASELINES, check_installed
     from ddco_pyro.segmenting.formats import Asked
-    from ddco_pyro.selection.small import GRANULARITIES, cut
 
-    if granularity not in (None, *GRANULARITIES):
-        raise BadInput(f"--granularity {granularity}: give one of {', '.join(GRANULARITIES)}")
     check_outputs(places, [run] if in_place else [run, demos])
     fit = load(run, allow_code)
     if level is not None and fit.names and level not in fit.names:
         raise BadInput(f"--level: there is no level {level!r} (there is: {', '.join(fit.names)})")
-    others = {}
-    if granularity is not None:
-        with console.Progress() as progress:
-            others = {name: cut(fit, name, progress) for name in GRANULARITIES}
-        fit = others.pop(granularity)
     with open_source(demos, external=allow_external) as source, console.Progress("segmenting") as progress:
         beside = baseline_labels(fit) if baselines else ()
-        beside += tuple(f"{level}_{name}" for level in fit.names for name in others)
         asked = Asked(fit, run, demos, source, level or next(iter(fit.names), ""), beside, overwrite, same_order)
         writers = [writer_of(place, asked) for place in places]
         if fit.names:  # without options, segments() refuses the run
@@ -262,7 +244,6 @@ def segment(
                 raise BadInput(f"--baselines: {missing}; name what to write, such as --html PAGE")
         segmented = segments(fit, source, progress, intervals=html is not None)
         segmented = replace(segmented, frequency=fps or segmented.frequency)
-        segmented = beside_others(segmented, others, fit, source) if others else segmented
         if baselines:
             segmented = beside_baselines(segmented, fit, source, gripper, progress)
             for name, scores in segmented.agreements.items():
