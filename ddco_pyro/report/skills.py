@@ -11,7 +11,7 @@ import numpy as np
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.pictures import Observed
 from ddco_pyro.drawing.colours import option_colour, option_rgb
-from ddco_pyro.drawing.diagrams import curves, path_film, transition_graph, typical_paths
+from ddco_pyro.drawing.diagrams import curves, transition_graph, typical_paths
 from ddco_pyro.drawing.figures import data_uri
 from ddco_pyro.drawing.page import (
     Block,
@@ -219,17 +219,17 @@ class _Shown:
 
     def explained(self) -> str:
         """What the drawings of each option are."""
-        typical = (
-            "Typical segments have the largest mean posterior probability; different demonstrations come first. "
-            "Instances in a film are aligned at their onset; one that has ended rests."
-        )
+        typical = "Typical segments have the largest mean posterior probability; different demonstrations come first."
         if self.pictures:
-            return f"Contact sheet: first, middle and last picture of a segment, a row each. {typical}"
+            return (
+                f"Contact sheet: first, middle and last picture of a segment, a row each. {typical} Instances in a "
+                "film are aligned at their onset; one that has ended rests."
+            )
         if not self.drawn:
             return f"Lines: controls from the onset of each segment on. {typical}"
         return (
             f"Drawings: {in_words(self.drawn, self.demos)}. Circle, square and triangle: first, "
-            f"middle and last step of a segment. {typical} Click a film to stop it."
+            f"middle and last step of a segment. {typical}"
         )
 
     def blocks(self, found: Sequence[Instance], choice: int) -> list[Block]:
@@ -244,13 +244,7 @@ class _Shown:
         if self.drawn:
             shown = list(dict.fromkeys([*(one.row for one in chosen[:SHOWN]), *range(len(self.demos))]))[:MOST_PATHS]
             segments = [(shown.index(one.row), one.start, one.end) for one in chosen[:SHOWN]]
-            steps = aligned(chosen)
-            film_paths = [self.paths[one.row] for one in chosen]
-            seconds = max(len(steps) / FRAMES_PER_SECOND, 1.5)
-            return [
-                Drawing(typical_paths([self.paths[row] for row in shown], segments, colour), where),
-                Drawing(path_film(film_paths, steps, seconds, colour), caption),
-            ]
+            return [Drawing(typical_paths([self.paths[row] for row in shown], segments, colour), where)]
         controls = [
             self.demos[one.row].actions.reshape(len(self.demos[one.row]), -1)[one.start : one.end] for one in chosen
         ]
