@@ -17,7 +17,6 @@ import numpy as np
 import pyarrow.parquet as parquet
 import pytest
 from command_line import call
-from safetensors.numpy import load_file
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.importing import import_demonstrations
@@ -402,22 +401,19 @@ def test_lerobot_eval_runs_a_fit_in_an_environment(tmp_path, monkeypatch):
     print(f"{sum(successes)} of {len(successes)} episodes succeed")
 
 
-@pytest.mark.usefixtures("numpy_alone")
-def test_a_policy_for_lerobot_has_the_weights_of_the_export(toy_run, tmp_path):
-    """Its ``runner.py`` acts with them alone, as the export's does."""
+def test_a_policy_for_lerobot_is_an_export_with_lerobots_files(toy_run, tmp_path):
     assert call("export", toy_run.folder, "--lerobot", tmp_path / "policy").status == 0
     assert call("export", toy_run.folder, "--out", tmp_path / "export").status == 0
-    config = json.loads((tmp_path / "policy" / "config.json").read_text())
+    exported, policy = (
+        {path.name: path.read_bytes() for path in (tmp_path / name).iterdir()} for name in ("export", "policy")
+    )
+    for name in ("controller.json", "runner.py"):
+        assert policy[name] == exported[name]
+    assert policy.keys() - exported.keys() == {"config.json", "policy_preprocessor.json", "policy_postprocessor.json"}
+    config = json.loads(policy["config.json"])
     assert config["type"] == "ddco"
     assert config["input_features"]["observation.offsets"] == {"type": "STATE", "shape": [4]}
     assert config["output_features"] == {"action": {"type": "ACTION", "shape": [2]}}
-    assert json.loads(config["controller"]) == json.loads((tmp_path / "export" / "controller.json").read_text())
-    weights = load_file(tmp_path / "policy" / "model.safetensors")
-    shapes = {name: [list(array.shape), str(array.dtype)] for name, array in weights.items()}
-    assert json.loads(config["weights"]) == shapes
-    with np.load(tmp_path / "export" / "weights.npz") as file:
-        assert {name.replace(".", "/") for name in file.files} == weights.keys()
-        assert all(np.array_equal(file[name.replace("/", ".")], array) for name, array in weights.items())
     (tmp_path / "policy" / "mine.txt").touch()
     ended = call("export", toy_run.folder, "--lerobot", tmp_path / "policy")
     assert (ended.status, ended.err.count("\n")) == (2, 1)

@@ -17,6 +17,7 @@ from ddco_pyro.errors import BadInput, command
 
 if TYPE_CHECKING:
     from ddco_pyro.data.sources import Source
+    from ddco_pyro.exporting import Exported
     from ddco_pyro.fitting.fitted import Fit
     from ddco_pyro.segmenting.formats import Asked, Writer
 
@@ -300,7 +301,7 @@ def export(
     ] = False,
     allow_code: AllowCode = False,
 ) -> None:
-    """Write the controller as files that do not need this library: numpy with a runner, torch.export, ONNX.
+    """Write the controller as files that do not need this library: numpy with a runner, and ONNX.
 
     Every form is loaded again and acts in three synthetic episodes, by the
     loop of runner.py. It must choose the options of the run's controller,
@@ -320,13 +321,17 @@ def export(
     if lerobot:
         from ddco_pyro.exporting.lerobot import export_policy
 
-        export_policy(fit, lerobot)
+        _say_exported(export_policy(fit, lerobot))
         print(f"{lerobot}: use it with: lerobot-eval --policy.path={lerobot} --env.type=...")
     if out is None:
         return
     exported = write(fit, out, onnx)
-    for form, (difference, seconds) in exported.items():
-        print(f"{form}: largest difference {difference:.1e}, a step takes {1e3 * seconds:.3f} ms")
+    _say_exported(exported)
     form = next(iter(exported))
     again = shlex.join(["python", str(out / "runner.py"), str(out), *([] if form == "numpy" else [form])])
     print(f"{out}: try it with: {again}")
+
+
+def _say_exported(exported: Exported) -> None:
+    for form, (difference, seconds) in exported.items():
+        print(f"{form}: largest difference {difference:.1e}, a step takes {1e3 * seconds:.3f} ms")
