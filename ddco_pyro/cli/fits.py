@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -17,7 +17,7 @@ from ddco_pyro.data.files import Output, check_outputs
 from ddco_pyro.errors import BadInput, Failed, command
 from ddco_pyro.events import Event
 from ddco_pyro.jobs import LONG, Workers, processes
-from ddco_pyro.logs import Logged, MakeLog, find_log
+from ddco_pyro.logs import Log
 from ddco_pyro.spec import Spec, SpecError, dump_spec, load_spec, spec_schema, user_code
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def fit(
         typer.Option(
             "--log",
             metavar="NAME",
-            help="Log training, too: tensorboard, mlflow, wandb-offline, or module:Class (--allow-code); repeatable.",
+            help="Log training, too: tensorboard or wandb-offline; repeatable.",
         ),
     ] = [],  # noqa: B006
     resume: Annotated[
@@ -104,12 +104,11 @@ def fit(
             _follow(ranks)
             return
         loaded = load_spec(spec, overrides, allow_code)
-        logs = {name: find_log(name, allow_code) for name in log}
         if ranks.size > 1 and jobs not in (None, 1):
             raise SpecError(f"--jobs {jobs}: the processes of torchrun train together; leave --jobs out")
         jobs = 1 if ranks.size > 1 else -1 if jobs is None else jobs
         with _ready(loaded, jobs):
-            _fit_and_report(loaded, spec, out, jobs, seeds, resume, logs)
+            _fit_and_report(loaded, spec, out, jobs, seeds, resume, [*dict.fromkeys(log)])
 
 
 def _follow(ranks: Ranks) -> None:
@@ -136,7 +135,7 @@ def _fit_and_report(
     jobs: int,
     seeds: int | None,
     resume: bool,
-    logs: Mapping[str, MakeLog],
+    logs: Sequence[str],
 ) -> None:
     from ddco_pyro.cli import console
     from ddco_pyro.fitting.fit import fit as fitted_to
@@ -147,12 +146,12 @@ def _fit_and_report(
     folder = out or Path("runs") / f"{spec.stem}-{time.strftime('%Y%m%d-%H%M%S')}"
     _check_folder(folder, spec, loaded)
     repeated = () if seeds is None else ("--seeds", str(seeds))
-    own = any(":" in name for name in logs) and not user_code(loaded)
-    more = [word for name in logs for word in ("--log", name)] + (["--allow-code"] if own else [])
+    more = [word for name in logs for word in ("--log", name)]
+    logged = [Log(name, folder, loaded.model_dump(mode="json"), console.say) for name in logs]
     again = command("fit", folder / "spec.yaml", "--out", folder, "--resume", *repeated, *more, *_allowed(loaded))
     with _continued(again, folder), console.Progress() as progress, ExitStack() as stack:
-        plain = loaded.model_dump(mode="json")
-        logged = [stack.enter_context(Logged(make, folder, plain)) for make in logs.values()]
+        for log in logged:
+            stack.enter_context(log)
 
         def listen(event: Event) -> None:
             progress(event)
@@ -161,7 +160,7 @@ def _fit_and_report(
 
         fitted = fitted_to(loaded, None, folder, listen, jobs, resume)
         for log in logged:
-            log.scalars(_held_out(fitted))
+            log.add(_held_out(fitted))
         if seeds is not None:
             fitted = repeat(fitted, seeds, progress, jobs)
     from ddco_pyro.report import write_report  # imports matplotlib, after the fit
