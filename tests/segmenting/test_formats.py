@@ -32,7 +32,7 @@ from ddco_pyro.segmenting.formats.lerobot import SARM, Annotated
 from ddco_pyro.segmenting.formats.mimicgen import Isaac, MimicGen
 from ddco_pyro.segmenting.formats.tables import CSV
 
-HERE = Path(__file__).parent
+HERE = Path(__file__).parents[1]
 NAMES = ("control", "place", "reach", "grasp")
 ORDERED = [[(2, 4), (3, 3), (1, 5)], [(2, 2), (3, 1), (1, 1)], [(2, 6), (3, 2), (1, 3)]]
 """Of each demonstration, its subtasks as (option, steps), in one order: reach, grasp, place."""

@@ -384,8 +384,8 @@ def test_a_policy_without_options_is_refused(toy_run, file):
 # --- subtasks of LeRobot datasets -------------------------------------------------------------------------------------
 
 
-LEROBOT = Path(__file__).parent / "fixtures" / "lerobot"
-LANGUAGE = Path(__file__).parent / "fixtures" / "lerobot_language"
+LEROBOT = Path(__file__).parents[1] / "fixtures" / "lerobot"
+LANGUAGE = Path(__file__).parents[1] / "fixtures" / "lerobot_language"
 SPEC = """
 demonstrations: {path: PATH, valid_fraction: 0.25}
 observations: [state]
