@@ -50,7 +50,7 @@ bench: $(DEMO)
 tools:
 	test -x .venv-tools/bin/python || python3.12 -m venv .venv-tools
 	.venv-tools/bin/pip install -q 'lerobot[dataset,evaluation]>=0.6' label-studio-sdk 'rerun-sdk>=0.41' pympi-ling \
-		tensorflow-cpu tensorflow-datasets rlds ./lerobot_policy_ddco
+		./lerobot_policy_ddco
 	.venv-tools/bin/pip install -q --no-deps isaaclab 'mimicgen @ git+https://github.com/NVlabs/mimicgen'
 	$(PIP) -e '.[rerun]'
 

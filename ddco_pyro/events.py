@@ -103,14 +103,6 @@ class CellDone(Event):
 
 
 @dataclass(frozen=True)
-class CandidateGivenUp(Event):
-    """A candidate is given up; ``folds`` of its folds are not scored."""
-
-    candidate: str
-    folds: int
-
-
-@dataclass(frozen=True)
 class SeedFitted(Event):
     """The model and its baselines are fitted with another of ``total`` training seeds."""
 

@@ -51,13 +51,7 @@ figures = needle.folder / "figures"
 # %% [markdown]
 # ## When is which option active?
 #
-# Each row is a demonstration, each colour an option of the most likely path.
-
-# %%
-Image(figures / "segments.png")
-
-# %% [markdown]
-# The same along the way of the gripper:
+# Each colour is an option of the most likely path, along the way of the gripper:
 
 # %%
 Image(figures / "trajectories.png")

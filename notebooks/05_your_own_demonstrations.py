@@ -83,7 +83,7 @@ Markdown(verdicts.verdict(mine.metrics))
 # The options over time, beside the phases that the expert itself says it is in (the model has not seen them):
 
 # %%
-Image(mine.folder / "figures" / "segments.png")
+Image(mine.folder / "figures" / "posterior.png")
 
 # %%
 agreement = mine.metrics.agreement

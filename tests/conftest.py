@@ -20,7 +20,6 @@ from hypothesis import settings
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from ddco_pyro import exporting
 from ddco_pyro.errors import Failed
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.spec import parse_spec
@@ -99,14 +98,6 @@ def toy_run(cache, tmp_path_factory, toy_spec, watched):
 def undecided(monkeypatch):
     """``init`` asks no small fits, as where they fail: they take most of its time."""
     monkeypatch.setattr("ddco_pyro.selection.small.decide", mock.Mock(side_effect=Failed("no small fits")))
-
-
-@pytest.fixture
-def numpy_alone(monkeypatch):
-    """Exports have numpy's form alone: programs, which hold no more than the networks, take seconds to make."""
-    compare = exporting._compare
-    monkeypatch.setattr(exporting, "_programs", lambda program, onnx: {})
-    monkeypatch.setattr(exporting, "_compare", lambda folder, forms: compare(folder, ["numpy"]))
 
 
 @pytest.fixture(scope="session")

@@ -18,7 +18,6 @@ from ddco_pyro.data.pictures import Pictures
 from ddco_pyro.data.sources.video import frames
 from ddco_pyro.encoding import About, Backbone, Encoder, Projection
 from ddco_pyro.fitting.rollouts import roll_out
-from ddco_pyro.report import write_report
 from ddco_pyro.simulation import collect as collecting
 from ddco_pyro.simulation.cameras import Encoded
 from ddco_pyro.simulation.episodes import play, run_episode
@@ -130,9 +129,7 @@ def test_a_spec_with_a_camera_is_checked_fitted_and_rolled_out(tmp_path):
     DRAWN.clear()
     measured = roll_out(fit, 2, film=1, jobs=1).methods["flat"].measures["success"]
     assert DRAWN
-    film, looks = (list(frames(fit.folder / "videos" / place / "flat-1000.mp4")) for place in ("", "saliency"))
-    assert len(film) == len(looks) + 1  # the end is seen by nobody
-    assert "<h2>What it looks at</h2>" in write_report(fit, fit.demonstrations).read_text()
+    assert list(frames(fit.folder / "videos" / "flat-1000.mp4"))
     alone = play(
         watched, Controller.from_spec(fit.hierarchy, RolloutSpec()), range(1000, 1002), fit.hierarchy.encoder.shapes
     )

@@ -82,7 +82,7 @@ def test_the_file_is_what_the_scores_say(finished):
         assert row["status"] == "scored"
     assert data["best"] == int(np.argmax(means)) == made.choice.best.candidate.number
     assert data["chosen"] == made.choice.chosen.candidate.number
-    assert (data["folds"], data["demonstrations"], data["stop_early"]) == (4, 12, None)
+    assert (data["folds"], data["demonstrations"]) == (4, 12)
     assert (folder / "figures" / "selection.png").read_bytes().startswith(b"\x89PNG")
     assert made.choice.chosen.candidate.name in (folder / "selection.md").read_text()
 
@@ -150,38 +150,6 @@ def test_an_unexpected_error_is_told_and_tried_again_next_time(tmp_path, monkeyp
         select(spec, tmp_path / "run", Told(), ONE)
     monkeypatch.undo()
     assert select(spec, tmp_path / "run", Told(), ONE).choice.chosen is not None
-
-
-def hopeless_second(candidate, fold):
-    return -candidate * (10 + fold)
-
-
-def test_hopeless_candidates_are_given_up_only_if_asked(tmp_path, monkeypatch):
-    spec, calls = spec_at(tmp_path, folds=6), []
-    monkeypatch.setattr(folds, "score", faked(hopeless_second, calls))
-    whole = select(spec, tmp_path / "whole", Told(), ONE)
-    assert len(calls) == 12
-    assert [row.status for row in whole.choice.rows] == ["scored", "scored"]
-    calls.clear()
-    told = Told()
-    early = select(spec, tmp_path / "early", told, ONE, stop_early=True)
-    last = max(fold for candidate, fold in calls if candidate == 1)
-    assert 2 <= last < 5
-    assert told.stopped == [(early.choice.rows[1].candidate.name, 5 - last)]
-    assert [row.status for row in early.choice.rows] == ["scored", "stopped"]
-    assert early.choice.chosen.candidate.number == whole.choice.chosen.candidate.number == 0
-    assert "--stop-early" in json.loads((tmp_path / "early" / "selection.json").read_text())["stop_early"]
-
-
-def test_giving_up_does_not_depend_on_interruptions(tmp_path, monkeypatch):
-    """Scores that are there already, of folds after the one in which a candidate is given up, do not count."""
-    spec = spec_at(tmp_path, folds=6)
-    monkeypatch.setattr(folds, "score", faked(hopeless_second))
-    select(spec, tmp_path / "early", Told(), ONE, stop_early=True)
-    select(spec, tmp_path / "whole", Told(), ONE)
-    select(spec, tmp_path / "whole", Told(), ONE, stop_early=True)
-    first, second = ((tmp_path / name / "selection.json").read_bytes() for name in ("early", "whole"))
-    assert first == second
 
 
 # --- in processes -----------------------------------------------------------------------------------------------------

@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy import stats
 from selecting import DATA, candidate, score, spec_at, two_skills
 
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.selection.choice import as_data, choose, hopeless, markdown, table
+from ddco_pyro.selection.choice import as_data, choose, markdown, table
 from ddco_pyro.selection.folds import FoldError, assign, divide, keep_folds
 from ddco_pyro.selection.grid import candidates, wide
 from ddco_pyro.spec import SpecError, parse_spec, with_overrides
@@ -84,7 +83,7 @@ def test_a_candidate_with_a_failed_fold_is_named_and_not_chosen():
     assert found.best is found.chosen is found.rows[1]
     data = as_data(found)
     assert data["failed"] == [{"candidate": 0, "name": "count = 1", "fold": 1, "reason": "it diverged"}]
-    text = markdown(found, {**data, "folds": 2, "demonstrations": 2, "stop_early": None})
+    text = markdown(found, {**data, "folds": 2, "demonstrations": 2})
     assert "**Failed:** count = 1, fold 1: it diverged" in text
     assert table(found).rows[0][-1] == "failed"
 
@@ -97,38 +96,6 @@ def test_where_all_have_failed_there_is_no_choice():
     assert [row.mean for row in found.rows] == [1.0, None]
     data = as_data(found)
     assert (data["best"], data["chosen"]) == (None, None)
-
-
-def test_a_stopped_candidate_is_compared_on_the_folds_it_has():
-    scores = [score(0, f, v) for f, v in enumerate([1.0, 2.0])]
-    scores += [score(1, f, v) for f, v in enumerate([2.0, 4.0, 9.0])]
-    found = choose([candidate(0), candidate(1)], scores, 3)
-    assert found.rows[0].status == "stopped"
-    assert pair(found.rows[0]) == pytest.approx((-1.5, 0.5))
-    assert found.chosen is found.rows[1]
-
-
-def test_hopeless_is_what_a_paired_t_test_says():
-    random = np.random.default_rng(0)
-    for shift in (0.05, 0.1, 0.2, 0.4):
-        best = random.normal(size=6)
-        other = best - shift + 0.05 * random.normal(size=6)
-        scores = [score(c, f, v) for c, row in enumerate([best, other]) for f, v in enumerate(row)]
-        below = stats.ttest_rel(other, best, alternative="less").pvalue < 0.001
-        assert (1 in hopeless([candidate(0), candidate(1)], scores)) == below
-        assert 0 not in hopeless([candidate(0), candidate(1)], scores)
-
-
-def test_two_folds_are_not_enough_to_give_up():
-    scores = [score(c, f, -10.0 * c + 0.001 * f * c) for c in (0, 1) for f in range(2)]
-    assert hopeless([candidate(0), candidate(1)], scores) == set()
-    scores += [score(0, 2, 0.0), score(1, 2, -10.0)]
-    assert hopeless([candidate(0), candidate(1)], scores) == {1}
-
-
-def test_a_candidate_that_has_failed_is_given_up():
-    scores = [score(0, 0, 1.0), score(1, 0, 0.0, failed="it diverged")]
-    assert hopeless([candidate(0), candidate(1)], scores) == {1}
 
 
 @pytest.mark.parametrize(
@@ -150,7 +117,7 @@ def test_a_best_candidate_at_the_edge_of_the_grid_is_noted(path, grid, means, sa
     assert noted.startswith(said)
     assert bool(noted) == bool(said)
     assert ("likelihood does not count skills" in noted) == ("count" in noted)
-    assert noted in markdown(made, as_data(made) | {"folds": 2, "demonstrations": 4, "stop_early": None})
+    assert noted in markdown(made, as_data(made) | {"folds": 2, "demonstrations": 4})
 
 
 def test_different_fixed_errors_are_noted():

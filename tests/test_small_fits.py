@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 import yaml
@@ -16,6 +15,7 @@ import ddco_pyro
 from ddco_pyro.acting.monitor import run_lengths
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.options import segments_of
+from ddco_pyro.labelling.ways import Ways
 from ddco_pyro.metrics import Segments
 from ddco_pyro.selection.small import Lasting, asked, heavy_tails, in_steps, lasting, overrides, unasked
 from ddco_pyro.spec import load_spec, parse_spec, with_overrides
@@ -95,29 +95,13 @@ def test_init_writes_what_it_found(tmp_path: Path):
     assert "exclude each other" in both.err
 
 
-def test_segments_are_coarser_or_finer_as_asked(tmp_path: Path):
-    file, spec, run = tmp_path / "demos.hdf5", tmp_path / "spec.yaml", tmp_path / "run"
-    skills_within_which_speed_varies(4, 100).write(file)
-    spec.write_text(
-        SPEC.replace("FILE", str(file)).replace("fraction: 0", "fraction: 0.2")
-        + "compare_with: [{kind: flat, policy: {network: linear}}]\n"
-    )
-    ddco_pyro.fit(spec, out=run)
-    ended = call("segment", run, file, "--granularity", "coarse", "--out", tmp_path / "labelled.hdf5")
-    assert ended.status == 0, ended.err
-    with h5py.File(tmp_path / "labelled.hdf5") as labelled:
-        levels = [demo["labels"] for demo in labelled["data"].values()]
-        medians = {
-            name: np.median(np.concatenate(run_lengths([level[name][:] for level in levels], 2)))
-            for name in ("option", "option_medium", "option_fine")
-        }
-    assert medians["option_fine"] <= medians["option_medium"] <= medians["option"]
-    assert (run / "granularity" / "coarse" / "metrics.json").is_file()
-    wrong = call("segment", run, file, "--granularity", "huge", "--out", tmp_path / "other.hdf5")
-    assert wrong.status == 2
-    assert "coarse, medium, fine" in wrong.err
-    flat = call("segment", run / "baselines" / "flat", file, "--granularity", "fine", "--out", tmp_path / "other.hdf5")
-    assert (flat.status, "without options" in flat.err) == (2, True)
+def test_other_ways_to_cut_are_longer_or_shorter():
+    demos = skills_within_which_speed_varies(4, 100)
+    trained = ddco_pyro.fit(parse_spec(yaml.safe_load(SPEC)), demos)
+    calls = Ways(trained, demos, 1).calls
+    fits = (calls["fine"](), trained, calls["coarse"]())
+    fine, own, coarse = (np.median(np.concatenate(run_lengths([*fit.segment(demos)[0]], 2))) for fit in fits)
+    assert fine <= own < coarse
 
 
 def test_heavy_tails_are_found_where_they_predict_better():

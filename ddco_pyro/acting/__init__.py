@@ -1,1 +1,1 @@
-"""Fitted hierarchies at run time: controllers, monitors and saliency maps."""
+"""Fitted hierarchies at run time: controllers and monitors."""

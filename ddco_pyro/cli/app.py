@@ -33,25 +33,23 @@ app = typer.Typer(
 EXAMPLES: dict[Callable[..., None], str] = {
     starting.demo: "demo --out runs/demo",
     starting.new: "new mine.hdf5 --out runs/mine",
-    fits.check: "check specs/needle.yaml --set hierarchy.levels.0.count=3",
-    demos.collect: "collect specs/needle.yaml --out needle.hdf5",
-    fits.fit: "fit specs/needle.yaml --set training.epochs=50 --out runs/short",
-    fits.select: "select specs/mine.yaml --set selection.grid.hierarchy.levels.0.count=[1,2,4,8]",
-    fits.merge: "merge runs/mine --options 2 4",
-    runs.compare: "compare runs/needle runs/needle/baselines/flat runs/other",
-    runs.rollout: "rollout runs/needle --episodes 200 --video",
-    runs.report: "report runs/needle",
-    runs.name: "name runs/mine --level option reach,grasp,lift,place",
-    demos.inspect: "inspect mine.hdf5",
-    demos.init: "init mine.hdf5 --out mine.yaml",
     demos.import_: "import pusht --out demos.hdf5",
+    demos.inspect: "inspect mine.hdf5",
     demos.encode: "encode demos.hdf5 --observation camera --encoder timm:resnet18.a1_in1k --out encoded.hdf5",
+    demos.init: "init mine.hdf5 --out mine.yaml",
+    fits.check: "check specs/needle.yaml --set hierarchy.levels.0.count=3",
+    fits.fit: "fit specs/needle.yaml --set training.epochs=50 --out runs/short",
+    runs.report: "report runs/needle",
     runs.segment: "segment runs/mine mine.hdf5 --html segments.html",
     label.label: "label runs/mine mine.hdf5 --out labelled.hdf5",
+    fits.select: "select specs/mine.yaml --set selection.grid.hierarchy.levels.0.count=[1,2,4,8]",
+    runs.compare: "compare runs/needle runs/needle/baselines/flat runs/other",
+    demos.collect: "collect specs/needle.yaml --out needle.hdf5",
+    runs.rollout: "rollout runs/needle --episodes 200 --video",
     runs.export: "export runs/mine --out controller --onnx",
     study.study: "study run studies/mine.yaml --jobs 2",
 }
-"""Every command, in the order of ``--help``."""
+"""Every command, in the order of ``--help``: as a user needs them."""
 
 
 def _print_version(asked: bool) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Self
@@ -17,11 +18,9 @@ from ddco_pyro.data.controls import described, notes
 from ddco_pyro.data.hdf5 import printable
 from ddco_pyro.drawing import words
 from ddco_pyro.drawing.page import Table
-from ddco_pyro.errors import command
 from ddco_pyro.evaluation import effort, verdicts
 from ddco_pyro.events import (
     BaselineSegmented,
-    CandidateGivenUp,
     CellDone,
     CellsBegan,
     DemonstrationsDone,
@@ -36,13 +35,12 @@ from ddco_pyro.events import (
     TrainingBegan,
     TrainingEnded,
 )
-from ddco_pyro.names import label_name, method, numbered_name, option_name
+from ddco_pyro.names import label_name, method, option_name
 
 if TYPE_CHECKING:
     from ddco_pyro.data.inspection import Field, Inspection
     from ddco_pyro.evaluation.annotators import Annotators
     from ddco_pyro.fitting.fitted import Fit
-    from ddco_pyro.fitting.merging import Pair
     from ddco_pyro.metrics import Metrics
     from ddco_pyro.model.hierarchy import Hierarchy
     from ddco_pyro.spec import Spec
@@ -119,9 +117,6 @@ class Progress:
                 if failed:
                     self._say(f"{cell} failed: {failed}")
                 self._advance(note=cell)
-            case CandidateGivenUp(candidate, folds):
-                self._say(f"{candidate}: stopped early, {folds} folds less")
-                self._advance(by=folds)
             case SeedFitted(total):
                 self._advance("fitting with other training seeds", total)
             case EpisodeEnded(policy, total):
@@ -134,14 +129,12 @@ class Progress:
         self._rich.add_task(label, total=total, note="")
         self._task, self._last = self._rich.tasks[-1], time.monotonic()
 
-    def _advance(
-        self, label: str = "", total: int | None = None, done: int | None = None, note: str = "", by: int = 1
-    ) -> None:
-        """Count ``by`` more, or ``done`` in all; begin with this label and total where no count is open."""
+    def _advance(self, label: str = "", total: int | None = None, done: int | None = None, note: str = "") -> None:
+        """Count one more, or ``done`` in all; begin with this label and total where no count is open."""
         if self._task is None or (label and self._task.finished):
             self._begin(label, total)
         assert self._task is not None
-        task, advance = self._task, by if done is None else None
+        task, advance = self._task, 1 if done is None else None
         self._rich.update(task.id, completed=done, advance=advance, note=note)
         if not self._terminal and (task.finished or time.monotonic() - self._last > PLAIN_SECONDS):
             self._last = time.monotonic()
@@ -230,7 +223,7 @@ def labels(spec: Spec, used: Labels | None, known: Mapping[str, Sequence[str]]) 
             say(f"warning: {what} {advice}")
 
 
-# --- fit, select, merge, rollout --------------------------------------------------------------------------------------
+# --- fit, select, rollout ---------------------------------------------------------------------------------------------
 
 
 ONE_FIT = (
@@ -269,15 +262,6 @@ def seeds(metrics: Metrics) -> None:
     say(verdicts.over_seeds(found, method(metrics.model), len(metrics.valid), sound, brief))
 
 
-def merged(pair: Pair, before: Fit, after: Fit) -> None:
-    """The merged options and the change of held-out log-likelihood."""
-    names = list(before.names.values())[pair.level]
-    first, second = (numbered_name(option, names).removeprefix("option ") for option in pair.options)
-    apart = "" if pair.divergence is None else f" ({pair.divergence:.2f} nats/step apart)"
-    values = [words.number(fit.metrics.log_likelihood_per_step.valid) for fit in (before, after)]
-    say(f"Merged options {first} and {second}{apart}: held-out {values[0]} → {values[1]} nats/step.")
-
-
 def warnings(fit: Fit) -> None:
     """Durations beside those asked for; warnings of a short training and of a degenerate solution, with remedies."""
     from ddco_pyro.evaluation.options import degeneracies, durations
@@ -289,7 +273,7 @@ def warnings(fit: Fit) -> None:
 
 
 def names(fit: Fit) -> None:
-    """The names in ``names.yaml``, with their agreement with labels, and the command that takes proposed ones."""
+    """The names in ``names.yaml``, with their agreement with labels, and the line there that takes proposed ones."""
     found = {(one.level, one.option): one for one in fit.metrics.named_by_labels}
     each = {
         level: [(name, found.get((level, option))) for option, name in enumerate(own[1:], start=1)]
@@ -299,20 +283,21 @@ def names(fit: Fit) -> None:
         say(f"labels: {told}")
     for row, (accuracy, edit) in effort.contributions(fit.metrics.training).items():
         say(f"  left out, {row}: accuracy {words.number(accuracy)}, edit score {words.number(edit)}")
+    file = fit.run_folder / "names.yaml"
     written = [
         f"{name} {words.number(one.agreement)}" if one and one.name == name else name
         for level in fit.named
         for name, one in each[level]
     ]
     if written:
-        say(f"names: {fit.run_folder / 'names.yaml'}: {', '.join(written)}")
+        say(f"names: {file}: {', '.join(written)}")
     for level, pairs in each.items():
         proposed = {name: one for name, one in pairs if one and name == option_name(one.option)}
         if proposed:
             said = [f"{name} as {one.name} {words.number(one.agreement)}" for name, one in proposed.items()]
-            taken = ",".join(proposed[name].name if name in proposed else name for name, _ in pairs)
-            again = command("name", fit.run_folder, "--level", level, taken)
-            say(f"names proposed, not written: {words.listed(said)}; to take them: {again}")
+            taken = [proposed[name].name if name in proposed else name for name, _ in pairs]
+            line = json.dumps({level: taken}, ensure_ascii=False)[1:-1]
+            say(f"names proposed, not written: {words.listed(said)}; to take them, write into {file}: {line}")
     if found:
         labels = words.listed(dict.fromkeys(f"labels/{one.labels}" for one in found.values()))
         say(f"Agreement with {labels}: the steps with both an option and its label, divided by the steps with either.")

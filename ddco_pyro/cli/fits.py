@@ -1,23 +1,23 @@
-"""Commands that fit: ``check``, ``fit``, ``select`` and ``merge``."""
+"""Commands that fit: ``check``, ``fit`` and ``select``."""
 
 from __future__ import annotations
 
 import json
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ddco_pyro.cli import AllowCode, Backend, Level, Overrides, RunPath, Scheduler, SpecPath, hint, out_folder, written
+from ddco_pyro.cli import AllowCode, Backend, Overrides, Scheduler, SpecPath, hint, out_folder, written
 from ddco_pyro.data.files import Output, check_outputs
 from ddco_pyro.errors import BadInput, Failed, command
 from ddco_pyro.events import Event
 from ddco_pyro.jobs import LONG, Workers, processes
-from ddco_pyro.logs import Logged, MakeLog, find_log
+from ddco_pyro.logs import Log
 from ddco_pyro.spec import Spec, SpecError, dump_spec, load_spec, spec_schema, user_code
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def fit(
         typer.Option(
             "--log",
             metavar="NAME",
-            help="Log training, too: tensorboard, mlflow, wandb-offline, or module:Class (--allow-code); repeatable.",
+            help="Log training, too: tensorboard or wandb-offline; repeatable.",
         ),
     ] = [],  # noqa: B006
     resume: Annotated[
@@ -104,12 +104,11 @@ def fit(
             _follow(ranks)
             return
         loaded = load_spec(spec, overrides, allow_code)
-        logs = {name: find_log(name, allow_code) for name in log}
         if ranks.size > 1 and jobs not in (None, 1):
             raise SpecError(f"--jobs {jobs}: the processes of torchrun train together; leave --jobs out")
         jobs = 1 if ranks.size > 1 else -1 if jobs is None else jobs
         with _ready(loaded, jobs):
-            _fit_and_report(loaded, spec, out, jobs, seeds, resume, logs)
+            _fit_and_report(loaded, spec, out, jobs, seeds, resume, [*dict.fromkeys(log)])
 
 
 def _follow(ranks: Ranks) -> None:
@@ -136,7 +135,7 @@ def _fit_and_report(
     jobs: int,
     seeds: int | None,
     resume: bool,
-    logs: Mapping[str, MakeLog],
+    logs: Sequence[str],
 ) -> None:
     from ddco_pyro.cli import console
     from ddco_pyro.fitting.fit import fit as fitted_to
@@ -147,12 +146,12 @@ def _fit_and_report(
     folder = out or Path("runs") / f"{spec.stem}-{time.strftime('%Y%m%d-%H%M%S')}"
     _check_folder(folder, spec, loaded)
     repeated = () if seeds is None else ("--seeds", str(seeds))
-    own = any(":" in name for name in logs) and not user_code(loaded)
-    more = [word for name in logs for word in ("--log", name)] + (["--allow-code"] if own else [])
+    more = [word for name in logs for word in ("--log", name)]
+    logged = [Log(name, folder, loaded.model_dump(mode="json"), console.say) for name in logs]
     again = command("fit", folder / "spec.yaml", "--out", folder, "--resume", *repeated, *more, *_allowed(loaded))
     with _continued(again, folder), console.Progress() as progress, ExitStack() as stack:
-        plain = loaded.model_dump(mode="json")
-        logged = [stack.enter_context(Logged(make, folder, plain)) for make in logs.values()]
+        for log in logged:
+            stack.enter_context(log)
 
         def listen(event: Event) -> None:
             progress(event)
@@ -161,7 +160,7 @@ def _fit_and_report(
 
         fitted = fitted_to(loaded, None, folder, listen, jobs, resume)
         for log in logged:
-            log.scalars(_held_out(fitted))
+            log.add(_held_out(fitted))
         if seeds is not None:
             fitted = repeat(fitted, seeds, progress, jobs)
     from ddco_pyro.report import write_report  # imports matplotlib, after the fit
@@ -192,16 +191,11 @@ def select(
     folds: Annotated[int | None, typer.Option(help="Number of folds; by default the spec's selection.folds.")] = None,
     jobs: Annotated[int, typer.Option(help="Processes that train folds; -1 is one for each core.")] = -1,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the unfinished selection in --out.")] = False,
-    stop_early: Annotated[bool, typer.Option("--stop-early", help="Give hopeless candidates up.")] = False,
     backend: Annotated[Backend, typer.Option(help="Where folds are trained: loky (here) or dask.")] = Backend.LOKY,
     scheduler: Scheduler = None,
     allow_code: AllowCode = False,
 ) -> None:
-    """Choose among the candidates of the spec's grid by cross-validation; then fit the chosen one to all the data.
-
-    With --stop-early, after each fold from the third on, a candidate is given up where the paired t-test over the folds
-    so far puts it below the best so far (one-sided, p < 0.001), or where a fold of it has failed.
-    """
+    """Choose among the candidates of the spec's grid by cross-validation; then fit the chosen one to all the data."""
     number = [] if folds is None else [f"selection.folds={folds}"]
     loaded = load_spec(spec, [*overrides, *number], allow_code)
     workers = backend.workers(jobs, scheduler)
@@ -215,10 +209,9 @@ def select(
         _check_folder(folder, spec, loaded)
         demos = selection.known_demonstrations(loaded)
         selection.check(loaded, workers, demos)  # before anything is collected, trained or written
-        early = ["--stop-early"] if stop_early else []
-        again = command("select", folder / "spec.yaml", "--out", folder, "--resume", *early, *_allowed(loaded))
+        again = command("select", folder / "spec.yaml", "--out", folder, "--resume", *_allowed(loaded))
         with _continued(again, folder), console.Progress() as progress:
-            made = selection.select(loaded, folder, progress, workers, stop_early, demos, resume)
+            made = selection.select(loaded, folder, progress, workers, demos, resume)
             progress.end()
             assert made.choice.chosen is not None  # or it would have failed
             final = selection.final_spec(made.choice.chosen.candidate)
@@ -232,41 +225,6 @@ def select(
     console.warnings(fitted)
     print(f"selection: {folder / 'selection.json'}")
     print(f"report: {write_report(fitted, fitted.demonstrations)}")
-
-
-def merge(
-    run: RunPath,
-    options: Annotated[
-        tuple[int, int] | None,
-        typer.Option(help="Numbers of the two options; by default those that act most alike.", show_default=False),
-    ] = None,
-    level: Level = None,
-    out: Annotated[Path | None, written(out_folder, "The run folder; by default RUN-merged.")] = None,
-    jobs: Annotated[int, typer.Option(help="Processes that train restarts; -1 is one for each core.")] = -1,
-    allow_code: AllowCode = False,
-) -> None:
-    """Merge two options of a run and fit again from its segments, into another run folder.
-
-    An unfinished one is continued.
-    """
-    from ddco_pyro.cli import console
-    from ddco_pyro.fitting import merging
-    from ddco_pyro.fitting.fitted import load
-    from ddco_pyro.report import write_report
-
-    named = run if run.name else run.resolve()
-    folder = out or named.with_name(f"{named.name}-merged")
-    check_outputs([Output("--out", folder, "folder")], [run])
-    before = load(run, allow_code)
-    pair = merging.chosen(before, level, options)
-    with console.Progress() as progress:
-        fitted = merging.merge(before, pair, folder, progress, jobs)
-    console.log_likelihoods(fitted)
-    console.merged(pair, before, fitted)
-    console.warnings(fitted)
-    console.names(fitted)
-    print(f"report: {write_report(fitted, fitted.demonstrations)}")
-    print(f"next: {command('compare', run, folder, *_allowed(fitted.spec))}")
 
 
 def _check_folder(folder: Path, spec: Path, loaded: Spec) -> None:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from ddco_pyro.labelling.session import Exporter
     from ddco_pyro.segmenting import Segmented
 
-SUFFIXES = {"--rabc": ".parquet", "--mimicgen": ".hdf5", "--isaac": ".hdf5"}
+SUFFIXES = {"--mimicgen": ".hdf5", "--isaac": ".hdf5"}
 """Of the files of formats whose name says none."""
 
 
@@ -97,21 +97,20 @@ def _fitted(file: Path) -> Path:
 
 
 def _exporters(run: Path, file: Path) -> dict[str, Exporter]:
-    """What writes each format, but the copy with labels, which is saved anyway."""
-    return {form.option[2:]: partial(_export, form, run, file) for form in runs.FORMATS if form.option != "--out"}
+    """What writes each format of an HDF5 file, but the copy with labels, which is saved anyway."""
+    offered = [option for option, form in runs.FORMATS.items() if option != "--out" and form.takes != "lerobot"]
+    return {option[2:]: partial(_export, option, run, file) for option in offered}
 
 
-def _export(form: runs.Format, run: Path, file: Path, segmented: Segmented, fit: Fit, folder: Path, level: str) -> Path:
+def _export(option: str, run: Path, file: Path, segmented: Segmented, fit: Fit, folder: Path, level: str) -> Path:
     from ddco_pyro.data.sources import open_source
     from ddco_pyro.segmenting.formats import Asked
 
-    name = form.option[2:]
-    suffix = "" if form.kind == "folder" else SUFFIXES.get(form.option, f".{name}")
-    place = Output(form.option, folder / f"segments{suffix}", form.kind)
+    kind = runs.FORMATS[option].kind
+    suffix = "" if kind == "folder" else SUFFIXES.get(option, f".{option[2:]}")
+    place = Output(option, folder / f"segments{suffix}", kind)
     with open_source(file) as source:
-        writer = runs.writer_of(
-            place, Asked(fit, run, file, source, level), {one.name: one.default for one in form.more}
-        )
+        writer = runs.writer_of(place, Asked(fit, run, file, source, level))
         writer.check()
         writer.write(segmented)
     return place.path

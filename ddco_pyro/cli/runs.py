@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-import inspect
 import shlex
 import time
-from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import wraps
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import typer
 
-from ddco_pyro.cli import BRACKET, AllowCode, Level, Overrides, RunPath, out_file, out_folder, written
+from ddco_pyro.cli import BRACKET, AllowCode, Overrides, RunPath, out_file, out_folder, written
 from ddco_pyro.data.files import Output, check_outputs
-from ddco_pyro.errors import BadInput, command
+from ddco_pyro.errors import BadInput
 
 if TYPE_CHECKING:
     from ddco_pyro.data.sources import Source
+    from ddco_pyro.exporting import Exported
     from ddco_pyro.fitting.fitted import Fit
     from ddco_pyro.segmenting.formats import Asked, Writer
 
@@ -106,31 +104,6 @@ def report(run: RunPath, overrides: Overrides = [], allow_code: AllowCode = Fals
     print(f"report: {write_report(fitted, fitted.demonstrations)}")
 
 
-def name(
-    run: RunPath,
-    names: Annotated[
-        str | None,
-        typer.Argument(metavar="[NAMES]", help="The names of options 1 to k, with commas between.", show_default=False),
-    ] = None,
-    level: Level = None,
-    allow_code: AllowCode = False,
-) -> None:
-    """Name the options of a level in RUN/names.yaml; without NAMES, show the options with their shares and lengths."""
-    from ddco_pyro.cli import console
-    from ddco_pyro.fitting.fitted import load
-    from ddco_pyro.report.options import use_table
-
-    fitted = load(run, allow_code)
-    if names is not None:
-        check_outputs([Output("RUN", run / "names.yaml", "file")])
-        fitted.name_options(level or next(iter(fitted.names), ""), names.split(","))
-    elif not fitted.names or (level and level not in fitted.names):
-        raise BadInput(f"{run}: has no {f'level {level!r}' if fitted.names else 'options'}; name another")
-    console.show(use_table(fitted, [level] if level else None))
-    if names is not None:
-        print(f"{run / 'names.yaml'}: show them with: {command('report', run, *['--allow-code'] * allow_code)}")
-
-
 def _check_run(run: Path, *names: str) -> None:
     """Check that the report of a run, and these files of the run, may be written."""
     files = [Output("RUN", run / name, "file") for name in ("report.html", *names)]
@@ -140,112 +113,74 @@ def _check_run(run: Path, *names: str) -> None:
 # --- segment and export -----------------------------------------------------------------------------------------------
 
 
-def _option(name: str, default: Any, kind: Any, text: str) -> inspect.Parameter:
-    """An option that belongs to formats alone, as a parameter of their writers."""
-    flag = f"--{name.replace('_', '-')}"
-    annotation = Annotated[kind, typer.Option(flag, help=text)]
-    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
-
-
 class Format(NamedTuple):
-    """A format of segments, an option of ``segment`` that names a file or folder.
+    """A format of segments.
 
     :param writer: its class in :mod:`ddco_pyro.segmenting.formats`, ``module:Class``.
-    :param more: further options, which are arguments of that class.
+    :param text: what is written, in words.
+    :param takes: the format of demonstrations that it copies; empty where it takes any.
     """
 
-    option: str
     kind: Literal["file", "folder", "stream"]
     writer: str
-    group: str
     text: str
-    more: tuple[inspect.Parameter, ...] = ()
+    takes: Literal["", "robomimic", "lerobot"] = ""
 
 
-OVERWRITE = _option("overwrite", False, bool, "Let --out replace a file that is no labelled copy of DEMOS.")
-LEROBOT_FORMAT = _option(
-    "lerobot_format", "0.6", Literal["0.6", "0.4"], "Subtasks as LeRobot reads them from 0.6 on, or in 0.4 and 0.5."
-)
-SAME_ORDER = _option(
-    "same_order",
-    False,
-    bool,
-    "Leave demonstrations out of --mimicgen and --isaac if their options follow another order than most.",
-)
-GENERAL, DATASETS, TOOLS = "Pages, tables and labels", "Datasets for training", "Annotation tools"
-FORMATS = (
-    Format("--html", "stream", "html:Page", GENERAL, "A page with the timeline of every demonstration."),
-    Format("--csv", "stream", "tables:CSV", GENERAL, "A table with a row for each step."),
-    Format("--parquet", "stream", "tables:Parquet", GENERAL, "The same table as Parquet."),
-    Format(
-        "--out", "file", "labels:Labels", GENERAL, "A copy of the HDF5 file with labels for each step.", (OVERWRITE,)
+FORMATS = {
+    "--html": Format("stream", "html:Page", "A page with the timeline of every demonstration."),
+    "--csv": Format("stream", "tables:CSV", "A table with a row for each step."),
+    "--parquet": Format("stream", "tables:Parquet", "The same table as Parquet."),
+    "--out": Format("file", "labels:Labels", "A copy of the HDF5 file with labels for each step.", "robomimic"),
+    "--lerobot": Format("folder", "lerobot:Annotated", "A copy of a LeRobot dataset with subtasks.", "lerobot"),
+    "--sarm": Format("folder", "lerobot:SARM", "The same with the stages of SARM's reward model.", "lerobot"),
+    "--mimicgen": Format(
+        "file", "mimicgen:MimicGen", "A copy of a prepared file with MimicGen's signals.", "robomimic"
     ),
-    Format(
-        *("--lerobot", "folder", "lerobot:Annotated", DATASETS, "A LeRobot dataset with options as subtasks."),
-        more=(LEROBOT_FORMAT,),
-    ),
-    Format("--sarm", "folder", "lerobot:SARM", DATASETS, "A LeRobot dataset with the stages of SARM's reward model."),
-    Format("--rabc", "stream", "rabc:RABC", DATASETS, "Progress of each frame as Parquet, for RA-BC in LeRobot."),
-    Format(
-        *("--mimicgen", "file", "mimicgen:MimicGen", DATASETS, "A copy of a prepared file, with MimicGen's signals."),
-        more=(SAME_ORDER,),
-    ),
-    Format("--isaac", "file", "mimicgen:Isaac", DATASETS, "The same for Isaac Lab Mimic.", (SAME_ORDER,)),
-    Format("--rlds", "folder", "rlds:RLDS", DATASETS, "Steps in the fields of RLDS, as numpy archives."),
-    Format("--label-studio", "folder", "label_studio:LabelStudio", TOOLS, "Predictions for Label Studio."),
-    Format("--elan", "folder", "elan:ELAN", TOOLS, "ELAN's .eaf of each demonstration."),
-    Format("--rerun", "folder", "rerun:Rerun", TOOLS, "Rerun's .rrd of each demonstration."),
-)
-"""Every format of segments; to add one, write its :class:`Writer` and list it here."""
+    "--isaac": Format("file", "mimicgen:Isaac", "The same for Isaac Lab Mimic.", "robomimic"),
+    "--label-studio": Format("folder", "label_studio:LabelStudio", "Predictions for Label Studio."),
+    "--elan": Format("folder", "elan:ELAN", "ELAN's .eaf of each demonstration."),
+    "--rerun": Format("folder", "rerun:Rerun", "Rerun's .rrd of each demonstration."),
+}
+"""Every format, by its option of ``segment``. A new one is a :class:`Writer`, a row here and a parameter there."""
+
+TAKEN = {"robomimic": "HDF5 file in robomimic's layout", "lerobot": "LeRobot dataset"}
 
 
-def with_formats(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command an option for each format, between its arguments and its own options.
-
-    The command gets them as ``outputs``, from the option to the path, with the options that were given, and the
-    formats' further options as ``settings`` by name.
-    """
-    own = list(inspect.signature(command, eval_str=True).parameters.values())
-    parsers = {"file": out_file, "stream": out_file, "folder": out_folder}
-    added = {form.option[2:].replace("-", "_"): form for form in FORMATS}
-    keyword = inspect.Parameter.KEYWORD_ONLY
-    options = [
-        inspect.Parameter(
-            name,
-            keyword,
-            default=None,
-            annotation=Annotated[
-                Path | None,
-                written(parsers[form.kind], form.text, show_default=False, rich_help_panel=form.group),
-            ],
-        )
-        for name, form in added.items()
-    ]
-
-    more = {option.name: option for form in FORMATS for option in form.more}
-    options += more.values()
-
-    @wraps(command)
-    def with_outputs(**arguments: Any) -> None:
-        paths = {form.option: arguments.pop(name, None) for name, form in added.items()}
-        settings = {name: arguments.pop(name, option.default) for name, option in more.items()}
-        outputs = {option: path for option, path in paths.items() if path}
-        command(**arguments, outputs=outputs, settings=settings)
-
-    parameters = [option.replace(kind=keyword) for option in own if option.name not in ("outputs", "settings")]
-    vars(with_outputs)["__signature__"] = inspect.Signature([*parameters[:2], *options, *parameters[2:]])
-    return with_outputs
+def _to(option: str) -> Any:
+    """The option of a format."""
+    form = FORMATS[option]
+    parser = out_folder if form.kind == "folder" else out_file
+    return written(parser, form.text, show_default=False, rich_help_panel="Formats")
 
 
-@with_formats
 def segment(
-    outputs: dict[str, Path],
-    settings: dict[str, Any],
     run: RunPath,
     demos: Annotated[
         Path, typer.Argument(metavar="DEMOS", help="Demonstrations: an HDF5 file, or a Minari or LeRobot dataset.")
     ],
+    html: Annotated[Path | None, _to("--html")] = None,
+    csv: Annotated[Path | None, _to("--csv")] = None,
+    parquet: Annotated[Path | None, _to("--parquet")] = None,
+    out: Annotated[Path | None, _to("--out")] = None,
+    lerobot: Annotated[Path | None, _to("--lerobot")] = None,
+    sarm: Annotated[Path | None, _to("--sarm")] = None,
+    mimicgen: Annotated[Path | None, _to("--mimicgen")] = None,
+    isaac: Annotated[Path | None, _to("--isaac")] = None,
+    label_studio: Annotated[Path | None, _to("--label-studio")] = None,
+    elan: Annotated[Path | None, _to("--elan")] = None,
+    rerun: Annotated[Path | None, _to("--rerun")] = None,
     in_place: Annotated[bool, typer.Option("--in-place", help="Write the labels into the HDF5 file itself.")] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Let --out replace a file that is no labelled copy of DEMOS.")
+    ] = False,
+    same_order: Annotated[
+        bool,
+        typer.Option(
+            "--same-order",
+            help="Leave demonstrations out of --mimicgen and --isaac if their options follow another order than most.",
+        ),
+    ] = False,
     level: Annotated[
         str | None, typer.Option(help="The level that gives the subtasks; the lowest by default.", show_default=False)
     ] = None,
@@ -269,56 +204,43 @@ def segment(
     gripper: Annotated[
         int, typer.Option(help="The control dimension of the gripper for --baselines, from 0; by default the last.")
     ] = -1,
-    granularity: Annotated[
-        str | None,
-        typer.Option(
-            metavar="coarse|medium|fine",
-            help="How long segments are: as in the run (medium), or twice or half as long, by further fits. The other "
-            "two stand beside as labels.",
-            show_default=False,
-        ),
-    ] = None,
     allow_code: AllowCode = False,
 ) -> None:
     """Label every step of demonstrations with a run's options, and write them in the formats that you name.
 
     DEMOS is changed with --in-place only.
     """
-    if not (outputs or in_place or baselines):
+    each = zip(
+        FORMATS,
+        (html, csv, parquet, out, lerobot, sarm, mimicgen, isaac, label_studio, elan, rerun),
+        strict=True,
+    )
+    places = [Output(option, path, FORMATS[option].kind) for option, path in each if path]
+    if not (places or in_place or baselines):
         raise BadInput(
-            "name what to write, such as --html PAGE, --csv FILE or --lerobot FOLDER; labels for each step go to --out "
-            "FILE (a copy) or with --in-place into DEMOS; --baselines measures agreement with labels"
+            "name what to write, such as --html PAGE or --csv FILE; labels for each step go to --out FILE (a copy) or "
+            "with --in-place into DEMOS; --baselines measures agreement with labels"
         )
-    if "--out" in outputs and in_place:
+    if out and in_place:
         raise BadInput("--out and --in-place exclude each other; keep one")
-    places = [Output(form.option, outputs[form.option], form.kind) for form in FORMATS if form.option in outputs]
     if in_place:
         places.append(Output("--in-place", demos, "file"))
     from ddco_pyro.cli import console
     from ddco_pyro.data.sources import open_source
     from ddco_pyro.evaluation.agreement import agreement_table, tolerances
     from ddco_pyro.fitting.fitted import load
-    from ddco_pyro.segmenting import baseline_labels, beside_baselines, beside_others, segments
+    from ddco_pyro.segmenting import baseline_labels, beside_baselines, segments
     from ddco_pyro.segmenting.baselines import BASELINES, check_installed
     from ddco_pyro.segmenting.formats import Asked
-    from ddco_pyro.selection.small import GRANULARITIES, cut
 
-    if granularity not in (None, *GRANULARITIES):
-        raise BadInput(f"--granularity {granularity}: give one of {', '.join(GRANULARITIES)}")
     check_outputs(places, [run] if in_place else [run, demos])
     fit = load(run, allow_code)
     if level is not None and fit.names and level not in fit.names:
         raise BadInput(f"--level: there is no level {level!r} (there is: {', '.join(fit.names)})")
-    others = {}
-    if granularity is not None:
-        with console.Progress() as progress:
-            others = {name: cut(fit, name, progress) for name in GRANULARITIES}
-        fit = others.pop(granularity)
     with open_source(demos) as source, console.Progress("segmenting") as progress:
         beside = baseline_labels(fit) if baselines else ()
-        beside += tuple(f"{level}_{name}" for level in fit.names for name in others)
-        asked = Asked(fit, run, demos, source, level or next(iter(fit.names), ""), beside)
-        writers = [writer_of(place, asked, settings) for place in places]
+        asked = Asked(fit, run, demos, source, level or next(iter(fit.names), ""), beside, overwrite, same_order)
+        writers = [writer_of(place, asked) for place in places]
         if fit.names:  # without options, segments() refuses the run
             for writer in writers:
                 writer.check()
@@ -327,9 +249,8 @@ def segment(
             check_installed(BASELINES)
             if missing and not writers:
                 raise BadInput(f"--baselines: {missing}; name what to write, such as --html PAGE")
-        segmented = segments(fit, source, progress, intervals="--html" in outputs)
+        segmented = segments(fit, source, progress, intervals=html is not None)
         segmented = replace(segmented, frequency=fps or segmented.frequency)
-        segmented = beside_others(segmented, others, fit, source) if others else segmented
         if baselines:
             segmented = beside_baselines(segmented, fit, source, gripper, progress)
             for name, scores in segmented.agreements.items():
@@ -343,19 +264,22 @@ def segment(
             print(writer.write(segmented))
 
 
-def writer_of(place: Output, asked: Asked, settings: Mapping[str, Any]) -> Writer:
+def writer_of(place: Output, asked: Asked) -> Writer:
     """What writes a format's file or folder.
 
-    :param settings: the formats' further options by name.
-    :raises BadInput: a package that the format needs is missing.
+    :raises BadInput: the format copies other demonstrations, or a package that it needs is missing.
     """
-    (form,) = (form for form in FORMATS if form.option == place.option.replace("--in-place", "--out"))
+    form = FORMATS[place.option.replace("--in-place", "--out")]
+    if form.takes not in ("", asked.source.format):
+        raise BadInput(
+            f"{asked.demos}: is no {TAKEN[form.takes]}, which {place.option} needs; name another format, such as --csv "
+            "or --html"
+        )
     try:
         kind = resolve_name(f"ddco_pyro.segmenting.formats.{form.writer}")
     except ModuleNotFoundError as error:
         raise BadInput(f"{place.option} needs {error.name}; install it with: pip install {error.name}") from None
-    more = {option.name: settings[option.name] for option in form.more}
-    writer: Writer = kind(place.option, place.path, asked, **more)
+    writer: Writer = kind(place.option, place.path, asked)
     return writer
 
 
@@ -384,7 +308,7 @@ def export(
     ] = False,
     allow_code: AllowCode = False,
 ) -> None:
-    """Write the controller as files that do not need this library: numpy with a runner, torch.export, ONNX.
+    """Write the controller as files that do not need this library: numpy with a runner, and ONNX.
 
     Every form is loaded again and acts in three synthetic episodes, by the
     loop of runner.py. It must choose the options of the run's controller,
@@ -405,13 +329,17 @@ def export(
     if lerobot:
         from ddco_pyro.exporting.lerobot import export_policy
 
-        export_policy(fit, lerobot)
+        _say_exported(export_policy(fit, lerobot))
         print(f"{lerobot}: use it with: lerobot-eval --policy.path={lerobot} --env.type=...")
     if out is None:
         return
     exported = write(fit, out, onnx)
-    for form, (difference, seconds) in exported.items():
-        print(f"{form}: largest difference {difference:.1e}, a step takes {1e3 * seconds:.3f} ms")
+    _say_exported(exported)
     form = next(iter(exported))
     again = shlex.join(["python", str(out / "runner.py"), str(out), *([] if form == "numpy" else [form])])
     print(f"{out}: try it with: {again}")
+
+
+def _say_exported(exported: Exported) -> None:
+    for form, (difference, seconds) in exported.items():
+        print(f"{form}: largest difference {difference:.1e}, a step takes {1e3 * seconds:.3f} ms")

@@ -1,11 +1,9 @@
-"""Colours: one for each option, the same in every figure, frame and film; and heat over a picture."""
+"""Colours: one for each option, the same in every figure, frame and film."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
-
-import numpy as np
 
 from ddco_pyro.names import option_name
 
@@ -23,15 +21,6 @@ without red, green or blue cones. All ten are more than 18 apart."""
 
 ROW = 132
 """Characters in a row of a legend, about: eleven options without names."""
-
-HEIGHT = 240
-"""Rows of a picture with heat; pixels stay squares."""
-
-FADED = 0.5
-"""The share by which the picture under the heat is made paler."""
-
-PERCENTILE = 99.5
-"""The percentile of the values that has the strongest colour, so that single pixels do not pale the rest."""
 
 
 def option_colour(choice: int) -> str:
@@ -69,25 +58,3 @@ def add_legend(
     longest = max((len(handle.get_label()) for handle in handles), default=0)  # type: ignore[arg-type]
     columns = max(1, min(len(handles), ROW // (longest + 4)))
     figure.legend(handles=handles, loc=place, ncols=columns, handlelength=1)  # type: ignore[call-overload]
-
-
-def all_with_heat(looks: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-    """Pictures and the values of their pixels side by side, as :func:`with_heat` draws each."""
-    return np.hstack([with_heat(*look) for look in looks.values()])
-
-
-def with_heat(picture: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """A picture uint8 [H, W, C], pale and grey, under the values [H, W] ≥ 0 of its pixels, uint8 [HEIGHT, W', 3].
-
-    Colours go from yellow to dark red on a scale of the picture's own; 0 has none.
-    """
-    import cv2  # one's own vectors need none of it
-    from matplotlib import colormaps
-
-    grey = 255 - (1 - FADED) * (255 - picture.astype(float).mean(-1, keepdims=True))
-    most = np.percentile(values, PERCENTILE) or values.max() or 1.0
-    share = np.clip(values / most, 0, 1)
-    colours = 255 * colormaps["YlOrRd"](share)[..., :3]
-    drawn = ((1 - share[..., None]) * grey + share[..., None] * colours).astype(np.uint8)
-    width = round(HEIGHT * drawn.shape[1] / drawn.shape[0])
-    return np.asarray(cv2.resize(drawn, (width, HEIGHT), interpolation=cv2.INTER_NEAREST))

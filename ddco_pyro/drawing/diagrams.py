@@ -1,4 +1,4 @@
-"""Drawings of options in SVG: transitions, likeness, and trajectories of instances."""
+"""Drawings of options in SVG: transitions and trajectories of instances."""
 
 from __future__ import annotations
 
@@ -21,20 +21,13 @@ LETTERS = 16
 """Of a name beside a node, at most."""
 
 
-def svg(width: float, height: float, label: str, parts: Sequence[str], **looks: str) -> Markup:
+def svg(width: float, height: float, label: str, parts: Sequence[str]) -> Markup:
     """An SVG element of this size in its own units.
 
     :param parts: its contents, escaped already.
-    :param looks: further attributes.
     """
-    return Markup('<svg viewBox="0 0 {:.0f} {:.0f}" role="img" aria-label="{}"{}>{}</svg>').format(
-        width, height, label, _attributes(looks), Markup("\n").join(map(Markup, parts))
-    )
-
-
-def _attributes(looks: Mapping[str, Any]) -> Markup:
-    return Markup("").join(
-        Markup(' {}="{}"').format(name.rstrip("_").replace("_", "-"), value) for name, value in looks.items()
+    return Markup('<svg viewBox="0 0 {:.0f} {:.0f}" role="img" aria-label="{}">{}</svg>').format(
+        width, height, label, Markup("\n").join(map(Markup, parts))
     )
 
 
@@ -114,36 +107,6 @@ def _edge(start: float, end: float, y: float, gap: float, share: float, title: s
     ).format(0.45 + 0.55 * share, title, path, width, head, _text(middle, top - 7, count))
 
 
-def dendrogram(merges: np.ndarray, choices: Sequence[int], names: Sequence[str]) -> Markup:
-    """Options joined at their distance, from left (alike) to right, on a square-root scale.
-
-    :param merges: the result of :func:`scipy.cluster.hierarchy.linkage` for the options ``choices``.
-    """
-    from scipy.cluster.hierarchy import dendrogram as laid_out  # most commands draw none
-
-    found = laid_out(merges, no_plot=True)
-    left, row, most = 170.0, 26.0, float(merges[:, 2].max()) or 1.0
-    height = row * len(choices) + 34
-
-    def right(distance: float) -> float:
-        return left + (WIDTH - left - 60) * float(np.sqrt(distance / most))
-
-    parts: list[str] = []
-    for distances, rows in zip(found["dcoord"], found["icoord"], strict=True):
-        points = " ".join(f"{right(x):.1f},{row * y / 10:.1f}" for x, y in zip(distances, rows, strict=True))
-        parts.append(Markup('<polyline class="edge" points="{}"/>').format(points))
-        parts.append(
-            _text(right(distances[1]) + 4, row * (rows[1] + rows[2]) / 20 - 4, f"{distances[1]:.2f}", "start", "soft")
-        )
-    for place, leaf in enumerate(found["leaves"]):
-        choice, y = choices[leaf], row * (place + 0.5)
-        parts.append(Markup('<circle cx="{}" cy="{}" r="6" fill="{}"/>').format(left - 12, y, option_colour(choice)))
-        parts.append(_text(left - 24, y + 4, shortened(names[choice]), "end"))
-    parts.append(_text(left, height - 8, "0", kind="soft"))
-    parts.append(_text(WIDTH - 60, height - 8, f"{most:.2f} nats per step", kind="soft"))
-    return svg(WIDTH, height, "How alike options are", parts)
-
-
 # --- instances of an option -------------------------------------------------------------------------------------------
 
 CELL = 110.0
@@ -167,13 +130,10 @@ def line(points: np.ndarray, **looks: Any) -> Markup:
     """A line through points [T, 2], at most 60 of them."""
     chosen = points[np.unique(np.linspace(0, len(points) - 1, min(len(points), 60)).round().astype(int))]
     drawn = " ".join(f"{x:.1f},{y:.1f}" for x, y in chosen)
-    return Markup('<polyline points="{}" fill="none"{}/>').format(drawn, _attributes(looks))
-
-
-def paths_of_one(points: np.ndarray, **looks: Any) -> Markup:
-    """A line for each path [P, T, 2] of a demonstration: solid, dashed or dotted."""
-    dashes = (DASHES[LINES[place % len(LINES)]] for place in range(len(points)))
-    return Markup("").join(line(path, stroke_dasharray=next(dashes), **looks) for path in points)
+    attributes = Markup("").join(
+        Markup(' {}="{}"').format(name.rstrip("_").replace("_", "-"), value) for name, value in looks.items()
+    )
+    return Markup('<polyline points="{}" fill="none"{}/>').format(drawn, attributes)
 
 
 def typical_paths(paths: Sequence[np.ndarray], segments: Sequence[tuple[int, int, int]], colour: str) -> Markup:
@@ -187,42 +147,14 @@ def typical_paths(paths: Sequence[np.ndarray], segments: Sequence[tuple[int, int
     parts: list[str] = [line(path, class_="faint") for each in placed for path in each]
     mark = f'fill="{colour}" stroke="var(--paper)" stroke-width="1"'
     for row, start, end in segments:
-        parts.append(paths_of_one(placed[row][:, start:end], stroke=colour, stroke_width=2))
-        for path in placed[row]:
+        for place, path in enumerate(placed[row]):
+            dashes = DASHES[LINES[place % len(LINES)]]
+            parts.append(line(path[start:end], stroke_dasharray=dashes, stroke=colour, stroke_width=2))
             (x, y), (x1, y1), (x2, y2) = (path[step] for step in (start, (start + end - 1) // 2, end - 1))
             parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4.5" {mark}/>')
             parts.append(f'<rect x="{x1 - 3.5:.1f}" y="{y1 - 3.5:.1f}" width="7" height="7" {mark}/>')
             parts.append(f'<path d="M{x2:.1f},{y2 - 5:.1f} l5,9 l-10,0 z" {mark}/>')
     return svg(width, height, "Trajectories of typical segments", parts)
-
-
-def path_film(paths: Sequence[np.ndarray], steps: np.ndarray, seconds: float, colour: str) -> Markup:
-    """A grid of cells in each of which a point moves along one instance; all begin at their onset together.
-
-    :param paths: the demonstration of each instance in the plane [P, T, 2]; a point moves along each path.
-    :param steps: the step of each frame in each instance, [F, instances].
-    :param seconds: of the whole film.
-    """
-    columns = min(3, len(paths))
-    placed = fitted(paths, CELL, CELL)
-    parts: list[str] = []
-    for cell, path in enumerate(placed):
-        shown = path[:, steps[:, cell]]
-        parts.append(f'<g transform="translate({CELL * (cell % columns):.0f},{CELL * (cell // columns):.0f})">')
-        parts.append(f'<rect x="1" y="1" width="{CELL - 2:.0f}" height="{CELL - 2:.0f}" class="faint"/>')
-        parts += [line(one, class_="faint") for one in path]
-        parts.append(paths_of_one(shown, stroke=colour, stroke_width=1.5))
-        for (x, y), one in zip(shown[:, 0], shown, strict=True):
-            parts.append(f'<circle r="4.5" cx="{x:.1f}" cy="{y:.1f}" fill="{colour}" stroke="var(--ink)">')
-            for axis, name in enumerate(("cx", "cy")):
-                values = ";".join(f"{value:.1f}" for value in one[:, axis])
-                parts.append(
-                    f'<animate attributeName="{name}" values="{values}" dur="{seconds:.2f}s" repeatCount="indefinite"/>'
-                )
-            parts.append("</circle>")
-        parts.append("</g>")
-    rows = -(-len(placed) // columns)
-    return svg(columns * CELL, rows * CELL, "Instances from their onset on", parts, class_="film", tabindex="0")
 
 
 def curves(values: Mapping[str, Sequence[np.ndarray]], colour: str) -> Markup:

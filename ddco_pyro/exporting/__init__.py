@@ -1,8 +1,7 @@
-"""Export a fitted controller as files that run without this library: numpy, ``torch.export`` and ONNX."""
+"""Export a fitted controller as files that run without this library: numpy and ONNX."""
 
 from __future__ import annotations
 
-import io
 import json
 import logging
 import warnings
@@ -27,7 +26,7 @@ from ddco_pyro.model.seeding import HOST
 
 __all__ = ["TOLERANCE", "Exported", "export", "write_numpy"]
 
-FILES = {"controller.json", "weights.npz", "controller.pt2", "controller.onnx", "runner.py", "check.npz", "__pycache__"}
+FILES = {"controller.json", "weights.npz", "controller.onnx", "runner.py", "check.npz", "__pycache__"}
 """Everything that an exported folder can hold."""
 
 DEFECT = "with networks of this library that is a defect: report it"
@@ -44,9 +43,8 @@ Exported = dict[str, tuple[float, float]]
 def export(fit: Fit, folder: str | Path, onnx: bool = False) -> Exported:
     """Write the controller that a run's ``rollout`` describes, and verify every form of it.
 
-    The folder gets ``controller.json``, ``weights.npz`` and ``runner.py``, which run with numpy alone;
-    ``controller.pt2``, a ``torch.export`` program of one step of all networks; with ``onnx`` the same step as
-    ``controller.onnx``; and ``check.npz``, episodes to replay.
+    The folder gets ``controller.json``, ``weights.npz`` and ``runner.py``, which run with numpy alone; with ``onnx``
+    one step of all networks as ``controller.onnx``; and ``check.npz``, episodes to replay.
 
     Each form is loaded again from the disk and driven by ``runner.py`` through synthetic episodes. Every option must
     equal the original's choice. Every control and network output must lie within
@@ -54,18 +52,17 @@ def export(fit: Fit, folder: str | Path, onnx: bool = False) -> Exported:
     otherwise nothing changes.
 
     :raises ExportError: a form acts differently, or cannot be made.
-    :raises BadInput: ``folder`` holds other files.
+    :raises BadInput: ``folder`` holds other files, or numpy cannot evaluate the networks and no ONNX is asked for.
 
-    >>> sorted(ddco_pyro.export(fit, "controller"))  # both forms act like the original
-    ['numpy', 'torch']
+    >>> [*ddco_pyro.export(fit, "controller")]  # it acts like the original
+    ['numpy']
     """
     folder = Path(folder)
     if folder.exists() and not folder.is_dir():
         raise BadInput(f"{folder}: is a file; choose another --out")
     refuse_others(folder, FILES, "--out")
     with whole_folder(folder) as temporary:
-        forms = _write(fit, temporary, onnx)
-        return _compare(temporary, forms)
+        return write_verified(fit, temporary, onnx)
 
 
 def refuse_others(folder: Path, names: set[str], option: str) -> None:
@@ -76,6 +73,15 @@ def refuse_others(folder: Path, names: set[str], option: str) -> None:
     """
     if folder.exists() and (others := sorted({path.name for path in folder.iterdir()} - names)):
         raise BadInput(f"{folder}: holds what was not exported, such as {others[0]}; choose another {option}")
+
+
+def write_verified(fit: Fit, folder: Path, onnx: bool = False) -> Exported:
+    """Write every file into an empty folder, and verify every form.
+
+    :raises ExportError: a form acts differently, or cannot be made.
+    :raises BadInput: numpy cannot evaluate the networks, and no ONNX is asked for.
+    """
+    return _compare(folder, _write(fit, folder, onnx))
 
 
 def write_numpy(fit: Fit, folder: Path) -> bool:
@@ -105,13 +111,15 @@ def runner_source() -> str:
 
 def _write(fit: Fit, folder: Path, onnx: bool) -> list[str]:
     """Write every file; returns the forms that can run."""
-    forms = ["numpy"] if write_numpy(fit, folder) else []
-    for name, content in _programs(StepProgram(fit.hierarchy.eval()).eval(), onnx).items():
-        (folder / name).write_bytes(content)
+    forms = [*(["numpy"] if write_numpy(fit, folder) else []), *(["onnx"] if onnx else [])]
+    if not forms:
+        raise BadInput(f"{fit.place}: has networks that numpy cannot evaluate; export it with --out and --onnx")
+    if onnx:
+        (folder / "controller.onnx").write_bytes(_onnx(StepProgram(fit.hierarchy.eval()).eval()))
     episodes = record(fit.controller(), fit.hierarchy)
     episodes["tolerance"] = np.array(tolerance(fit.hierarchy, episodes))
     np.savez_compressed(folder / "check.npz", **episodes)  # type: ignore[arg-type]
-    return [*forms, "torch", *(["onnx"] if onnx else [])]
+    return forms
 
 
 def _compare(folder: Path, forms: list[str]) -> Exported:
@@ -142,20 +150,14 @@ def _one_line_errors(what: str) -> Iterator[None]:
         raise ExportError(f"nothing was written: {what}: {type(error).__name__}: {text}") from error
 
 
-def _programs(program: StepProgram, onnx: bool) -> dict[str, bytes]:
-    """The contents of ``controller.pt2`` and, on request, of ``controller.onnx``, by name."""
-    inputs, content = program.example(), io.BytesIO()
+def _onnx(program: StepProgram) -> bytes:
+    """The contents of ``controller.onnx``."""
+    inputs, (given, names) = program.example(), program.onnx_names()
     with _one_line_errors("the networks cannot be exported"), warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # of torch about itself
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it misses torchvision, which nothing here needs
         exported = torch.export.export(program, inputs)
-        torch.export.save(exported, content)
-        files = {"controller.pt2": content.getvalue()}
-        if onnx:
-            given, names = program.onnx_names()
-            made = torch.onnx.export(
-                exported, inputs, input_names=given, output_names=names, dynamo=True, verbose=False
-            )
-            assert made is not None
-            files["controller.onnx"] = made.model_proto.SerializeToString()
-    return files
+        made = torch.onnx.export(exported, inputs, input_names=given, output_names=names, dynamo=True, verbose=False)
+        assert made is not None
+        content: bytes = made.model_proto.SerializeToString()
+    return content

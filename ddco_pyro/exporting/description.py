@@ -1,4 +1,4 @@
-"""One step of an exported controller as a module for ``torch.export`` and ONNX, and its facts for the numpy runner.
+"""One step of an exported controller as a module for ONNX, and its facts for the numpy runner.
 
 The facts are ``controller.json`` and ``weights.npz``.
 """

@@ -8,9 +8,8 @@
     controller.choices, controller.terminations   # active options, lowest level first, and their ψ
     controller.active                             # their names, by level
 
-``python runner.py [FOLDER] [numpy|torch|onnx]`` replays the episodes in ``check.npz`` and prints the largest difference
-from the original. A user's networks may need ``Runner(".", networks="torch")`` and torch, or
-``Runner(".", networks="onnx")`` and onnxruntime.
+``python runner.py [FOLDER] [numpy|onnx]`` replays the episodes in ``check.npz`` and prints the largest difference from
+the original. A user's networks may need ``Runner(".", networks="onnx")`` and onnxruntime.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ Networks = Callable[[np.ndarray, int, Mapping[str, np.ndarray], State], tuple[Ou
 class Runner:
     """An exported controller: :meth:`reset`, then :meth:`act` with each observation.
 
-    :param networks: ``numpy``, ``torch`` (the ``torch.export`` program) or ``onnx``, to evaluate the networks.
+    :param networks: ``numpy`` or ``onnx``, to evaluate the networks.
     """
 
     def __init__(self, folder: str | Path, networks: str = "numpy") -> None:
@@ -406,41 +405,18 @@ def _selection(logits: np.ndarray, caller: Mapping[str, Any]) -> np.ndarray:
 
 def _numpy(folder: Path, about: Mapping[str, Any]) -> Networks:
     if not about["numpy"]:
-        raise ValueError('it has networks that numpy cannot evaluate: use Runner(..., networks="torch") or "onnx"')
+        raise ValueError('it has networks that numpy cannot evaluate: use Runner(..., networks="onnx")')
     return NumpyNetworks(read_arrays(folder / "weights.npz"), about)
 
 
-def _torch(folder: Path, about: Mapping[str, Any]) -> Networks:
-    """Every network of the hierarchy, from ``controller.pt2``."""
-    import torch
-
-    program = torch.export.load(folder / "controller.pt2").module()
-
-    def run(inputs: Mapping[str, np.ndarray]) -> State:
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)  # networks are small: more threads only wait for one another
-        try:
-            with torch.no_grad():
-                return [tensor.numpy() for tensor in program(*map(torch.tensor, inputs.values()))]
-        finally:
-            torch.set_num_threads(threads)
-
-    return _program(run, about)
-
-
 def _onnx(folder: Path, about: Mapping[str, Any]) -> Networks:
-    """Every network of the hierarchy, from ``controller.onnx``."""
+    """Every network of the hierarchy, from ``controller.onnx``, which gives first the outputs, then the next state."""
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     session = onnxruntime.InferenceSession(str(folder / "controller.onnx"), options)
-    names = [argument.name for argument in session.get_inputs()]  # without those that nothing reads
-    return _program(lambda inputs: session.run(None, {name: inputs[name] for name in names}), about)
-
-
-def _program(run: Callable[[Mapping[str, np.ndarray]], State], about: Mapping[str, Any]) -> Networks:
-    """Networks that give first their outputs, then the next state."""
+    names, read = about["outputs"], [argument.name for argument in session.get_inputs()]  # nothing reads the others
 
     def evaluate(
         features: np.ndarray, step: int, images: Mapping[str, np.ndarray], state: State
@@ -448,13 +424,13 @@ def _program(run: Callable[[Mapping[str, np.ndarray]], State], about: Mapping[st
         inputs = {"features": features, "step": np.array([step], np.int64)}
         inputs |= {f"image_{number}": image for number, image in enumerate(images.values())}
         inputs |= {f"state_{number}": array for number, array in enumerate(state)}
-        values, names = run(inputs), about["outputs"]
+        values = session.run(None, {name: inputs[name] for name in read})
         return dict(zip(names, values, strict=False)), list(values[len(names) :])
 
     return evaluate
 
 
-FORMS: dict[str, Callable[[Path, Mapping[str, Any]], Networks]] = {"numpy": _numpy, "torch": _torch, "onnx": _onnx}
+FORMS: dict[str, Callable[[Path, Mapping[str, Any]], Networks]] = {"numpy": _numpy, "onnx": _onnx}
 
 
 def replay(controller: Runner, episodes: Mapping[str, np.ndarray]) -> tuple[float, float]:

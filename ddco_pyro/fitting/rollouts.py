@@ -5,16 +5,13 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import BeforeValidator, model_validator
 
 from ddco_pyro.acting.controller import Controller
-from ddco_pyro.acting.saliency import Looking
 from ddco_pyro.data.files import json_text, write_text
-from ddco_pyro.drawing.colours import all_with_heat
 from ddco_pyro.errors import command
 from ddco_pyro.evaluation.worth import success_worth
 from ddco_pyro.events import EpisodeEnded, OnEvent, ignore
@@ -22,7 +19,7 @@ from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.fitting.run import RunError
 from ddco_pyro.jobs import Workers, processes
 from ddco_pyro.metrics import Method, Record, Rollouts, read_record, write_table
-from ddco_pyro.simulation.episodes import run_episode, run_episodes, summarize
+from ddco_pyro.simulation.episodes import run_episodes, summarize
 from ddco_pyro.simulation.film import write_film
 from ddco_pyro.simulation.task import SUCCESS, Policy, Task, find_task
 from ddco_pyro.spec.base import invalid
@@ -93,7 +90,6 @@ def roll_out(
             for episode in run_episodes(str(fit.spec.task), policy, seeds, film, jobs, fit.spec.observed, ()):
                 outcomes.append(episode.outcome)
                 if episode.frames:
-                    _film_looks(fit, name, policy, episode.seed)
                     write_film(_film(fit, name, episode.seed), episode, _names(policy))
                 on_event(EpisodeEnded(name, total))
             rolled.outcomes[name] = outcomes
@@ -119,15 +115,6 @@ def roll_out(
     fit.metrics.write(folder)
     unfinished.unlink(missing_ok=True)
     return fit.metrics.rollouts
-
-
-def _film_looks(fit: Fit, name: str, policy: Policy | str, seed: int) -> None:
-    """Film the saliency of a fitted policy that reads pictures, in the episode of a seed."""
-    if isinstance(policy, Controller) and policy.hierarchy.encoder.images:
-        looking = Looking(policy)
-        again = run_episode(find_task(str(fit.spec.task)), looking, seed, observed=fit.spec.observed, keep=())
-        path = fit.run_folder / "videos" / "saliency" / f"{name}-{seed}.mp4"
-        write_film(path, replace(again, frames=list(map(all_with_heat, looking.looks))), _names(policy))
 
 
 def _names(policy: Policy | str) -> list[Sequence[str]]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import chain
 from pathlib import Path
 
 from ddco_pyro.data.files import only_one
@@ -14,7 +13,6 @@ from ddco_pyro.events import OnEvent, SeedFitted, ignore
 from ddco_pyro.fitting.fit import fit as fit_again
 from ddco_pyro.fitting.fitted import Fit, load
 from ddco_pyro.fitting.rollouts import roll_out
-from ddco_pyro.fitting.run import is_finished
 from ddco_pyro.jobs import Workers, processes, run_all
 from ddco_pyro.metrics import Metrics, Seeds, SuccessOfSeeds
 from ddco_pyro.spec import Spec, user_code, with_overrides
@@ -39,7 +37,7 @@ def training_seeds(spec: Spec, seeds: int) -> list[int]:
 def repeat(first: Fit, seeds: int, on_event: OnEvent = ignore, jobs: int = 1) -> Fit:
     """Repeat a fit and its baselines with other training seeds, ``seeds`` in all.
 
-    Each repetition is a run in ``seeds/SEED`` of the run folder. Finished repetitions are not done again.
+    Each repetition is a run in ``seeds/SEED`` of the run folder; a finished one is not done again.
 
     :param jobs: processes that fit side by side; -1 is one for each core. The result is the same for any number.
     :returns: the fit, with the results of all repetitions in ``metrics.seeds`` and ``metrics.json``.
@@ -51,9 +49,8 @@ def repeat(first: Fit, seeds: int, on_event: OnEvent = ignore, jobs: int = 1) ->
     with only_one(folder):
         places = {seed: folder / "seeds" / str(seed) for seed in numbers[1:]}
         calls = {seed: partial(_again, first.spec, seed, place) for seed, place in places.items()}
-        left = {seed: call for seed, call in calls.items() if not is_finished(places[seed])}
-        with run_all(left, Workers(jobs), "repeated the fit") as fitted:
-            for _ in chain(places.keys() - left, fitted):
+        with run_all(calls, Workers(jobs), "repeated the fit") as fitted:
+            for _ in fitted:
                 on_event(SeedFitted(len(places)))
         every = [first, *(load(place, allow_code) for place in places.values())]
         first.metrics.seeds = over_seeds(numbers, [fit.metrics for fit in every])

@@ -53,7 +53,6 @@ def write_report(fit: Fit, demos: Demonstrations) -> Path:
             likelihood.demonstrations(metrics, {track.anchor for track in drawn.tracks} if segmented else ()),
             likelihood.dimensions(fit),
             options.section(fit, demos, active, paths) if active else None,
-            inputs.saliency(fit, demos, segmented),
             inputs.branches(fit),
             learning,
             warned if warned and warned.folded else None,

@@ -1,4 +1,4 @@
-"""Posteriors, most likely paths and terminations of demonstrations, as arrays for figures."""
+"""Posteriors and most likely paths of demonstrations, as arrays for figures."""
 
 from __future__ import annotations
 
@@ -14,8 +14,6 @@ from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.names import option_name
 from ddco_pyro.segmenting import Segmented, Segments, of_piece, of_run
 
-MOST_BINS = 60
-
 
 @dataclass(frozen=True)
 class LevelActivity:
@@ -24,14 +22,12 @@ class LevelActivity:
     :param names: the name of each choice, control first.
     :param active: u_t, the posterior probability of each choice [N, T, C]; 0 past a demonstration's end.
     :param path: choices of the most likely path [N, T]; -1 past the end.
-    :param termination: ψ_h(s_t) of the k options [N, T, k].
     """
 
     name: str
     names: Sequence[str]
     active: np.ndarray
     path: np.ndarray
-    termination: np.ndarray
 
     @property
     def choices(self) -> list[int]:
@@ -70,9 +66,8 @@ def activity(fit: Fit, demos: Demonstrations) -> Activity:
     steps, pieces, segments = max(demos.lengths), [], dict[str, Segments]()
     labels = {demo.name: {name: demo.labels[name] for name in fit.spec.demonstrations.label_names} for demo in demos}
     for piece in fit.infer(demos):
-        endings = (level[..., 1].exp() for level in piece.outputs.termination)
-        arrays = zip(piece.posterior.u, piece.path.choices, endings, strict=True)
-        pieces.append([(_padded(u.float(), steps), _padded(h, steps, -1), _padded(psi, steps)) for u, h, psi in arrays])
+        arrays = zip(piece.posterior.u, piece.path.choices, strict=True)
+        pieces.append([(_padded(u.float(), steps), _padded(h, steps, -1)) for u, h in arrays])
         segments |= {demo.name: demo for demo in of_piece(fit, piece, labels, intervals=True)}
     levels = tuple(
         LevelActivity(name, names, *map(np.concatenate, zip(*arrays, strict=True)))
@@ -92,41 +87,3 @@ def _padded(values: Tensor, steps: int, end: float = 0.0) -> np.ndarray:
     """[N, T', ...] to [N, steps, ...]."""
     missing = [(0, 0), (0, steps - values.shape[1])] + [(0, 0)] * (values.ndim - 2)
     return np.pad(values.numpy(), missing, constant_values=end)
-
-
-@dataclass(frozen=True)
-class Bins:
-    """Steps of demonstrations gathered into bins of time.
-
-    :param index: the bin of each step [N, T]; -1 past a demonstration's end.
-    :param edges: the bins' edges [B + 1], in steps or as shares of a demonstration.
-    :param axis: the label of the time axis.
-    """
-
-    index: np.ndarray
-    edges: np.ndarray
-    axis: str
-
-    def mean(self, values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Weighted mean over the steps [N, T] of each bin [B]; NaN where the weights sum to 0."""
-        total, weight = self.total(values * weights), self.total(weights)
-        return np.divide(total, weight, out=np.full(len(total), np.nan), where=weight > 0)
-
-    def total(self, values: np.ndarray) -> np.ndarray:
-        """Sum over the steps [N, T] of each bin [B]."""
-        inside = self.index >= 0
-        return np.bincount(self.index[inside], values[inside], minlength=len(self.edges) - 1)
-
-
-def bins(lengths: np.ndarray) -> Bins:
-    """One bin for each step of equally long, short demonstrations; else bins of normalised time."""
-    steps = np.arange(lengths.max())
-    alive = steps < lengths[:, None]
-    if len(set(lengths)) == 1 and lengths[0] <= MOST_BINS:
-        index = np.broadcast_to(steps, alive.shape)
-        return Bins(index, np.arange(lengths[0] + 1) - 0.5, "step t")
-    count = int(min(MOST_BINS, lengths.min()))
-    index = np.minimum((steps + 0.5) / lengths[:, None] * count, count - 1).astype(int)
-    return Bins(
-        np.where(alive, index, -1), np.linspace(0.0, 1.0, count + 1), "share of the demonstration that has passed"
-    )

@@ -1,4 +1,4 @@
-"""Inputs in the report: saliency of pictures, and the use of each branch of the networks."""
+"""Inputs in the report: what policies and terminations read, and the use of each branch of the networks."""
 
 from __future__ import annotations
 
@@ -6,74 +6,23 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import torch
-from markupsafe import Markup
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from ddco_pyro.acting.saliency import Saliency
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.drawing.colours import all_with_heat, option_colour
-from ddco_pyro.drawing.figures import FAINT, WIDTH, blank, save
+from ddco_pyro.drawing.figures import FAINT, blank, save
 from ddco_pyro.drawing.page import Section, Table, note
 from ddco_pyro.drawing.words import number, percent
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import BranchUse
 from ddco_pyro.model.networks import Inputs
-from ddco_pyro.names import name_in_level, option_name
-from ddco_pyro.segmenting import Segmented
-from ddco_pyro.training.data import parts
-
-COLUMNS, ROWS = 4, 3
+from ddco_pyro.names import name_in_level
 
 GRADIENT_DEMONSTRATIONS, GRADIENT_STEPS = 8, 1000
 """Demonstrations and steps, padding included, over which gradients with respect to observations are averaged."""
 
 SHADES = ("#1f3b73", "#6f8fc9", "#c9a227", "#8c4a32", "#5b8c5a", "#7d6b91")
 """One for each branch, in turn."""
-
-
-def saliency(fit: Fit, demos: Demonstrations, segmented: Segmented | None) -> Section | None:
-    """Saliency over a held-out demonstration, or over the first one where none is held out; None without pictures.
-
-    :param segmented: the segments of demonstrations; None for a policy without options.
-    """
-    keys = fit.hierarchy.encoder.images
-    if not keys:
-        return None
-    split = parts(fit.spec, demos)
-    part = "valid" if "valid" in split and not fit.without else "train"
-    demo, gradients, names = split[part][0], Saliency(fit.hierarchy), next(iter(fit.names.values()), ())
-    levels = next((one.levels for one in segmented.segments if one.name == demo.name), {}) if segmented else {}
-    shown = np.unique(np.linspace(0, len(demo) - 1, COLUMNS * ROWS).round().astype(int))
-    panels = []
-    for step in range(shown[-1] + 1):
-        choices = [int(level.options[step]) for level in levels.values()]
-        looks = gradients.step({key: values[step] for key, values in demo.observations.items()}, choices)
-        if step in shown:
-            title = f"step {step}" + (f", {option_name(choices[0], names)}" if choices else "")
-            panels.append((title, choices[0] if choices else 0, all_with_heat(looks)))
-    height, width = panels[0][2].shape[:2]
-    figure = blank(ROWS * (WIDTH / COLUMNS * height / width + 0.25))
-    for axes, (title, choice, drawn) in zip(figure.subplots(ROWS, COLUMNS, squeeze=False).flat, panels, strict=False):
-        axes.imshow(drawn)
-        axes.set(xticks=[], yticks=[], title=title)
-        axes.spines[:].set(visible=True, linewidth=3, color=option_colour(choice))
-    for axes in figure.axes[len(panels) :]:
-        axes.remove()
-    caption = (
-        f"Pictures of {demo.name}, {'held out' if part == 'valid' else 'a training demonstration'}, as networks see "
-        "them, paler. Colours: how much the control of the active option changes with each pixel, the norm of its "
-        "gradient, from yellow to dark red on a scale of each picture's own. The frame has the colour of the option on "
-        "the most likely path."
-    )
-    alt = f"Saliency of {', '.join(keys)} over {demo.name}"
-    command = Markup("<code>ddco-pyro rollout --video</code>")
-    limits = Markup(
-        "A gradient is the effect of a small change, not of the absence of a thing. {} films the saliency of an "
-        "episode (<code>videos/saliency</code>)."
-    ).format(command)
-    picture = save(figure, fit.run_folder / "figures" / "looks.png", alt, caption)
-    return Section("looks", "What it looks at", [picture, note(limits)], folded=True)
 
 
 def deciding(fit: Fit, demos: Demonstrations) -> dict[str, dict[str, dict[int, str]]]:

@@ -16,7 +16,7 @@ from matplotlib.ticker import MaxNLocator
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.drawing.colours import add_legend, is_bright, option_colour
-from ddco_pyro.drawing.figures import FAINT, GRID, INK, blank, hide_frame, save
+from ddco_pyro.drawing.figures import FAINT, INK, blank, hide_frame, save
 from ddco_pyro.drawing.page import Block, Cell, Picture, Section, Table, Text, note
 from ddco_pyro.drawing.timeline import Timelines
 from ddco_pyro.drawing.words import duration, number, percent
@@ -24,7 +24,7 @@ from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import NamedByLabel
 from ddco_pyro.names import label_name, numbered_name
 from ddco_pyro.report import trajectories
-from ddco_pyro.report.activity import Activity, Bins, LevelActivity, bins
+from ddco_pyro.report.activity import Activity
 from ddco_pyro.segmenting.page import HOW
 from ddco_pyro.spec import PathSpec
 
@@ -33,9 +33,6 @@ EXAMPLES = 4
 
 MOST_POINTS = 400
 """Steps that are drawn of a posterior; longer demonstrations are averaged over groups of steps."""
-
-LEAST_SHARE = 0.01
-"""A termination is drawn where its option is active in at least this share of the demonstrations."""
 
 ROWS = 6
 """Time lines that are seen at once."""
@@ -58,9 +55,7 @@ def section(fit: Fit, demos: Demonstrations, activity: Activity, paths: Sequence
     ]
     pictures = (
         _posterior_picture(fit, demos, activity, labels),
-        _rows_picture(fit, activity, labels),
         trajectories.picture(fit, demos, activity, paths),
-        _timing_picture(fit, activity),
     )
     used = note("On the most likely path of all demonstrations. The same option chosen anew stays one segment.")
     blocks: list[Block] = [picture for picture in pictures if picture is not None]
@@ -75,15 +70,12 @@ def section(fit: Fit, demos: Demonstrations, activity: Activity, paths: Sequence
     return Section("options", "Which option is active when", blocks, folded=True)
 
 
-def use_table(fit: Fit, levels: Sequence[str] | None = None) -> Table:
-    """The use of each choice of each level, the highest level first; control only where it is chosen.
-
-    :param levels: the levels to show; None for all.
-    """
+def use_table(fit: Fit) -> Table:
+    """The use of each choice of each level, the highest level first; control only where it is chosen."""
     rows, stands_for = [], {(one.level, one.option): agreeing(one) for one in fit.metrics.named_by_labels}
     for (level, names), use in reversed(list(zip(fit.names.items(), fit.metrics.options, strict=True))):
         total = sum(row.steps for row in use)
-        for row in use if levels is None or level in levels else ():
+        for row in use:
             if row.choice or row.segments:
                 named = Cell(numbered_name(row.choice, names), colour=option_colour(row.choice))
                 length = "–" if row.length is None else duration(fit.metrics.control_frequency, row.length)
@@ -179,113 +171,11 @@ def _labels(axes: Axes, labels: np.ndarray, names: Sequence[str], colours: Mappi
     hide_frame(axes)
 
 
-# --- the most likely path of every demonstration ----------------------------------------------------------------------
-
-
-def row_order(activity: Activity) -> np.ndarray:
-    """Demonstrations by length, then by the step at which the option of the lowest level first changes [N]."""
-    path = activity.levels[0].path
-    changed = np.diff(path, axis=1, append=-1) != 0  # at the end at the latest
-    first = np.where(changed[:, :-1].any(1), changed.argmax(1), path.shape[1])
-    return np.lexsort((first, activity.lengths))
-
-
-def _rows_picture(fit: Fit, activity: Activity, labels: Sequence[Mapping[str, np.ndarray]]) -> Picture:
-    """A panel for each level, the highest first, and each kind of labels; a row of colour for each demonstration."""
-    count, rows = len(labels), row_order(activity)
-    caption = (
-        f"Most likely options of all {count} demonstrations, one row each, sorted by length, then by the step at which "
-        "the option first changes."
-    )
-    if labels[0]:
-        caption += " A ground-truth label has the colour of the option that it is matched with, or is grey."
-    images = [(f"level “{level.name}”", colour_image(level.path[rows])) for level in reversed(activity.levels)]
-    for name in labels[0]:
-        title, colours = "ground-truth labels", activity.segmented.label_colours(name)
-        image = label_image([labels[row][name] for row in rows], activity.lengths.max(), colours)
-        images.append((title if len(labels[0]) == 1 else f"labels “{name}”", image))
-    figure = blank(float(np.clip(0.9 + 0.045 * count, 2.2, 7)))
-    panels = figure.subplots(1, len(images), sharey=True, squeeze=False)[0]
-    for axes, (title, image) in zip(panels, images, strict=True):
-        axes.imshow(
-            image, aspect="auto", interpolation="nearest", extent=(-0.5, image.shape[1] - 0.5, count + 0.5, 0.5)
-        )
-        axes.set(title=title, xlabel="step t")
-        axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
-        axes.yaxis.set_major_locator(MaxNLocator(6, integer=True))
-    panels[0].set_ylabel("demonstration")
-    add_legend(figure, activity.choices, activity.names)
-    alt = f"Rows of colour: the most likely option at each step of {count} demonstrations"
-    return save(figure, fit.run_folder / "figures" / "segments.png", alt, caption)
-
-
 def colour_image(path: np.ndarray) -> np.ndarray:
-    """Choices [N, T] as colours [N, T, 3]; white where there is none (-1)."""
-    palette = np.array([to_rgb(option_colour(choice)) for choice in range(max(int(path.max()), 0) + 1)] + [(1, 1, 1)])
-    image: np.ndarray = palette[path]  # -1 is the last entry
+    """Choices [N, T] as colours [N, T, 3]."""
+    palette = np.array([to_rgb(option_colour(choice)) for choice in range(int(path.max()) + 1)])
+    image: np.ndarray = palette[path]
     return image
-
-
-def label_image(labels: Sequence[np.ndarray], steps: int, colours: Mapping[int, str]) -> np.ndarray:
-    """Labels [T_n] of N demonstrations in their colours or in shades of grey [N, steps, 3]; white past the end."""
-    values = sorted({int(value) for array in labels for value in np.unique(array)})
-    greys = np.linspace(0.86, 0.1, len(values))
-    palette = np.array([to_rgb(colours.get(value, str(grey))) for value, grey in zip(values, greys, strict=True)])
-    image = np.ones((len(labels), steps, 3))
-    for row, array in zip(image, labels, strict=True):
-        row[: len(array)] = palette[np.searchsorted(values, array)]
-    return image
-
-
-# --- shares and terminations over time --------------------------------------------------------------------------------
-
-
-def _timing_picture(fit: Fit, activity: Activity) -> Picture:
-    """For each level, the highest first: share of each choice and termination probability of each option over time."""
-    caption = (
-        "Left: mean probability of each option over all demonstrations. Right: probability that an active option ends "
-        "at a step (its termination condition, ψ in the paper); not drawn where the option is hardly ever active."
-    )
-    if len(activity.levels) > 1:
-        caption += " Above the lowest level an option can end only where the option below it ends."
-    gathered = bins(activity.lengths)
-    figure = blank(0.5 + 2.1 * len(activity.levels))
-    panels = figure.subplots(len(activity.levels), 2, sharex=True, squeeze=False)
-    middles = (gathered.edges[:-1] + gathered.edges[1:]) / 2
-    for (left, right), level in zip(panels, reversed(activity.levels), strict=True):
-        _stack(left, shares(level, gathered), gathered.edges)
-        left.set(title=f"share of each choice, level “{level.name}”", ylabel="share")
-        for option, values in enumerate(terminations(level, gathered).T, start=1):
-            right.plot(middles, values, color=option_colour(option), linewidth=1.5, marker="o", markersize=2.5)
-        right.set(title=f"probability of ending, level “{level.name}”", ylabel="probability", ylim=(-0.02, 1.02))
-        right.grid(axis="y", color=GRID)
-    for axes in panels[-1]:
-        axes.set_xlabel(gathered.axis)
-    add_legend(figure, activity.choices, activity.names)
-    alt = f"Share of each option and termination probabilities over time, {len(activity.lengths)} demonstrations"
-    return save(figure, fit.run_folder / "figures" / "timing.png", alt, caption)
-
-
-def shares(level: LevelActivity, gathered: Bins) -> np.ndarray:
-    """Mean of u_t in each bin [B, C]."""
-    alive = (gathered.index >= 0).astype(float)
-    return np.stack([gathered.mean(level.active[..., c], alive) for c in range(level.active.shape[2])], axis=1)
-
-
-def terminations(level: LevelActivity, gathered: Bins) -> np.ndarray:
-    """Mean of ψ_h(s_t) in each bin [B, k], weighted by u_{t-1}(h), the probability that h may end at t.
-
-    NaN in bins in which the option is hardly active.
-    """
-    before = np.zeros_like(level.active[..., 1:])
-    before[:, 1:] = level.active[:, :-1, 1:]
-    steps = gathered.total(np.ones(gathered.index.shape))
-    means = []
-    for option in range(before.shape[2]):
-        weights = before[..., option]
-        mean = gathered.mean(level.termination[..., option], weights)
-        means.append(np.where(gathered.total(weights) >= LEAST_SHARE * steps, mean, np.nan))
-    return np.stack(means, axis=1)
 
 
 # --- segments ---------------------------------------------------------------------------------------------------------

@@ -32,17 +32,9 @@ __all__ = [
     "Segments",
     "baseline_labels",
     "beside_baselines",
-    "beside_others",
     "recorded",
     "segments",
 ]
-
-
-OTHERS = {
-    baselines.RECOGNISER: baselines.RECOGNISED,
-    **{name: f"options, {name}" for name in ("coarse", "medium", "fine")},
-}
-"""What can stand beside a run's options and is fitted by no baseline, in words."""
 
 
 @dataclass(frozen=True)
@@ -140,9 +132,7 @@ class Segmented:
                 equal = f"{baselines.BASELINES[baselines.EQUAL]}, {part}"
                 scores[equal] = of_equal_lengths(labels, self.counts[level])
             for part, group in [*groups.items()][:1]:
-                for name, words in (
-                    baselines.BASELINES | {baselines.RECOGNISER: baselines.RECOGNISED} | OTHERS
-                ).items():
+                for name, words in (baselines.BASELINES | {baselines.RECOGNISER: baselines.RECOGNISED}).items():
                     if f"{level}_{name}" in group[0].baselines and name != baselines.EQUAL:
                         kinds = [demo.baselines[f"{level}_{name}"] for demo in group]
                         agreements[level][f"{words}, {part}"] = scores_of(kinds, [demo.labels[truth] for demo in group])
@@ -234,18 +224,7 @@ def beside_baselines(
             for row, steps in zip(() if piece.recognised is None else piece.recognised, piece.lengths, strict=True)
         ]
     each = (
-        replace(demo, baselines={**demo.baselines, **{name: kinds[row] + 1 for name, kinds in found.items()}})
-        for row, demo in enumerate(segmented.segments)
-    )
-    return replace(segmented, segments=tuple(each))
-
-
-def beside_others(segmented: Segmented, others: Mapping[str, Fit], fit: Fit, source: Source) -> Segmented:
-    """The same segments with the options of other fits of the same levels, as baselines of these names."""
-    demos = tuple(recorded(segmented, fit, source))
-    found = {f"{level.level}_{name}": level.choices for name, other in others.items() for level in other.segment(demos)}
-    each = (
-        replace(demo, baselines={**demo.baselines, **{name: options[row] for name, options in found.items()}})
+        replace(demo, baselines={name: kinds[row] + 1 for name, kinds in found.items()})
         for row, demo in enumerate(segmented.segments)
     )
     return replace(segmented, segments=tuple(each))

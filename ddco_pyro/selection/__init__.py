@@ -14,15 +14,15 @@ from pathlib import Path
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import json_text, write_text
 from ddco_pyro.errors import Failed
-from ddco_pyro.events import CandidateGivenUp, CellDone, CellsBegan, OnEvent, ignore
+from ddco_pyro.events import CellDone, CellsBegan, OnEvent, ignore
 from ddco_pyro.fitting.digest import record
 from ddco_pyro.fitting.run import claimed
 from ddco_pyro.inference import compile_all
-from ddco_pyro.jobs import Workers, processes, run_all
+from ddco_pyro.jobs import Workers, run_all
 from ddco_pyro.selection import choice as choosing
 from ddco_pyro.selection import folds as dividing
 from ddco_pyro.selection import grid
-from ddco_pyro.selection.choice import STOP_RULE, Choice
+from ddco_pyro.selection.choice import Choice
 from ddco_pyro.selection.folds import Folds, Score
 from ddco_pyro.selection.grid import Candidate
 from ddco_pyro.spec import Spec, with_overrides
@@ -78,14 +78,13 @@ def select(
     folder: str | Path,
     on_event: OnEvent = ignore,
     workers: Workers = HERE,
-    stop_early: bool = False,
     demos: Demonstrations | None = None,
     resume: bool = True,
 ) -> Selection:
     """Score every candidate of the spec's grid in every fold, choose one, and write table and figure into the folder.
 
-    Scores that the folder holds are not computed again. The result depends on the spec, the demonstrations and
-    ``stop_early`` alone, not on workers or interruptions.
+    Scores that the folder holds are not computed again. The result depends on the spec and the demonstrations
+    alone, not on workers or interruptions.
 
     >>> grid = "selection.grid.hierarchy.levels.0.count=[1, 2]"
     >>> spec = ddco_pyro.load_spec("mine.yaml", [grid, "selection.folds=2", "training.epochs=2"])
@@ -107,9 +106,9 @@ def select(
         folds = dividing.divide(demos, spec.selection.folds, spec.seed)
         dividing.keep_folds(folds, folder / "folds.json")
         candidates = grid.candidates(spec, folds.dimensions)
-        scores = _score_all(folder, folds, candidates, on_event, workers, stop_early)
+        scores = _score_all(folder, folds, candidates, on_event, workers)
         choice = choosing.choose(candidates, scores, len(folds.held_out))
-        _write(folder, spec, choice, folds, stop_early)
+        _write(folder, spec, choice, folds)
     if choice.chosen is None:
         reasons = [reason for row in choice.rows for reason in row.failed.values()]
         raise SelectionFailed(f"every candidate has failed in some fold; the first reason: {reasons[0]}")
@@ -117,35 +116,21 @@ def select(
 
 
 def _score_all(
-    folder: Path, folds: Folds, candidates: Sequence[Candidate], on_event: OnEvent, workers: Workers, stop_early: bool
+    folder: Path, folds: Folds, candidates: Sequence[Candidate], on_event: OnEvent, workers: Workers
 ) -> list[Score]:
-    """The scores of all candidates in all folds, in their order; up to the last fold of a candidate given up early."""
-    count = len(folds.held_out)
-    pairs = [(candidate.number, fold) for candidate in candidates for fold in range(count)]
+    """The scores of all candidates in all folds, in their order."""
+    pairs = [(candidate.number, fold) for fold in range(len(folds.held_out)) for candidate in candidates]
     kept = {pair: dividing.kept_score(folder, *pair) for pair in pairs}
     done = {pair: score for pair, score in kept.items() if score is not None}
     on_event(CellsBegan("cross-validation", len(pairs), len(done)))
-    running = list(candidates)
+    calls = {pair: partial(dividing.score, folds, candidates[pair[0]], pair[1]) for pair in pairs if pair not in done}
     compile_all()
-    with processes(workers.number(len(pairs))):
-        for numbers in [[fold] for fold in range(count)] if stop_early else [list(range(count))]:
-            pending = [(one, fold) for fold in numbers for one in running if (one.number, fold) not in done]
-            calls = {(one.number, fold): partial(dividing.score, folds, one, fold) for one, fold in pending}
-            with run_all(calls, workers, "trained a fold") as scores:
-                for pair, score in scores:
-                    dividing.keep_score(folder, score)
-                    done[pair] = score
-                    on_event(CellDone(f"{candidates[score.candidate].name}, fold {score.fold}", score.failed))
-            if stop_early:
-                numbers_running = {one.number for one in running}
-                seen = [s for s in done.values() if s.fold <= numbers[-1] and s.candidate in numbers_running]
-                hopeless = choosing.hopeless(running, seen)
-                for number in sorted(hopeless):  # later scores, which an earlier selection may have left, do not count
-                    later = [(number, fold) for fold in range(numbers[-1] + 1, count)]
-                    missing = [pair for pair in later if done.pop(pair, None) is None]
-                    on_event(CandidateGivenUp(candidates[number].name, len(missing)))
-                running = [one for one in running if one.number not in hopeless]
-    return [done[pair] for pair in sorted(done)]
+    with run_all(calls, workers, "trained a fold") as scores:
+        for pair, score in scores:
+            dividing.keep_score(folder, score)
+            done[pair] = score
+            on_event(CellDone(f"{candidates[score.candidate].name}, fold {score.fold}", score.failed))
+    return [done[pair] for pair in sorted(pairs)]
 
 
 def final_spec(chosen: Candidate) -> Spec:
@@ -154,12 +139,11 @@ def final_spec(chosen: Candidate) -> Spec:
     return with_overrides(chosen.spec, {**apart, "demonstrations.leave_one_out": False})
 
 
-def _write(folder: Path, spec: Spec, choice: Choice, folds: Folds, stop_early: bool) -> None:
+def _write(folder: Path, spec: Spec, choice: Choice, folds: Folds) -> None:
     found = {
         "folds": len(folds.held_out),
         "demonstrations": len(folds.demos),
         "seed": spec.seed,
-        "stop_early": STOP_RULE if stop_early else None,
         **choosing.as_data(choice),
     }
     write_text(folder / "selection.md", choosing.markdown(choice, found))

@@ -29,14 +29,7 @@ if TYPE_CHECKING:
 RULE = (
     "chosen: the candidate with the fewest parameters within one standard error of the best, that is, with a mean "
     "held-out log-likelihood per step at most one standard error of the best's mean below it; the better one where "
-    "parameters are equal. A candidate that failed in a fold, or was stopped early, is not chosen"
-)
-
-STOP_FOLDS = 3
-STOP_LEVEL = 0.001
-STOP_RULE = (
-    f"--stop-early: after each fold from the {STOP_FOLDS}rd on, a candidate is given up where the paired t-test over "
-    f"the folds so far puts it below the best so far (one-sided, p < {STOP_LEVEL}), or where a fold of it has failed"
+    "parameters are equal. A candidate that failed in a fold is not chosen"
 )
 
 STD_NOTE = (
@@ -50,7 +43,6 @@ STD_NOTE = (
 class Row:
     """The result of one candidate; log-likelihoods in nats per step.
 
-    :param status: ``scored``; ``failed`` where a fold failed; ``stopped`` where the candidate was given up early.
     :param mean: held-out log-likelihood per step over the scored folds, and its standard ``error``.
     :param difference: this minus the best over the folds of both.
     :param folds: log-likelihood per step of each scored fold, by number.
@@ -60,7 +52,6 @@ class Row:
     """
 
     candidate: Candidate
-    status: str
     mean: float | None
     error: float | None
     difference: Difference | None
@@ -68,6 +59,11 @@ class Row:
     failed: Mapping[int, str]
     gradient_steps: float | None = None
     unconverged: tuple[int, ...] = ()
+
+    @property
+    def status(self) -> str:
+        """``scored``, or ``failed`` where a fold failed."""
+        return "failed" if self.failed else "scored"
 
 
 @dataclass(frozen=True)
@@ -116,7 +112,7 @@ def choose(candidates: Sequence[Candidate], scores: Sequence[Score], folds: int)
     complete = [result for result in results if len(result.good) == folds]
     best = max(complete, key=lambda result: result.mean, default=None)
     reference = best or max((result for result in results if result.good), key=lambda result: result.mean, default=None)
-    rows = [result.row(folds, reference) for result in results]
+    rows = [result.row(reference) for result in results]
     best_row = rows[best.candidate.number] if best else None
     within = [row for row in rows if within_one_error(row, best_row)]
     chosen = min(within, key=lambda row: (row.candidate.parameters, -(row.mean or 0.0)), default=None)
@@ -150,17 +146,16 @@ class _Scored:
         values, steps = self.arrays(list(self.good))
         return float(values.sum() / steps.sum())
 
-    def row(self, folds: int, best: _Scored | None) -> Row:
+    def row(self, best: _Scored | None) -> Row:
         """The candidate's row, compared with the best."""
-        status = "failed" if self.failed else "scored" if len(self.good) == folds else "stopped"
         if not self.good:
-            return Row(self.candidate, status, None, None, None, {}, self.failed)
+            return Row(self.candidate, None, None, None, {}, self.failed)
         values, steps = self.arrays(list(self.good))
         error = paired(values, np.zeros(len(values)), steps).standard_error
         per_fold = dict(zip(self.good, (values / steps).tolist(), strict=True))
         took = float(np.mean([score.gradient_steps for score in self.good.values()]))
         rising = tuple(fold for fold, score in self.good.items() if not score.converged)
-        return Row(self.candidate, status, self.mean, error, self.against(best), per_fold, self.failed, took, rising)
+        return Row(self.candidate, self.mean, error, self.against(best), per_fold, self.failed, took, rising)
 
     def against(self, best: _Scored | None) -> Difference | None:
         """Difference to another candidate per step, over the folds of both."""
@@ -169,27 +164,6 @@ class _Scored:
             return None
         (ours, steps), (theirs, _) = self.arrays(both), best.arrays(both)
         return paired(ours, theirs, steps)
-
-
-def hopeless(candidates: Sequence[Candidate], scores: Sequence[Score]) -> set[int]:
-    """Numbers of the candidates to give up after some folds, by :data:`STOP_RULE`."""
-    failed = {score.candidate for score in scores if score.failed}
-    results = [_Scored(candidate, [s for s in scores if s.candidate == candidate.number]) for candidate in candidates]
-    results = [result for result in results if result.candidate.number not in failed]
-    best = max(results, key=lambda result: result.mean, default=None)
-    if best is None or len(best.good) < STOP_FOLDS:
-        return failed
-    return failed | {result.candidate.number for result in results if result is not best and _below(result, best)}
-
-
-def _below(result: _Scored, best: _Scored) -> bool:
-    (ours, steps), (theirs, _) = result.arrays(list(result.good)), best.arrays(list(result.good))
-    difference = (ours - theirs) / steps
-    if np.ptp(difference) == 0:
-        return bool(difference[0] < 0)
-    from scipy import stats
-
-    return bool(stats.ttest_1samp(difference, 0, alternative="less").pvalue < STOP_LEVEL)
 
 
 def as_data(choice: Choice) -> dict[str, Any]:
@@ -252,7 +226,7 @@ def markdown(choice: Choice, data: Mapping[str, Any]) -> str:
         f"every candidate. Log-likelihood in nats: {NAT}. ± is one standard error over the folds; gradient steps are "
         "the mean of a fold."
     )
-    lines = [data["rule"] + ".", *([data["stop_early"] + "."] if data["stop_early"] else [])]
+    lines = [data["rule"] + "."]
     lines += [f"**Failed:** {one['name']}, fold {one['fold']}: {one['reason']}" for one in data["failed"]]
     lines += [f"**Note:** {note}." for note in choice.notes]
     return Page("Selection", [Text(intro), table(choice), *map(Text, lines)], []).markdown()
@@ -294,6 +268,8 @@ def draw(choice: Choice) -> Figure:
         "diamond: best; orange: chosen, the smallest within one standard error of the best (band); dots: single folds"
     )
     notes = [line for note in choice.notes for line in textwrap.wrap(f"Note: {note}.", 150)]
-    status = {"scored": "", "failed": " (failed)", "stopped": " (stopped)"}
-    names = [f"{row.candidate.name} ({row.candidate.parameters} parameters){status[row.status]}" for row in choice.rows]
+    names = [
+        f"{row.candidate.name} ({row.candidate.parameters} parameters){' (failed)' if row.failed else ''}"
+        for row in choice.rows
+    ]
     return interval_plot(names, panels, [marks, *notes])

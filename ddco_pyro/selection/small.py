@@ -19,8 +19,6 @@ from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.options import segments_of
 from ddco_pyro.events import EpochEnded, Event, LengthTried, OnEvent, ignore
 from ddco_pyro.fitting.fit import fit
-from ddco_pyro.fitting.fitted import Fit, load
-from ddco_pyro.fitting.run import is_finished
 from ddco_pyro.metrics import Segments
 from ddco_pyro.spec import Spec, with_overrides
 from ddco_pyro.training.data import parts
@@ -40,8 +38,6 @@ USUAL = 0.5
 """Below this power gates and terminations have ridges of :data:`RIDGE`, and options may begin from windows."""
 RIDGE = 100.0
 """What gates and terminations read of observations costs nothing else."""
-GRANULARITIES = {"coarse": 2.0, "medium": 1.0, "fine": 0.5}
-"""Median segments in units of a run's own."""
 STEPS_A_SECOND = 10
 """Where the frequency is unknown."""
 PARTS = (1, 3)
@@ -182,32 +178,6 @@ def heavy_tails(spec: Spec, demos: Demonstrations) -> tuple[int, ...]:
 def with_heavy_tails(spec: Spec, dims: tuple[int, ...]) -> Spec:
     """The spec with one Student t for these control dimensions, if there are any."""
     return with_overrides(spec, {"control.parts": [{"name": "heavy", "dims": dims, "kind": "student"}]} if dims else {})
-
-
-def cut(trained: Fit, granularity: str, on_event: OnEvent = ignore) -> Fit:
-    """A run's model, fitted again so that segments are about twice or half as long.
-
-    A run keeps such fits in ``granularity/``.
-
-    :param granularity: one of :data:`GRANULARITIES`; ``medium`` is the run itself.
-    :raises BadInput: the run has no options that last, or trains on labels.
-    """
-    trained.refuse_flat()
-    if GRANULARITIES[granularity] == 1:
-        return trained
-    if trained.spec.training.labels is not None:
-        raise BadInput("--granularity: the labels that the run trains on decide how long segments are; leave it out")
-    folder = None if trained.folder is None else trained.folder / "granularity" / granularity
-    if folder is not None and is_finished(folder):
-        return load(folder, allow_code=True)
-    spec, demos = trained.spec, trained.demonstrations
-    train = parts(spec, demos)["train"]
-    half = float(np.mean([len(demo) for demo in train])) / 2  # a whole demonstration is no skill
-    steps = min(GRANULARITIES[granularity] * segments_of(trained.segment(train)[0]).median, half)
-    alone = {"compare_with": [], "demonstrations.leave_one_out": False}
-    found = lasting(spec, demos, steps, on_event)
-    changes = overrides(spec, found.power, found.constant, found.window) | alone
-    return fit(with_overrides(spec, changes), demos, folder, on_event, keep=False)
 
 
 def in_steps(place: str, length: str, frequency: float | None) -> float:

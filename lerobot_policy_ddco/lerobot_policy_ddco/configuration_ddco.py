@@ -10,14 +10,7 @@ from lerobot.configs import PreTrainedConfig
 @PreTrainedConfig.register_subclass("ddco")
 @dataclass
 class DDCOConfig(PreTrainedConfig):
-    """A controller of ``ddco-pyro export``.
-
-    :param controller: JSON, what ``controller.json`` of an export holds.
-    :param weights: JSON, the shape and the kind of each array in ``model.safetensors``.
-    """
-
-    controller: str = ""
-    weights: str = ""
+    """A controller of ``ddco-pyro export``, which the other files of its folder describe."""
 
     @property
     def observation_delta_indices(self) -> None:
@@ -46,9 +39,4 @@ class DDCOConfig(PreTrainedConfig):
         return None
 
     def validate_features(self) -> None:
-        """Require an exported controller.
-
-        :raises ValueError: there is none.
-        """
-        if not self.controller:
-            raise ValueError("there is no controller; export one with: ddco-pyro export RUN --lerobot FOLDER")
+        """Nothing to check: the controller checks each observation."""

@@ -2,42 +2,53 @@
 
 from __future__ import annotations
 
-import json
-from typing import Any
+import copy
+import importlib.util
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Self
 
 import numpy as np
 import torch
+from lerobot.configs import PreTrainedConfig
 from lerobot.policies.pretrained import PreTrainedPolicy
 from torch import Tensor
 
 from lerobot_policy_ddco.configuration_ddco import DDCOConfig
-from lerobot_policy_ddco.runner import NumpyNetworks, Runner
-
-
-class _Controller(Runner):
-    def __init__(self, weights: dict[str, np.ndarray], about: dict[str, Any], seed: int) -> None:
-        self.about, self._networks = about, NumpyNetworks(weights, about)
-        self.reset(seed)
 
 
 class DDCOPolicy(PreTrainedPolicy):
-    """Acts with options. ``active`` names the active option of each level, for each environment."""
+    """Acts with options. ``active`` names the active option of each level, for each environment.
+
+    :param folder: what ``ddco-pyro export RUN --lerobot FOLDER`` wrote; its ``runner.py`` is imported.
+    """
 
     config_class = DDCOConfig
     name = "ddco"
 
-    def __init__(self, config: DDCOConfig, **ignored: Any) -> None:
+    def __init__(self, config: DDCOConfig, folder: Path, **ignored: Any) -> None:
         super().__init__(config)
-        config.validate_features()
-        self.about = json.loads(config.controller)
-        for name, (shape, kind) in json.loads(config.weights).items():
-            self.register_buffer(name, torch.zeros(shape, dtype=getattr(torch, kind)))
+        self._exported = _imported(folder / "runner.py").Runner(folder)
+        self.about = self._exported.about
         self.episodes = 0
         self.reset()
 
+    @classmethod
+    def from_pretrained(
+        cls, pretrained_name_or_path: str | Path, *, config: PreTrainedConfig | None = None, **ignored: Any
+    ) -> Self:
+        """The policy of a folder on this machine.
+
+        :raises ValueError: there is no exported controller. Nothing is downloaded, since its code is executed.
+        """
+        folder = Path(pretrained_name_or_path)
+        if not (folder / "runner.py").is_file():
+            raise ValueError(f"{folder}: has no runner.py; export one with: ddco-pyro export RUN --lerobot FOLDER")
+        return cls(config or PreTrainedConfig.from_pretrained(folder), folder).eval()
+
     def reset(self) -> None:
         """Begin an episode in every environment."""
-        self._controllers: list[_Controller] = []
+        self._controllers: list[Any] = []
 
     @property
     def active(self) -> list[dict[str, str]]:
@@ -59,8 +70,9 @@ class DDCOPolicy(PreTrainedPolicy):
         rows = {key: batch[name].cpu().numpy() for key, name in names.items()}
         count = len(next(iter(rows.values()))) if rows else 1
         if not self._controllers:
-            weights = {name.replace("/", "."): array.cpu().numpy() for name, array in self.named_buffers()}
-            self._controllers = [_Controller(weights, self.about, self.episodes + row) for row in range(count)]
+            self._controllers = [copy.copy(self._exported) for _ in range(count)]
+            for row, controller in enumerate(self._controllers):
+                controller.reset(self.episodes + row)
             self.episodes += count
         controls = []
         for row, controller in enumerate(self._controllers):
@@ -85,6 +97,15 @@ class DDCOPolicy(PreTrainedPolicy):
         :raises RuntimeError: always.
         """
         raise RuntimeError("a ddco policy is fitted with: ddco-pyro fit SPEC")
+
+
+def _imported(path: Path) -> ModuleType:
+    spec = importlib.util.spec_from_file_location("ddco_runner", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 def _own(value: np.ndarray, spec: dict[str, Any]) -> np.ndarray:

@@ -108,7 +108,6 @@ def test_of_an_integer_type_every_column_is_discrete_whatever_its_sign():
     assert kinds(np.where(many < 50, -1, 1)) == {0: "binary"}
 
 
-@pytest.mark.usefixtures("numpy_alone")
 def test_two_discrete_columns_are_a_distribution_and_act_in_exports_as_in_the_run(tmp_path):
     """The probabilities of all nine actions sum to 1; nothing else is emitted."""
     made = []
@@ -237,7 +236,6 @@ def test_what_was_decided_comes_back_from_the_run(run):
 
 
 @pytest.mark.parametrize("control", ["mean", "sample"])
-@pytest.mark.usefixtures("numpy_alone")
 def test_exports_act_as_the_run_does(run, tmp_path, control):
     """Bounds and values that are taken often are emitted by both at the same steps, to the bit."""
     changed = run.__class__(with_overrides(run.spec, {"rollout.control": control}), run.hierarchy)
@@ -257,7 +255,6 @@ def test_exports_act_as_the_run_does(run, tmp_path, control):
 
 
 @pytest.mark.parametrize("rows", [False, True])
-@pytest.mark.usefixtures("numpy_alone")
 def test_discrete_actions_from_file_to_controller(tmp_path: Path, rows):
     """Integers [T] in the file, or rows with a single 1."""
     random = np.random.default_rng(0)

@@ -57,7 +57,7 @@ class Command(NamedTuple):
 COMMANDS = {
     "segment --csv": Command("segment run demos.hdf5 --csv", "demos.hdf5"),
     "segment --out": Command("segment run demos.hdf5 --overwrite --out", "demos.hdf5"),
-    "segment --lerobot": Command("segment run demos.hdf5 --lerobot", "run", folder=True),
+    "segment --elan": Command("segment run demos.hdf5 --elan", "run", folder=True),
     "export": Command("export run --out", "run", folder=True),
     "compare": Command("compare run run/baselines/flat --out", "run", folder=True),
     "fit": Command("fit toy.yaml --out", "toy.yaml", folder=True),
@@ -122,8 +122,8 @@ def test_two_outputs_of_one_name_are_refused(inputs: Path, tmp_path: Path, monke
     Path("link").symlink_to("a")
     ended = call("segment", inputs / "run", inputs / "demos.hdf5", "--html", "a", "--csv", second)
     refused(ended, f"--csv {Path(second)}: is also where --html is written; choose another place")
-    ended = call("segment", inputs / "run", inputs / "demos.hdf5", "--csv", "new/a", "--lerobot", "new")
-    refused(ended, "--lerobot new: and --csv new/a lie in one another")
+    ended = call("segment", inputs / "run", inputs / "demos.hdf5", "--csv", "new/a", "--elan", "new")
+    refused(ended, "--elan new: and --csv new/a lie in one another")
     assert [path.name for path in tmp_path.iterdir()] == ["link"]
 
 

@@ -8,7 +8,7 @@ from dataclasses import astuple
 import numpy as np
 from random_demonstrations import numbered
 
-from ddco_pyro.events import CandidateGivenUp, CellDone, CellsBegan
+from ddco_pyro.events import CellDone, CellsBegan
 from ddco_pyro.selection.folds import Score
 from ddco_pyro.selection.grid import Candidate
 from ddco_pyro.spec import parse_spec
@@ -18,10 +18,10 @@ class Told:
     """What a selection told whoever watches it."""
 
     def __init__(self):
-        self.begun, self.pairs, self.stopped = [], [], []
+        self.begun, self.pairs = [], []
 
     def __call__(self, event):
-        kinds = {CellsBegan: self.begun, CellDone: self.pairs, CandidateGivenUp: self.stopped}
+        kinds = {CellsBegan: self.begun, CellDone: self.pairs}
         kinds.get(type(event), []).append(astuple(event))
 
 

@@ -1,4 +1,4 @@
-"""Writers of segments: a class for each, in modules of their own; ``cli/runs.py`` lists them with their options."""
+"""Writers of segments: a class for each, in modules of their own; ``FORMATS`` of ``cli/runs.py`` lists them."""
 
 from __future__ import annotations
 
@@ -25,6 +25,8 @@ class Asked:
     :param demos: the path of the demonstrations; ``source`` is the same, open.
     :param level: the level whose options are subtasks.
     :param baselines: names of further labels, ``<level>_<baseline>``.
+    :param overwrite: replace a file that is no labelled copy of the demonstrations.
+    :param same_order: leave out demonstrations whose options follow another order than most, rather than refuse.
     """
 
     fit: Fit
@@ -33,19 +35,14 @@ class Asked:
     source: Source
     level: str
     baselines: tuple[str, ...] = ()
+    overwrite: bool = False
+    same_order: bool = False
 
     @cached_property
     def names(self) -> list[str]:
         """The subtask of each choice of the level, control (0) first."""
         names = self.fit.names[self.level]
         return [name_in_level(option, self.level, names) for option in range(len(names))]
-
-    @cached_property
-    def without(self) -> str:
-        """The observations that writers of demonstrations leave out, in words; empty without any."""
-        first = self.source.recording(self.source.names[0])
-        keys = [f"obs/{key}" for key in first.observations if key not in first.numbers]
-        return f", without {', '.join(keys)} (no numbers)" if keys else ""
 
 
 class Writer(ABC):
@@ -83,11 +80,3 @@ class Writer(ABC):
             for option in np.unique(options).tolist():
                 places.setdefault(option, []).append(float(np.flatnonzero(options == option).mean()) / len(options))
         return sorted(places, key=lambda option: float(np.mean(places[option])))
-
-    def progress(self, runs: list[Run], order: list[int]) -> np.ndarray:
-        """(k + τ) / K of each step: option k of K in the order, τ from 0 at its run's first step to 1 at its last."""
-        parts = [
-            order.index(option) + (np.linspace(0, 1, stop - start) if stop - start > 1 else np.ones(1))
-            for option, start, stop in runs
-        ]
-        return np.concatenate(parts) / len(order)

@@ -17,14 +17,12 @@ from ddco_pyro.data.sources.recording import BOUNDARY, LABEL_NAMES, label_names
 from ddco_pyro.errors import BadInput
 from ddco_pyro.names import choice_names
 from ddco_pyro.segmenting import Segmented, Segments, chosen_names
-from ddco_pyro.segmenting.formats import Asked, Writer
+from ddco_pyro.segmenting.formats import Writer
 
 OURS = "segmented_by"
 """Attribute of labels written by this library; other labels are never replaced."""
 
 SIGNATURE = "ddco-pyro"
-
-NO_LABELS = "labels go into HDF5 files only; name another format, such as --csv, --html or --lerobot"
 
 COPIED = "segmented_from"
 """Attribute of a labelled copy: digests of the file that was copied."""
@@ -45,22 +43,13 @@ def labels_of(demo: Segments) -> dict[str, np.ndarray]:
 
 
 class Labels(Writer):
-    """``labels/<level>`` and ``labels/<level>_boundary`` of every level, in a copy or in the file itself.
-
-    :param overwrite: replace a file that is no labelled copy of the demonstrations.
-    """
-
-    def __init__(self, option: str, out: Path, asked: Asked, overwrite: bool = False) -> None:
-        super().__init__(option, out, asked)
-        self.overwrite = overwrite
+    """``labels/<level>`` and ``labels/<level>_boundary`` of every level, in a copy or in the file itself."""
 
     def check(self) -> None:
-        fit, demos, source = self.asked.fit, self.asked.demos, self.asked.source
-        if source.format != "robomimic":
-            raise BadInput(f"{demos}: {NO_LABELS}")
-        if not (self.overwrite or _same(self.out, demos)):
+        fit, demos = self.asked.fit, self.asked.demos
+        if not (self.asked.overwrite or _same(self.out, demos)):
             check_copy(demos, self.out)
-        check_labels(demos, [*fit.names, *self.asked.baselines], chosen_names(source, fit))
+        check_labels(demos, [*fit.names, *self.asked.baselines], chosen_names(self.asked.source, fit))
 
     def write(self, segmented: Segmented) -> str:
         write_labels(self.asked.demos, self.out, segmented)

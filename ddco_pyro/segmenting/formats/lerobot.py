@@ -1,4 +1,4 @@
-"""Segments as subtasks in a LeRobot dataset: a copy of the demonstrations' own, or a new one."""
+"""Segments as subtasks in a copy of a LeRobot dataset."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import filecmp
 import json
 import os
 import shutil
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -23,16 +23,16 @@ from ddco_pyro.data.sources.lerobot import ANNOTATIONS, SUBTASK, LeRobot
 from ddco_pyro.data.sources.metadata import inside
 from ddco_pyro.errors import BadInput
 from ddco_pyro.segmenting import Segmented
-from ddco_pyro.segmenting.formats import Asked, Run, Writer
-from ddco_pyro.segmenting.formats.new_lerobot import write_dataset, write_indexed
+from ddco_pyro.segmenting.formats import Run, Writer
 
 PERSISTENT, EVENTS = "language_persistent", "language_events"
 ATOM = ("role", "content", "style", "timestamp", "tool_calls")
+INFO = Path("meta") / "info.json"
 
 
 @dataclass(frozen=True)
 class Subtasks:
-    """What a form writes.
+    """What is written.
 
     :param names: the subtask of each choice, control (0) first.
     :param runs: the subtasks of each episode, by its index.
@@ -48,69 +48,55 @@ class Subtasks:
         return np.concatenate([np.full(stop - start, option) for option, start, stop in self.runs[episode]])
 
 
-class Form(ABC):
-    """How a dataset holds subtasks."""
+class Copy(Writer):
+    """A copy of a LeRobot dataset with subtasks.
+
+    Videos are hard links where the file system has them, else copies. A folder that has these very subtasks is not
+    written again.
+    """
 
     features: ClassVar[Mapping[str, Any]] = {}
     """The entries of new columns of frames in ``meta/info.json``."""
 
-    @abstractmethod
-    def write(self, dataset: LeRobot, subtasks: Subtasks) -> None:
-        """Write the subtasks into a dataset of our own."""
+    def check(self) -> None:
+        source = self.asked.source
+        assert isinstance(source, LeRobot)  # or the command refuses the format
+        if self.features and {SUBTASK, PERSISTENT} & source.features.keys():
+            raise BadInput(f"{source.folder}: has subtasks already; name a dataset without them")
+        if self.out.resolve().is_relative_to(source.folder.resolve()):
+            raise BadInput(f"{self.out}: lies in the dataset; choose another {self.option}")
+        info = self.out / INFO
+        if self.out.exists() and not (info.is_file() and info.read_text(encoding="utf-8") == self._info(source)):
+            raise self._taken()
 
-
-class FrameColumns(Form):
-    """Subtasks as further columns of frames."""
-
-    def write_columns(self, dataset: LeRobot, subtasks: Subtasks) -> None:
-        """Add columns of frames to the data files, one row group for each episode, as LeRobot does."""
-        for path in dataset.data_files:
-            file = inside(dataset.folder, path)
-            table = parquet.read_table(file)
-            file.unlink()  # it may be a link
-            writer = None
-            for rows, columns in self._episodes(table, subtasks):
-                for name, values in columns.items():
-                    rows = rows.append_column(name, values)
-                rows = rows.replace_schema_metadata(self.metadata(table.schema.metadata or {}))
-                writer = writer or parquet.ParquetWriter(file, rows.schema)
-                writer.write_table(rows)
-            assert writer is not None  # a file of a dataset holds an episode
-            writer.close()
-
-    def _episodes(
-        self, table: pyarrow.Table, subtasks: Subtasks
-    ) -> Iterator[tuple[pyarrow.Table, dict[str, pyarrow.Array]]]:
-        """The rows of each episode in a data file, and the new columns.
-
-        :raises BadInput: the file has no times, or rows of an episode that the dataset does not name.
-        """
-        if "timestamp" not in table.column_names:
-            raise BadInput("the data files have no column timestamp; subtasks begin at times of frames")
-        index = table["episode_index"].to_numpy()
-        bounds = [0, *(np.flatnonzero(np.diff(index)) + 1).tolist(), len(index)]
-        for start, stop in pairwise(bounds):
-            rows, episode = table.slice(start, stop - start), int(index[start])
-            if episode not in subtasks.runs or subtasks.runs[episode][-1][2] != len(rows):
-                raise BadInput(f"the data files have rows of episode {episode} that meta/episodes does not name")
-            yield rows, self.columns(rows, subtasks.options(episode), subtasks.names)
+    def write(self, segmented: Segmented) -> str:
+        source = self.asked.source
+        assert isinstance(source, LeRobot)
+        with suppress(_SameFolder), whole_folder(self.out) as temporary:
+            shutil.copytree(
+                source.folder, temporary, dirs_exist_ok=True, copy_function=_link, ignore_dangling_symlinks=True
+            )
+            write_text(temporary / INFO, self._info(source))
+            runs = {int(demo.name.removeprefix("demo_")): self.runs(demo) for demo in segmented.segments}
+            self.add(LeRobot(temporary), Subtasks(self.asked.names, runs, self.order(segmented)))
+            if self.out.exists():
+                raise _SameFolder if _same(self.out, temporary) else self._taken()
+        return str(self.out)
 
     @abstractmethod
-    def columns(self, rows: pyarrow.Table, options: np.ndarray, names: list[str]) -> dict[str, pyarrow.Array]:
-        """The new columns of an episode.
+    def add(self, dataset: LeRobot, subtasks: Subtasks) -> None:
+        """Write the subtasks into the copy."""
 
-        :param rows: the episode's rows [T].
-        :param options: the option of each row [T].
-        :param names: the subtask of each option.
-        """
+    def _info(self, dataset: LeRobot) -> str:
+        """``meta/info.json`` with the subtasks."""
+        return json.dumps({**dataset.info, "features": {**dataset.features, **self.features}}, indent=4) + "\n"
 
-    def metadata(self, known: Mapping[bytes, bytes]) -> dict[bytes, bytes]:
-        """The metadata of the data files, from the metadata before."""
-        return dict(known)
+    def _taken(self) -> BadInput:
+        return BadInput(f"{self.out}: exists; choose another {self.option}")
 
 
-class Language(FrameColumns):
-    """LeRobot 0.6 and newer: each row holds all subtasks of its episode in ``language_persistent``.
+class Annotated(Copy):
+    """Each row holds all subtasks of its episode in ``language_persistent``, as LeRobot 0.6 and newer read them.
 
     A subtask lasts from its ``timestamp``, the time of its first frame, to the next subtask. The page on which
     LeRobot's users label datasets keeps the same in ``meta/lerobot_annotations.json``.
@@ -118,70 +104,73 @@ class Language(FrameColumns):
 
     features: ClassVar = {name: {"dtype": "language", "shape": [1], "names": None} for name in (PERSISTENT, EVENTS)}
 
-    def write(self, dataset: LeRobot, subtasks: Subtasks) -> None:
-        """Write the columns and the annotations."""
-        self.write_columns(dataset, subtasks)
+    def add(self, dataset: LeRobot, subtasks: Subtasks) -> None:
+        """Add the columns to the data files, one row group for each episode, as LeRobot does; and the annotations."""
         episodes = {}
         for path in dataset.data_files:
-            table = parquet.read_table(dataset.folder / path, columns=["episode_index", PERSISTENT])
-            for episode, row in zip(*np.unique(table["episode_index"], return_index=True), strict=True):
-                atoms = table[PERSISTENT][int(row)].as_py()
+            file = inside(dataset.folder, path)
+            table = parquet.read_table(file)
+            file.unlink()  # it may be a link
+            writer = None
+            for episode, rows in _episodes(table, subtasks):
+                for name, values in _columns(rows["timestamp"], subtasks.options(episode), subtasks.names).items():
+                    rows = rows.append_column(name, values)
+                writer = writer or parquet.ParquetWriter(file, rows.schema)
+                writer.write_table(rows)
+                atoms = rows[PERSISTENT][0].as_py()
                 episodes[str(episode)] = {"atoms": [{key: atom[key] for key in ATOM} for atom in atoms]}
+            assert writer is not None  # a file of a dataset holds an episode
+            writer.close()
         write_text(dataset.folder / ANNOTATIONS, json.dumps({"version": 2, "episodes": episodes}, indent=1) + "\n")
 
-    def columns(self, rows: pyarrow.Table, options: np.ndarray, names: list[str]) -> dict[str, pyarrow.Array]:
-        """The same list of subtasks on each row, and no events."""
-        starts = np.flatnonzero(np.diff(options, prepend=-1))
-        text = pyarrow.string()
-        entries = {
-            "role": pyarrow.array(["assistant"] * len(starts)),
-            "content": pyarrow.array([names[option] for option in options[starts]]),
-            "style": pyarrow.array(["subtask"] * len(starts)),
-            "timestamp": rows["timestamp"].combine_chunks().take(pyarrow.array(starts)),
-            "camera": pyarrow.nulls(len(starts), text),
-            "tool_calls": pyarrow.nulls(len(starts), pyarrow.list_(text)),
-        }
-        events = {name: values.type for name, values in entries.items() if name != "timestamp"}
-        persistent = pyarrow.StructArray.from_arrays(list(entries.values()), list(entries))
-        on_each_row = persistent.take(pyarrow.array(np.tile(np.arange(len(starts)), len(rows))))
-        offsets = np.arange(len(rows) + 1, dtype=np.int32)
-        return {
-            PERSISTENT: pyarrow.ListArray.from_arrays(pyarrow.array(offsets * len(starts)), on_each_row),
-            EVENTS: pyarrow.ListArray.from_arrays(
-                pyarrow.array(0 * offsets), pyarrow.array([], pyarrow.struct(events))
-            ),
-        }
+
+def _episodes(table: pyarrow.Table, subtasks: Subtasks) -> Iterator[tuple[int, pyarrow.Table]]:
+    """The rows of each episode in a data file.
+
+    :raises BadInput: the file has no times, or rows of an episode that the dataset does not name.
+    """
+    if "timestamp" not in table.column_names:
+        raise BadInput("the data files have no column timestamp; subtasks begin at times of frames")
+    index = table["episode_index"].to_numpy()
+    bounds = [0, *(np.flatnonzero(np.diff(index)) + 1).tolist(), len(index)]
+    for start, stop in pairwise(bounds):
+        rows, episode = table.slice(start, stop - start), int(index[start])
+        if episode not in subtasks.runs or subtasks.runs[episode][-1][2] != len(rows):
+            raise BadInput(f"the data files have rows of episode {episode} that meta/episodes does not name")
+        yield episode, rows
 
 
-class SubtaskIndex(FrameColumns):
-    """LeRobot 0.4 and 0.5: ``subtask_index`` of each frame, and the names in ``meta/subtasks.parquet``."""
+def _columns(times: pyarrow.ChunkedArray, options: np.ndarray, names: list[str]) -> dict[str, pyarrow.Array]:
+    """The new columns of an episode: the same list of subtasks on each row, and no events.
 
-    features: ClassVar = {SUBTASK: {"dtype": "int64", "shape": [1], "names": None}}
+    :param times: of its frames [T].
+    :param options: the option of each frame [T].
+    :param names: the subtask of each option.
+    """
+    starts = np.flatnonzero(np.diff(options, prepend=-1))
+    text = pyarrow.string()
+    entries = {
+        "role": pyarrow.array(["assistant"] * len(starts)),
+        "content": pyarrow.array([names[option] for option in options[starts]]),
+        "style": pyarrow.array(["subtask"] * len(starts)),
+        "timestamp": times.combine_chunks().take(pyarrow.array(starts)),
+        "camera": pyarrow.nulls(len(starts), text),
+        "tool_calls": pyarrow.nulls(len(starts), pyarrow.list_(text)),
+    }
+    events = {name: values.type for name, values in entries.items() if name != "timestamp"}
+    persistent = pyarrow.StructArray.from_arrays(list(entries.values()), list(entries))
+    on_each_row = persistent.take(pyarrow.array(np.tile(np.arange(len(starts)), len(options))))
+    offsets = np.arange(len(options) + 1, dtype=np.int32)
+    return {
+        PERSISTENT: pyarrow.ListArray.from_arrays(pyarrow.array(offsets * len(starts)), on_each_row),
+        EVENTS: pyarrow.ListArray.from_arrays(pyarrow.array(0 * offsets), pyarrow.array([], pyarrow.struct(events))),
+    }
 
-    def write(self, dataset: LeRobot, subtasks: Subtasks) -> None:
-        """Write the column, and the name of each option as the pandas index that LeRobot expects."""
-        self.write_columns(dataset, subtasks)
-        table = pyarrow.table({"subtask": subtasks.names, SUBTASK: list(range(len(subtasks.names)))})
-        write_indexed(dataset.folder / "meta" / "subtasks.parquet", table)
 
-    def columns(self, rows: pyarrow.Table, options: np.ndarray, names: list[str]) -> dict[str, pyarrow.Array]:
-        """The option of each row."""
-        return {SUBTASK: pyarrow.array(options.astype(np.int64))}
+class SARM(Copy):
+    """The stages of SARM, LeRobot's reward model: subtasks of each episode in ``meta/episodes``, ends inclusive."""
 
-    def metadata(self, known: Mapping[bytes, bytes]) -> dict[bytes, bytes]:
-        """The columns as the ``datasets`` library lists them, with the new one."""
-        listed = known.get(b"huggingface")
-        if listed is None:
-            return dict(known)
-        info: dict[str, Any] = json.loads(listed)
-        info["info"]["features"][SUBTASK] = {"dtype": "int64", "_type": "Value"}
-        return {**known, b"huggingface": json.dumps(info).encode()}
-
-
-class Stages(Form):
-    """SARM, LeRobot's reward model: the subtasks of each episode in ``meta/episodes``, with inclusive ends."""
-
-    def write(self, dataset: LeRobot, subtasks: Subtasks) -> None:
+    def add(self, dataset: LeRobot, subtasks: Subtasks) -> None:
         """Write the columns ``dense_subtask_...`` of episodes, and each subtask's mean share of an episode in order."""
         for file in sorted((dataset.folder / "meta" / "episodes").rglob("*.parquet")):
             table = parquet.read_table(file)
@@ -208,77 +197,6 @@ class Stages(Form):
         proportions = {subtasks.names[option]: float(shares[option]) for option in subtasks.order}
         path = dataset.folder / "meta" / "temporal_proportions_dense.json"
         write_text(path, json.dumps(proportions, indent=2, ensure_ascii=False) + "\n")
-
-
-FORMS: Mapping[str, Form] = {"0.6": Language(), "0.4": SubtaskIndex()}
-"""The forms of subtasks, by the first version of LeRobot that reads them."""
-
-INFO = Path("meta") / "info.json"
-
-
-def info_text(dataset: LeRobot, form: Form) -> str:
-    """``meta/info.json`` with the subtasks."""
-    return json.dumps({**dataset.info, "features": {**dataset.features, **form.features}}, indent=4) + "\n"
-
-
-class Annotated(Writer):
-    """A copy of a LeRobot dataset with subtasks, or a new dataset where the demonstrations are in another format.
-
-    Videos are hard links where the file system has them, else copies. A folder that has these very subtasks is not
-    written again.
-
-    :param lerobot_format: the first version of LeRobot that reads its subtasks.
-    """
-
-    def __init__(self, option: str, out: Path, asked: Asked, lerobot_format: str = "0.6") -> None:
-        super().__init__(option, out, asked)
-        self.form = FORMS[lerobot_format]
-
-    def check(self) -> None:
-        source = self.asked.source
-        if not isinstance(source, LeRobot):
-            return
-        if self.form.features and {SUBTASK, PERSISTENT} & source.features.keys():
-            raise BadInput(f"{source.folder}: has subtasks already; name a dataset without them")
-        if self.out.resolve().is_relative_to(source.folder.resolve()):
-            raise BadInput(f"{self.out}: lies in the dataset; choose another {self.option}")
-        info = self.out / INFO
-        expected = info_text(source, self.form)
-        if self.out.exists() and not (info.is_file() and info.read_text(encoding="utf-8") == expected):
-            raise self._taken()
-
-    def write(self, segmented: Segmented) -> str:
-        source = self.asked.source
-        with suppress(_SameFolder), whole_folder(self.out) as temporary:
-            if isinstance(source, LeRobot):
-                shutil.copytree(
-                    source.folder, temporary, dirs_exist_ok=True, copy_function=_link, ignore_dangling_symlinks=True
-                )
-            else:
-                write_dataset(temporary, self.asked, segmented)
-            dataset = LeRobot(temporary)
-            # A LeRobot dataset has numbers for names; the episodes of a new one are in the order of the segments.
-            kept = isinstance(source, LeRobot)
-            runs = {
-                int(demo.name.removeprefix("demo_")) if kept else place: self.runs(demo)
-                for place, demo in enumerate(segmented.segments)
-            }
-            write_text(temporary / INFO, info_text(dataset, self.form))
-            self.form.write(dataset, Subtasks(self.asked.names, runs, self.order(segmented)))
-            if self.out.exists():
-                raise _SameFolder if _same(self.out, temporary) else self._taken()
-        return f"{self.out}{'' if kept else self.asked.without}"
-
-    def _taken(self) -> BadInput:
-        return BadInput(f"{self.out}: exists; choose another {self.option}")
-
-
-class SARM(Annotated):
-    """A copy of a LeRobot dataset, or a new dataset, with the stages that SARM is trained on."""
-
-    def __init__(self, option: str, out: Path, asked: Asked) -> None:
-        super().__init__(option, out, asked)
-        self.form = Stages()
 
 
 class _SameFolder(Exception):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 from collections import Counter
 from collections.abc import Sequence
-from pathlib import Path
 from typing import ClassVar
 
 import h5py
@@ -15,7 +14,7 @@ from ddco_pyro.data.files import whole_file
 from ddco_pyro.data.hdf5 import opened, written
 from ddco_pyro.errors import BadInput
 from ddco_pyro.segmenting import Segmented, chosen_names
-from ddco_pyro.segmenting.formats import Asked, Run, Writer
+from ddco_pyro.segmenting.formats import Run, Writer
 
 
 class MimicGen(Writer):
@@ -23,8 +22,6 @@ class MimicGen(Writer):
 
     A signal is 0, and 1 from the last step of its subtask on. The last subtask of a demonstration has none. The copy
     has only demonstrations whose subtasks follow one order.
-
-    :param same_order: leave out demonstrations whose options follow another order than most, rather than refuse.
     """
 
     place: ClassVar = "datagen_info"
@@ -33,14 +30,8 @@ class MimicGen(Writer):
 
     script: ClassVar = "python mimicgen/scripts/prepare_src_dataset.py --dataset {}"
 
-    def __init__(self, option: str, out: Path, asked: Asked, same_order: bool = False) -> None:
-        super().__init__(option, out, asked)
-        self.same_order = same_order
-
     def check(self) -> None:
         asked = self.asked
-        if asked.source.format != "robomimic":
-            raise BadInput(f"{asked.demos}: is no HDF5 file in robomimic's layout, which {self.option} copies")
         with opened(asked.demos) as file:
             for name in chosen_names(asked.source, asked.fit):
                 there = file[f"data/{name}"].get(self.place, {})
@@ -91,7 +82,7 @@ class MimicGen(Writer):
                 problems[name] = f"its first subtask, {common[0]}, lasts one step, whose end cannot be marked"
         if len(common) == 1:
             raise BadInput(f"{self.option}: most demonstrations have one subtask, {common[0]}: there is no end to mark")
-        if problems and not (self.same_order and len(problems) < len(runs)):
+        if problems and not (self.asked.same_order and len(problems) < len(runs)):
             name, problem = next(iter(problems.items()))
             raise BadInput(
                 f"{self.option}: {name}: {problem}; --same-order leaves such demonstrations out ({len(problems)} of "

@@ -33,7 +33,10 @@ class Rerun(Writer):
         with whole_folder(self.out) as folder:
             for demo in segmented.segments:
                 self._write(str(folder / f"{demo.name}.rrd"), demo, segmented.frequency)
-        return f"{self.out}: {len(segmented)} recordings{self.asked.without}; look at them with: rerun {self.out}/*.rrd"
+        first = self.asked.source.recording(segmented.segments[0].name)
+        keys = [f"obs/{key}" for key in first.observations if key not in first.numbers]
+        without = f", without {', '.join(keys)} (no numbers)" if keys else ""
+        return f"{self.out}: {len(segmented)} recordings{without}; look at them with: rerun {self.out}/*.rrd"
 
     def _write(self, path: str, demo: Segments, frequency: float | None) -> None:
         import rerun

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 from importlib import import_module
 from itertools import pairwise
@@ -16,7 +17,6 @@ import numpy as np
 import pyarrow.parquet as parquet
 import pytest
 from command_line import call
-from safetensors.numpy import load_file
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.importing import import_demonstrations
@@ -30,33 +30,36 @@ from ddco_pyro.segmenting.formats.elan import ELAN
 from ddco_pyro.segmenting.formats.label_studio import LabelStudio
 from ddco_pyro.segmenting.formats.lerobot import SARM, Annotated
 from ddco_pyro.segmenting.formats.mimicgen import Isaac, MimicGen
-from ddco_pyro.segmenting.formats.rabc import RABC
-from ddco_pyro.segmenting.formats.rlds import RLDS
 from ddco_pyro.segmenting.formats.tables import CSV
 
-HERE = Path(__file__).parent
+HERE = Path(__file__).parents[1]
 NAMES = ("control", "place", "reach", "grasp")
 ORDERED = [[(2, 4), (3, 3), (1, 5)], [(2, 2), (3, 1), (1, 1)], [(2, 6), (3, 2), (1, 3)]]
 """Of each demonstration, its subtasks as (option, steps), in one order: reach, grasp, place."""
 OTHER = [*ORDERED, [(2, 3), (1, 3), (2, 2), (1, 2)]]
 """The last one reaches twice and does not grasp."""
+LEROBOT = HERE / "fixtures" / "lerobot"
+OF_DATASET = [
+    [(2, 2), (3, 1), (1, 2)],
+    [(2, 2), (3, 2), (1, 2)],
+    [(2, 4), (3, 1), (1, 2)],
+    [(2, 3), (1, 2), (2, 1), (1, 2)],
+]
+"""Subtasks of that dataset's episodes, which have 5 to 8 steps."""
 
 
 class Planted:
     """Demonstrations in a file, with known segments."""
 
-    def __init__(self, folder, plan, pictures=False, frequency=20.0, discrete=False):
+    def __init__(self, folder, plan, frequency=20.0):
         self.folder, self.file = folder, folder / "demos.hdf5"
         self.options = [np.concatenate([np.full(steps, option) for option, steps in each]) for each in plan]
         rng = np.random.default_rng(0)
         demos = []
         for number, options in enumerate(self.options):
             seen = {"arm/joints": rng.normal(size=(len(options), 3)), "jaw": rng.normal(size=(len(options), 1))}
-            if pictures:
-                seen["camera"] = rng.integers(0, 256, (len(options), 8, 10, 3), np.uint8)
-            actions = rng.integers(0, 4, len(options)) if discrete else rng.normal(size=(len(options), 2))
-            demos.append(Demonstration(f"demo_{number}", seen, actions))
-        self.demos = Demonstrations(tuple(demos), attributes={"control_frequency": frequency, "task": "plant"})
+            demos.append(Demonstration(f"demo_{number}", seen, rng.normal(size=(len(options), 2))))
+        self.demos = Demonstrations(tuple(demos), attributes={"control_frequency": frequency})
         self.demos.write(self.file)
         certain = [0.5 + 0.5 * rng.random(len(options)) for options in self.options]
         labels = [
@@ -82,7 +85,7 @@ class Planted:
         fit = SimpleNamespace(names={"skill": NAMES}, spec=spec)
         out, demos = self.folder / name, demos or self.file
         with open_source(demos) as source:
-            writer = kind(option, out, Asked(fit, self.folder / "run", demos, source, "skill"), **more)
+            writer = kind(option, out, Asked(fit, self.folder / "run", demos, source, "skill", **more))
             writer.check()
             self.said = writer.write(self.segmented)
         return out
@@ -204,68 +207,22 @@ def test_a_file_that_is_not_prepared_is_refused(planted, kind, first):
 # --- LeRobot ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("frequency", "discrete"), [(20.0, False), (30.0, True)])
-def test_a_new_lerobot_dataset_holds_the_demonstrations_and_their_subtasks(tmp_path, frequency, discrete):
-    """Read back by this library's reader of LeRobot datasets, annotations included; LeRobot's own below."""
-    planted = Planted(tmp_path, OTHER, pictures=True, frequency=frequency, discrete=discrete)
-    out = planted.write(Annotated, "dataset")
-    assert json.loads((out / "meta" / "info.json").read_text())["features"]["action"]["dtype"] == (
-        "int64" if discrete else "float32"
-    )
-    with open_source(out) as source:
-        assert source.frequency == frequency
-        assert json.loads(source.attributes["label_names"]) == {"subtask": ["reach", "grasp", "place"]}
-        for number, demo in enumerate(planted.demos):
-            found = source.recording(f"demo_{number}")
-            joints, jaw = demo.observations["arm/joints"], demo.observations["jaw"]
-            for key, expected in (("arm/joints", joints), ("jaw", jaw), ("state", np.hstack([joints, jaw]))):
-                np.testing.assert_allclose(found.observations[key].array(), expected, rtol=1e-6)
-            np.testing.assert_array_equal(found.observations["camera"].array(), demo.observations["camera"])
-            np.testing.assert_allclose(found.actions.array(), demo.actions, rtol=1e-6)
-            assert found.actions.dtype == (np.int64 if discrete else np.float32)
-            named = [("reach", "grasp", "place")[label] for label in found.labels["subtask"].array()]
-            assert named == [NAMES[option] for option in planted.options[number]]
-            assert found.attributes["task"] == "plant"
-    assert planted.write(Annotated, "dataset") == out  # the very same again
-    stats = json.loads((out / "meta" / "stats.json").read_text())
-    actions = np.concatenate([demo.actions for demo in planted.demos])
-    np.testing.assert_allclose(stats["action"]["std"], actions.std(axis=0), rtol=1e-5)
-    np.testing.assert_allclose(stats["action"]["q90"], np.quantile(actions, 0.9, axis=0), rtol=1e-5)
-    assert np.shape(stats["observation.camera"]["mean"]) == (3, 1, 1)
+@pytest.fixture
+def dataset(tmp_path):
+    return Path(shutil.copytree(LEROBOT, tmp_path / "dataset"))
 
 
-def test_observations_that_lerobot_cannot_tell_apart_are_refused(tmp_path):
-    planted = Planted(tmp_path, ORDERED)
-    with h5py.File(planted.file, "r+") as file:
-        for demo in file["data"].values():
-            demo["obs"].copy("arm/joints", demo["obs"], "arm.joints")
-    with pytest.raises(BadInput, match=r"obs/arm/joints and another observation are both observation\.arm\.joints"):
-        planted.write(Annotated, "dataset")
-    assert not (tmp_path / "dataset").exists()
-
-
-@pytest.mark.parametrize("kind", [Annotated, RLDS])
-def test_text_among_the_observations_is_left_out_and_named(kind, planted):
-    with h5py.File(planted.file, "r+") as file:
-        for demo in file["data"].values():
-            demo["obs/mission"] = [b"go"] * len(demo["actions"])
-    planted.write(kind, "written")
-    assert planted.said.endswith(", without obs/mission (no numbers)")
-
-
-def test_annotations_are_imported_as_labels_with_names(tmp_path):
+def test_annotations_are_imported_as_labels_with_names(dataset, tmp_path):
     """As the page on which LeRobot's users label keeps them, for some episodes."""
-    planted = Planted(tmp_path, ORDERED)
-    out = planted.write(Annotated, "dataset")
     atom = {"role": "assistant", "style": "subtask", "tool_calls": None}
     memory = {"role": "assistant", "style": "memory", "content": "seen", "timestamp": 0.0}
-    atoms = [{**atom, "content": "lift it", "timestamp": 0.25}, memory, {**atom, "content": "go", "timestamp": 0.1}]
+    atoms = [{**atom, "content": "lift it", "timestamp": 0.3}, memory, {**atom, "content": "go", "timestamp": 0.1}]
     annotations = {"version": 2, "schema": {}, "episodes": {"0": {"atoms": atoms}, "2": {"atoms": []}}}
-    (out / "meta" / "lerobot_annotations.json").write_text(json.dumps(annotations))
-    import_demonstrations(out, tmp_path / "imported.hdf5")
+    (dataset / "meta" / "lerobot_annotations.json").write_text(json.dumps(annotations))
+    import_demonstrations(dataset, tmp_path / "imported.hdf5")
     with h5py.File(tmp_path / "imported.hdf5") as file:
-        np.testing.assert_array_equal(file["data/demo_0/labels/subtask"], [-1, -1, 0, 0, 0, 1, 1, 1, 1, 1, 1, 1])
-        np.testing.assert_array_equal(file["data/demo_2/labels/subtask"], np.full(11, -1))
+        np.testing.assert_array_equal(file["data/demo_0/labels/subtask"], [-1, 0, 0, 1, 1])
+        np.testing.assert_array_equal(file["data/demo_2/labels/subtask"], np.full(7, -1))
         named = [
             json.loads(file[place].attrs["label_names"])
             for place in ("/", "data")
@@ -275,16 +232,18 @@ def test_annotations_are_imported_as_labels_with_names(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"episodes": 3}', '{"episodes": {"x": {"atoms": [{}]}}}'])
-def test_damaged_annotations_are_one_line(planted, text):
-    out = planted.write(Annotated, "dataset")
-    (out / "meta" / "lerobot_annotations.json").write_text(text)
-    with pytest.raises(BadInput, match=r"lerobot_annotations\.json: cannot be read, or is damaged"), open_source(out):
+def test_damaged_annotations_are_one_line(dataset, text):
+    (dataset / "meta" / "lerobot_annotations.json").write_text(text)
+    with (
+        pytest.raises(BadInput, match=r"lerobot_annotations\.json: cannot be read, or is damaged"),
+        open_source(dataset),
+    ):
         pass
 
 
 def test_the_stages_of_sarm(tmp_path):
-    planted = Planted(tmp_path, OTHER)
-    out = planted.write(SARM, "dataset")
+    planted = Planted(tmp_path, OF_DATASET)
+    out = planted.write(SARM, "dataset", demos=LEROBOT)
     rows = parquet.read_table(next((out / "meta" / "episodes").rglob("*.parquet"))).to_pylist()
     for number, row in enumerate(rows):
         stages = zip(*(row[f"dense_subtask_{key}"] for key in ("names", "start_frames", "end_frames")), strict=True)
@@ -295,9 +254,10 @@ def test_the_stages_of_sarm(tmp_path):
     np.testing.assert_allclose(list(shares.values()), expected)
 
 
-def test_a_copy_of_a_dataset_gets_stages_beside_its_subtasks(planted):
+def test_a_copy_of_a_dataset_gets_stages_beside_its_subtasks(tmp_path):
     """And existing stages are replaced."""
-    first = planted.write(Annotated, "first")
+    planted = Planted(tmp_path, OF_DATASET)
+    first = planted.write(Annotated, "first", demos=LEROBOT)
     second = planted.write(SARM, "second", demos=first)
     third = planted.write(SARM, "third", demos=second)
     assert (second / "meta" / "lerobot_annotations.json").read_text() == (
@@ -307,26 +267,12 @@ def test_a_copy_of_a_dataset_gets_stages_beside_its_subtasks(planted):
     assert names[0] == names[1]
     with pytest.raises(BadInput, match="lies in the dataset; choose another --option"):
         planted.write(SARM, "first/inside", demos=first)
-    (planted.folder / "taken").mkdir()
+    (tmp_path / "taken").mkdir()
     with pytest.raises(BadInput, match="taken: exists; choose another --option"):
         planted.write(SARM, "taken", demos=first)
 
 
-def test_progress_is_the_place_in_the_order_and_the_part_of_the_run(tmp_path):
-    planted = Planted(tmp_path, OTHER)
-    rows = parquet.read_table(planted.write(RABC, "progress.parquet")).to_pylist()
-    assert [row["index"] for row in rows] == list(range(len(rows)))
-    order, expected = ["reach", "grasp", "place"], []
-    for number in range(len(OTHER)):
-        for name, start, stop in planted.runs(number):
-            last = stop - 1 - start
-            tau = [t / last if last else 1.0 for t in range(stop - start)]
-            expected += [(number, (order.index(name) + each) / 3) for each in tau]
-    assert [row["episode_index"] for row in rows] == [episode for episode, _ in expected]
-    np.testing.assert_allclose([row["progress_dense"] for row in rows], [value for _, value in expected], rtol=1e-6)
-
-
-# --- annotation tools and steps ---------------------------------------------------------------------------------------
+# --- annotation tools -------------------------------------------------------------------------------------------------
 
 
 def test_predictions_for_label_studio(planted):
@@ -360,18 +306,6 @@ def test_annotations_for_elan(planted):
         assert found == [(name, 50 * start, 50 * stop) for name, start, stop in planted.runs(number)]  # 20 Hz
 
 
-def test_steps_of_rlds_need_no_pickle(planted):
-    out = planted.write(RLDS, "rlds")
-    for number, demo in enumerate(planted.demos):
-        with np.load(out / f"demo_{number}.npz", allow_pickle=False) as steps:
-            assert steps["subtask"].tolist() == [NAMES[option] for option in planted.options[number]]
-            np.testing.assert_array_equal(steps["observation/arm/joints"], demo.observations["arm/joints"])
-            np.testing.assert_array_equal(steps["action"], demo.actions)
-            last = [False] * (len(demo) - 1) + [True]
-            assert steps["is_last"].tolist() == steps["is_terminal"].tolist() == last
-            assert steps["is_first"].tolist() == last[::-1]
-
-
 # --- the tools themselves ---------------------------------------------------------------------------------------------
 
 TOOLS = Path(os.environ.get("DDCO_PYRO_TOOLS", HERE.parent / ".venv-tools")) / "bin" / "python"
@@ -383,12 +317,10 @@ TOOLS = Path(os.environ.get("DDCO_PYRO_TOOLS", HERE.parent / ".venv-tools")) / "
 @pytest.mark.parametrize(
     ("form", "kind", "plan"),
     [
-        ("lerobot", "lerobot:Annotated", OTHER),
-        ("sarm", "lerobot:SARM", OTHER),
-        ("rabc", "rabc:RABC", OTHER),
+        ("lerobot", "lerobot:Annotated", OF_DATASET),
+        ("sarm", "lerobot:SARM", OF_DATASET),
         ("mimicgen", "mimicgen:MimicGen", ORDERED),
         ("isaac", "mimicgen:Isaac", ORDERED),
-        ("rlds", "rlds:RLDS", OTHER),
         ("label_studio", "label_studio:LabelStudio", OTHER),
         ("elan", "elan:ELAN", OTHER),
         ("rerun", "rerun:Rerun", OTHER),
@@ -402,7 +334,7 @@ def test_the_tool_reads_what_was_planted(tmp_path, form, kind, plan):
     writer = getattr(import_module(f"ddco_pyro.segmenting.formats.{module}"), name)
     if writer in PREPARED:
         prepare(planted, writer)
-    out = planted.write(writer, "out")
+    out = planted.write(writer, "out", demos=LEROBOT if plan is OF_DATASET else None)
     table = planted.write(CSV, "table.csv")
     in_tools("read_formats.py", form, out, table, "skill")
 
@@ -469,22 +401,19 @@ def test_lerobot_eval_runs_a_fit_in_an_environment(tmp_path, monkeypatch):
     print(f"{sum(successes)} of {len(successes)} episodes succeed")
 
 
-@pytest.mark.usefixtures("numpy_alone")
-def test_a_policy_for_lerobot_has_the_weights_of_the_export(toy_run, tmp_path):
-    """Its ``runner.py`` acts with them alone, as the export's does."""
+def test_a_policy_for_lerobot_is_an_export_with_lerobots_files(toy_run, tmp_path):
     assert call("export", toy_run.folder, "--lerobot", tmp_path / "policy").status == 0
     assert call("export", toy_run.folder, "--out", tmp_path / "export").status == 0
-    config = json.loads((tmp_path / "policy" / "config.json").read_text())
+    exported, policy = (
+        {path.name: path.read_bytes() for path in (tmp_path / name).iterdir()} for name in ("export", "policy")
+    )
+    for name in ("controller.json", "runner.py"):
+        assert policy[name] == exported[name]
+    assert policy.keys() - exported.keys() == {"config.json", "policy_preprocessor.json", "policy_postprocessor.json"}
+    config = json.loads(policy["config.json"])
     assert config["type"] == "ddco"
     assert config["input_features"]["observation.offsets"] == {"type": "STATE", "shape": [4]}
     assert config["output_features"] == {"action": {"type": "ACTION", "shape": [2]}}
-    assert json.loads(config["controller"]) == json.loads((tmp_path / "export" / "controller.json").read_text())
-    weights = load_file(tmp_path / "policy" / "model.safetensors")
-    shapes = {name: [list(array.shape), str(array.dtype)] for name, array in weights.items()}
-    assert json.loads(config["weights"]) == shapes
-    with np.load(tmp_path / "export" / "weights.npz") as file:
-        assert {name.replace(".", "/") for name in file.files} == weights.keys()
-        assert all(np.array_equal(file[name.replace("/", ".")], array) for name, array in weights.items())
     (tmp_path / "policy" / "mine.txt").touch()
     ended = call("export", toy_run.folder, "--lerobot", tmp_path / "policy")
     assert (ended.status, ended.err.count("\n")) == (2, 1)

@@ -23,9 +23,7 @@ from ddco_pyro.fitting.fitted import load
 from ddco_pyro.metrics import Metrics
 from ddco_pyro.report import rollouts as rolling
 from ddco_pyro.report import trajectories, write_report
-from ddco_pyro.report.activity import Activity, LevelActivity, activity, bins
-from ddco_pyro.report.options import row_order, shares, terminations
-from ddco_pyro.segmenting import Segmented
+from ddco_pyro.report.activity import activity
 from ddco_pyro.simulation.episodes import Episode, summarize
 from ddco_pyro.simulation.film import write_film
 from ddco_pyro.spec import TrainingSpec, parse_spec
@@ -215,16 +213,6 @@ def test_a_label_has_the_colour_of_the_option_that_it_is_matched_with(labelled):
     assert lanes["phase"]
 
 
-@pytest.mark.parametrize(("divergence", "proposed"), [(0.05, True), (0.5, False)])
-def test_only_options_that_act_alike_are_to_be_merged(labelled, divergence, proposed):
-    found, _, demos = labelled
-    data = found.metrics.model_dump()
-    for row in data["divergences"][0]:
-        row["divergence"] = divergence
-    other = replace(found, metrics=Metrics.model_validate(data))
-    assert ("ddco-pyro merge" in write_report(other, demos).read_text()) == proposed
-
-
 def test_a_long_list_is_folded_and_long_timelines_are_cut(labelled, monkeypatch, drawn_here):
     """With every figure drawn."""
     found, _, demos = labelled
@@ -268,37 +256,6 @@ def test_activity_is_what_the_fit_says_in_one_go(labelled, monkeypatch):
 
 
 # --- what figures are drawn from --------------------------------------------------------------------------------------
-
-
-def test_bins_are_steps_of_equally_long_demonstrations_and_normalised_time_otherwise():
-    found = bins(np.array([4, 4]))
-    np.testing.assert_array_equal(found.index, [[0, 1, 2, 3]] * 2)
-    np.testing.assert_array_equal(found.edges, [-0.5, 0.5, 1.5, 2.5, 3.5])
-    found = bins(np.array([2, 4]))
-    np.testing.assert_array_equal(found.index, [[0, 1, -1, -1], [0, 0, 1, 1]])
-    assert len(bins(np.array([2000, 1999])).edges) == 61
-
-
-def test_shares_and_terminations_are_weighted_means():
-    active = np.array([[[0, 1, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 0], [0, 0.5, 0.5], [0, 0, 1]]], dtype=float)
-    termination = np.array([[[0.1, 0.2], [0.3, 0.4], [0.5, 0.6]], [[0.1, 0.2], [0.7, 0.8], [0.9, 1.0]]])
-    level = LevelActivity("option", (), active, np.zeros((2, 3), int), termination)
-    gathered = bins(np.array([3, 3]))
-    np.testing.assert_allclose(shares(level, gathered), [[0, 1, 0], [0, 0.75, 0.25], [0, 0, 1]])
-    nan = np.nan  # no option ends before the first step, and option 2 is not active before the last
-    expected = [[nan, nan], [0.5, nan], [(0.5 + 0.5 * 0.9) / 1.5, 1.0]]
-    np.testing.assert_allclose(terminations(level, gathered), expected)
-
-
-def test_rows_are_sorted_by_length_then_by_the_first_change():
-    """Two levels, of which the lowest counts; a demonstration without a change comes after those of its length."""
-    paths = ["11222", "1222-", "12111", "1111-", "11111", "1121-", "1----"]
-    low = np.array([[-1 if step == "-" else int(step) for step in path] for path in paths])
-    high = np.array([[1, 2, 1, 1, 1]] * len(paths))
-    nothing = np.zeros((len(paths), 5, 3))
-    levels = tuple(LevelActivity(name, (), nothing, path, nothing) for name, path in (("low", low), ("high", high)))
-    found = row_order(Activity(levels, (low >= 0).sum(1), Segmented((), {}, None)))
-    assert [paths[row] for row in found] == ["1----", "1222-", "1121-", "1111-", "12111", "11222", "11111"]
 
 
 def observing(observations):

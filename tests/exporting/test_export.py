@@ -1,4 +1,4 @@
-"""Exported controllers act as the original does, with numpy alone, as a torch.export program, and as ONNX."""
+"""Exported controllers act as the original does, with numpy alone and as ONNX."""
 
 from __future__ import annotations
 
@@ -25,21 +25,19 @@ from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import InputShape, UserNetwork
 from ddco_pyro.spec import parse_spec
 
-PROGRAMS = ("read by all",)
-"""Convolutions, LSTMs, perceptrons and linear networks, together."""
+PROGRAMS = ("read by all", "conv", "lstm", "trunk", "σ of the state", "per_timestep", "constant")
+"""The first has convolutions, LSTMs, perceptrons and linear networks, together."""
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow if name not in PROGRAMS else ()) for name in FITS]
+    "name", [pytest.param(name, marks=pytest.mark.slow if name != PROGRAMS[0] else ()) for name in PROGRAMS]
 )
 def test_every_form_acts_as_the_controller_does(name, tmp_path):
     """On other observations than those that it was compared on when it was written, past the longest demonstration."""
-    onnx = name in ("conv", "lstm", "trunk", "σ of the state", "per_timestep", "constant")
-    forms(name, tmp_path, ["numpy", "torch", *(["onnx"] if onnx else [])])
+    forms(name, tmp_path, ["numpy", "onnx"])
 
 
-@pytest.mark.parametrize("name", [name for name in FITS if name not in PROGRAMS])
-@pytest.mark.usefixtures("numpy_alone")
+@pytest.mark.parametrize("name", [name for name in FITS if name != PROGRAMS[0]])
 def test_numpy_acts_as_the_controller_does(name, tmp_path):
     forms(name, tmp_path, ["numpy"])
 
@@ -81,10 +79,10 @@ def test_the_command_says_how_well_each_form_does(exported):
     folder, ended = exported
     assert ended.status == 0, ended.err
     *lines, last = ended.out.splitlines()
-    for line, form in zip(lines, ("numpy", "torch", "onnx"), strict=True):
+    for line, form in zip(lines, ("numpy", "onnx"), strict=True):
         assert line.startswith(f"{form}: largest difference ")
     assert last == f"{folder}: try it with: python {folder / 'runner.py'} {folder}"
-    names = {"controller.json", "controller.onnx", "controller.pt2", "weights.npz", "check.npz", "runner.py"}
+    names = {"controller.json", "controller.onnx", "weights.npz", "check.npz", "runner.py"}
     assert {path.name for path in folder.iterdir()} == names
 
 
@@ -96,15 +94,9 @@ try:
     runner.main()
 except SystemExit as ended:
     assert ended.code == 0
-needed = {"numpy": None, "torch": "torch", "onnx": "onnxruntime"}[form]
+needed = {"numpy": None, "onnx": "onnxruntime"}[form]
 assert not {"torch", "onnxruntime", "pyro", "ddco_pyro"} .difference({needed}) & set(sys.modules)
 """
-
-
-def test_a_policy_for_lerobot_has_the_runner_of_exports():
-    """After a change: ``python -c 'from ddco_pyro.exporting import runner_source; print(runner_source(), end="")'``."""
-    package = Path(__file__).parents[1] / "lerobot_policy_ddco/lerobot_policy_ddco"
-    assert (package / "runner.py").read_text() == module.runner_source()
 
 
 def test_the_runner_is_one_file_in_which_nothing_is_missing(exported):
@@ -113,7 +105,7 @@ def test_the_runner_is_one_file_in_which_nothing_is_missing(exported):
     assert subprocess.run(linter, capture_output=True, text=True).stdout == "All checks passed!\n"
 
 
-@pytest.mark.parametrize("form", ["numpy", pytest.param("torch", marks=pytest.mark.slow), "onnx"])
+@pytest.mark.parametrize("form", ["numpy", "onnx"])
 def test_each_form_runs_without_this_library(exported, form):
     folder, _ = exported
     ended = subprocess.run([sys.executable, "-c", ALONE, form], cwd=folder, capture_output=True, text=True)
@@ -189,7 +181,6 @@ LONG = make("per_timestep", (), steps=30)
         pytest.param(LONG, "caller_0.1.bias", 1e-3, r"1\.0e-03, of 1\.0e-06 that", id="steps"),
     ],
 )
-@pytest.mark.usefixtures("numpy_alone")
 def test_every_network_of_every_option_and_step_is_compared(fit, tensor, by, message, tmp_path, damaged):
     """Though of 200 options most are active in no step, and of 30 steps' networks the last alone differs."""
     damaged(lambda folder: damage_numpy(folder, tensor, by))
@@ -197,7 +188,6 @@ def test_every_network_of_every_option_and_step_is_compared(fit, tensor, by, mes
         export(fit, tmp_path / "out")
 
 
-@pytest.mark.usefixtures("numpy_alone")
 def test_large_controls_are_compared_to_what_float32_can_hold(tmp_path):
     fit = make("linear")
     fit.hierarchy.scaling.scale.fill_(1.0)
@@ -207,13 +197,12 @@ def test_large_controls_are_compared_to_what_float32_can_hold(tmp_path):
 
 
 def test_a_file_that_cannot_be_loaded_is_not_left_behind(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "_programs", lambda program, onnx: {"controller.pt2": b"no archive"})
-    with pytest.raises(Failed, match=r"^nothing was written: as torch it cannot be run: \w+: "):
-        export(make("linear"), tmp_path / "out")
+    monkeypatch.setattr(module, "_onnx", lambda program: b"no model")
+    with pytest.raises(Failed, match=r"^nothing was written: as onnx it cannot be run: \w+: "):
+        export(make("linear"), tmp_path / "out", onnx=True)
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.usefixtures("numpy_alone")
 def test_what_was_exported_before_is_replaced_by_what_agrees_alone(tmp_path, damaged):
     out = tmp_path / "out"
     export(make("linear"), out)
@@ -230,7 +219,6 @@ def test_what_was_exported_before_is_replaced_by_what_agrees_alone(tmp_path, dam
     assert list(tmp_path.iterdir()) == [out]
 
 
-@pytest.mark.usefixtures("numpy_alone")
 def test_what_else_is_in_a_folder_is_not_lost(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(BadInput, match=r": holds what was not exported, such as notes\.txt; choose another --out$"):
@@ -258,8 +246,11 @@ class Inner(torch.nn.Module):
 def test_networks_that_numpy_cannot_evaluate_are_compared_as_a_program(tmp_path):
     fit = make("linear")
     fit.hierarchy.meta_policy.network = UserNetwork(Inner(fit.hierarchy.meta_policy.network), 3, 1)
-    assert list(export(fit, tmp_path / "out")) == ["torch"]
-    assert len(compare(runner.Runner(tmp_path / "out", "torch"), fit.controller(), 10)) > 1
+    with pytest.raises(BadInput, match=r"networks that numpy cannot evaluate; export it with --out and --onnx$"):
+        export(fit, tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
+    assert list(export(fit, tmp_path / "out", onnx=True)) == ["onnx"]
+    assert len(compare(runner.Runner(tmp_path / "out", "onnx"), fit.controller(), 10)) > 1
     with pytest.raises(ValueError, match="it has networks that numpy cannot evaluate: use "):
         runner.Runner(tmp_path / "out")
 
@@ -272,10 +263,8 @@ def test_a_users_state_is_carried_by_programs(place, tmp_path):
         meta_policy.network = UserNetwork(Remembering(InputShape({"all": 10}), 3, 1), 3, 1)
     else:
         meta_policy.network.over = UserNetwork(Remembering(InputShape({"all": 10}), 6, 1), 6, 1)
-    forms = ["torch", "onnx"] if place == "over" else ["torch"]
-    assert list(export(fit, tmp_path / "out", onnx="onnx" in forms)) == forms
-    for form in forms:
-        assert len(compare(runner.Runner(tmp_path / "out", form), fit.controller(), 10)) > 1
+    assert list(export(fit, tmp_path / "out", onnx=True)) == ["onnx"]
+    assert len(compare(runner.Runner(tmp_path / "out", "onnx"), fit.controller(), 10)) > 1
 
 
 class Adding(torch.nn.Module):
@@ -296,13 +285,13 @@ class Branching(torch.nn.Module):
 
 @pytest.mark.parametrize(
     ("network", "message"),
-    [(Adding, "as torch it differs from the run by "), (Branching, r"the networks cannot be exported: \w+: .*$")],
+    [(Adding, "as onnx it differs from the run by "), (Branching, r"the networks cannot be exported: \w+: .*$")],
 )
 def test_networks_that_act_otherwise_or_make_no_program_leave_nothing_behind(network, message, tmp_path):
     fit = make("linear")
     fit.hierarchy.meta_policy.network = UserNetwork(network(), 3, 1)
     with pytest.raises(Failed, match=rf"^nothing was written: {message}"):
-        export(fit, tmp_path / "out")
+        export(fit, tmp_path / "out", onnx=True)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -383,14 +372,12 @@ def test_a_sound_fit_may_differ_by_what_float32_does(tmp_path, capsys, monkeypat
     assert f" of {allowed(tmp_path):.1e} that are allowed; " in capsys.readouterr().out
 
 
-@pytest.mark.usefixtures("numpy_alone")
 def test_what_a_wide_layer_rounds_one_step_at_a_time_counts(tmp_path):
     """A product with a vector adds up in another order than one with a matrix; exported forms act step by step."""
     export(perceptron(8000), tmp_path)
     assert allowed(tmp_path) == pytest.approx(max(1e-6, 4 * measured(tmp_path)), rel=1e-6)
 
 
-@pytest.mark.usefixtures("numpy_alone")
 def test_where_float32_is_exact_enough_the_tolerance_is_as_it_was(tmp_path):
     export(steep(0.5), tmp_path)
     assert measured(tmp_path) < 2.5e-7
@@ -407,7 +394,6 @@ def test_networks_for_float32_alone_have_the_least_tolerance():
     assert tolerance(fit.hierarchy, episodes) == 1e-6
 
 
-@pytest.mark.usefixtures("numpy_alone")
 def test_large_pictures_are_compared_with_few_bytes(tmp_path):
     """60 pictures of 240 kB, in which places are told apart still: each has as many colours as its squares."""
     network = {"network": "conv", "layers": [{"filters": 4, "kernel": 5, "stride": 8}]}
@@ -422,7 +408,6 @@ def test_large_pictures_are_compared_with_few_bytes(tmp_path):
     assert (np.diff(pictures, axis=0) != 0).mean() > 0.99
 
 
-@pytest.mark.usefixtures("numpy_alone")
 def test_no_fit_is_so_unsound_that_anything_goes(tmp_path):
     """A hundred thousand times the difference of units: what it says is rounding to 1 %."""
     with pytest.raises(
@@ -432,7 +417,6 @@ def test_no_fit_is_so_unsound_that_anything_goes(tmp_path):
 
 
 @pytest.mark.parametrize("array", [f"caller_0.{layer}.{part}" for layer in (0, 1) for part in ("weight", "bias")])
-@pytest.mark.usefixtures("numpy_alone")
 def test_weights_that_are_off_by_a_thousandth_are_refused(array, tmp_path, monkeypatch, damaged):
     """Each array alone, of numpy's form; replaying it later shows it too."""
     export(steep(STEEP), tmp_path / "later")
@@ -447,23 +431,16 @@ def test_weights_that_are_off_by_a_thousandth_are_refused(array, tmp_path, monke
     assert ended.value.code == 1
 
 
-@pytest.mark.parametrize("form", ["torch", "onnx"])
-def test_programs_that_are_off_by_a_thousandth_are_refused(form, tmp_path, damaged):
-    damaged({"torch": scale_torch, "onnx": scale_onnx}[form])
-    with pytest.raises(Failed, match=rf"^nothing was written: as {form} it differs from the run by "):
-        export(steep(STEEP), tmp_path / "out", onnx=form == "onnx")
+def test_a_program_that_is_off_by_a_thousandth_is_refused(tmp_path, damaged):
+    damaged(scale_onnx)
+    with pytest.raises(Failed, match=r"^nothing was written: as onnx it differs from the run by "):
+        export(steep(STEEP), tmp_path / "out", onnx=True)
     assert list(tmp_path.iterdir()) == []
 
 
 def scale(folder: Path, array: str) -> None:
     with edited_numpy(folder) as weights:
         weights[array] = weights[array] * np.float32(1.001)
-
-
-def scale_torch(folder: Path) -> None:
-    program = torch.export.load(folder / "controller.pt2")
-    program.state_dict["hierarchy.meta_policy.network.layers.3.weight"].data *= 1.001
-    torch.export.save(program, folder / "controller.pt2")
 
 
 def scale_onnx(folder: Path) -> None:

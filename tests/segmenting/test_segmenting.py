@@ -99,9 +99,16 @@ def test_they_are_the_fits_own(toy_run, toy_spec, file, at_once, monkeypatch):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--level", "option"], "name what to write, such as --html PAGE, --csv FILE or --lerobot FOLDER; labels"),
+        (
+            ["--level", "option"],
+            "name what to write, such as --html PAGE or --csv FILE; labels for each step go to --out",
+        ),
         (["--in-place", "--out", "copy.hdf5"], "--out and --in-place exclude each other; keep one"),
         (["--mimicgen", "copy.hdf5"], "demo_0: has no datagen_info/eef_pose"),
+        (
+            ["--sarm", "copy"],
+            "demos.hdf5: is no LeRobot dataset, which --sarm needs; name another format, such as --csv",
+        ),
     ],
 )
 def test_what_to_write_has_to_be_said(toy_run, file, monkeypatch, options, message):
@@ -377,8 +384,8 @@ def test_a_policy_without_options_is_refused(toy_run, file):
 # --- subtasks of LeRobot datasets -------------------------------------------------------------------------------------
 
 
-LEROBOT = Path(__file__).parent / "fixtures" / "lerobot"
-LANGUAGE = Path(__file__).parent / "fixtures" / "lerobot_language"
+LEROBOT = Path(__file__).parents[1] / "fixtures" / "lerobot"
+LANGUAGE = Path(__file__).parents[1] / "fixtures" / "lerobot_language"
 SPEC = """
 demonstrations: {path: PATH, valid_fraction: 0.25}
 observations: [state]
@@ -450,40 +457,16 @@ def test_subtasks_begin_at_the_very_times_of_frames(lerobot_run, tmp_path):
         assert {said["timestamp"] for said in entries[0]} <= set(times)
 
 
-def test_the_older_form_of_subtasks(lerobot_run, tmp_path):
-    """``fixtures/write_lerobot.py`` says how the dataset was made; LeRobot 0.4.4 reads what is written here."""
-    out = tmp_path / "annotated"
-    older = ("--lerobot", out, "--level", "phase", "--lerobot-format", "0.4")
-    assert call("segment", lerobot_run.folder, LEROBOT, *older).status == 0
-    found = look(lerobot_run.folder, LEROBOT)
-    table = rows_of(out).to_pylist()
-    for one in found.segments:
-        rows = [row for row in table if row["episode_index"] == int(one.name[5:])]
-        assert [row["subtask_index"] for row in rows] == one.levels["phase"].options.tolist()
-    names = parquet.read_table(out / "meta" / "subtasks.parquet").to_pylist()
-    assert [row["subtask"] for row in names] == ["control", "phase 1", "phase 2"]
-    with open_source(out) as source:  # and it can be read here again
-        again = source.recording("demo_2").labels["subtask"].array()
-        np.testing.assert_array_equal(again, found.segments[2].levels["phase"].options)
-
-
-@pytest.mark.parametrize(
-    ("form", "features", "more"),
-    [
-        ("0.6", {"language_persistent": "language", "language_events": "language"}, "lerobot_annotations.json"),
-        ("0.4", {"subtask_index": "int64"}, "subtasks.parquet"),
-    ],
-)
-def test_a_copy_with_subtasks(lerobot_run, tmp_path, form, features, more):
-    out = tmp_path / "annotated"
-    arguments = ("segment", lerobot_run.folder, LEROBOT, "--lerobot", out, "--level", "phase", "--lerobot-format", form)
+def test_a_copy_with_subtasks(lerobot_run, tmp_path):
+    out, features = tmp_path / "annotated", ("language_persistent", "language_events")
+    arguments = ("segment", lerobot_run.folder, LEROBOT, "--lerobot", out, "--level", "phase")
     ended = call(*arguments)
     assert (ended.status, ended.out) == (0, f"{out}\n")
     info, before = (json.loads((folder / "meta" / "info.json").read_text()) for folder in (out, LEROBOT))
-    for name, dtype in features.items():
-        assert info["features"].pop(name) == {"dtype": dtype, "shape": [1], "names": None}
+    for name in features:
+        assert info["features"].pop(name) == {"dtype": "language", "shape": [1], "names": None}
     assert info == before
-    assert files(out) == files(LEROBOT) | {Path("meta") / more}
+    assert files(out) == files(LEROBOT) | {Path("meta/lerobot_annotations.json")}
     assert rows_of(out).drop_columns(list(features)).to_pylist() == rows_of(LEROBOT).to_pylist()
     with open_source(out) as source:
         assert source.names == ("demo_0", "demo_1", "demo_2", "demo_3")
@@ -491,12 +474,9 @@ def test_a_copy_with_subtasks(lerobot_run, tmp_path, form, features, more):
     again = call(*arguments)
     assert (again.status, again.out) == (0, f"{out}\n")
     assert (out / "meta" / "info.json").stat().st_mtime_ns == time  # it is this very copy
-    other = {"0.4": "0.6", "0.6": "0.4"}[form]
     for wrong, message in (
-        ([LEROBOT, "--lerobot", out, "--lerobot-format", form], "annotated: exists; choose another --lerobot"),
-        ([LEROBOT, "--lerobot", out, "--level", "phase", "--lerobot-format", other], "annotated: exists"),
+        ([LEROBOT, "--lerobot", out], "annotated: exists; choose another --lerobot"),
         ([out, "--lerobot", tmp_path / "twice"], "has subtasks already; name a dataset without them"),
-        ([out, "--lerobot", tmp_path / "twice", "--lerobot-format", other], "has subtasks already; name a dataset"),
     ):
         ended = call("segment", lerobot_run.folder, *wrong)
         assert (ended.status, ended.err.count("\n")) == (2, 1 + ended.err.count("segmenting: "))
@@ -507,7 +487,10 @@ def test_a_copy_with_subtasks(lerobot_run, tmp_path, form, features, more):
     ("arguments", "message"),
     [
         (["--lerobot", "OUT", "--level", "skil"], "there is no level 'skil' (there is: skill"),
-        (["--html", "OUT", "--out", "OUT2"], "labels go into HDF5 files only; name another format, such as --csv"),
+        (
+            ["--html", "OUT", "--out", "OUT2"],
+            "is no HDF5 file in robomimic's layout, which --out needs; name another format",
+        ),
     ],
 )
 def test_what_cannot_be_written_of_a_lerobot_dataset(lerobot_run, tmp_path, arguments, message):
