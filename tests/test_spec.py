@@ -425,7 +425,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         {"training": {"starts": ["random"], "labels": {"level": "option", "from": "phase", "hold": False}}},
         "training.labels.hold: false uses labels in initialisation alone, and that is random; say vq there",
     ),
-    ({"training.starts": ["clusters"]}, "training.starts.0: must be one of 'vq', 'vq_controls', 'windows'"),
+    ({"training.starts": ["clusters"]}, "training.starts.0: must be vq or vq_controls or windows or equal_parts"),
     ({"training.starts": []}, "training.starts: "),
     ({"training": {"starts": ["mixture"], "lower_levels": "frozen"}}, "training.lower_levels: mixture trains all"),
     ({"training.duration.mean": [20, 2]}, "training.duration.mean: has 2 numbers, but the number of levels is 1"),

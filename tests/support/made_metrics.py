@@ -16,6 +16,7 @@ TRAINING = {
         "spent": {"epochs": 5, "gradient_steps": 10},
         "each": [{"epochs": 5, "stopped": None, "start": "vq", "objective": 1.0}],
     },
+    "objective": 1.0,
     "device": "cpu",
     "by_em": False,
     "by_lbfgs": False,
