@@ -1,6 +1,6 @@
 """Gestures of surgeons: options without labels, and with a few, beside what a user would try instead (JIGSAWS).
 
-    python studies/people.py --data FOLDER [--tasks Knot_Tying Suturing] [--splits last surgeon trial pusht]
+    python -m studies.people --data FOLDER [--tasks Knot_Tying Suturing] [--splits last surgeon trial pusht]
         [--labelled 0 1 3 5 all] [--jobs 2] [--summarize]
 
 FOLDER holds ``TASK.hdf5``, of ``ddco-pyro import JIGSAWS/TASK --hz 10``. No licence lets anyone share these data; Johns
@@ -23,14 +23,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import study
 import torch
 from sklearn.cluster import KMeans
 from sklearn.decomposition import PCA
 from sklearn.metrics import normalized_mutual_info_score
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
-from study import Cell, Row, Settings, described
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.inspection import inspect
@@ -48,6 +46,8 @@ from ddco_pyro.spec.yaml import read_yaml
 from ddco_pyro.statistics import edit_score
 from ddco_pyro.training.data import demonstrations as read_demonstrations
 from ddco_pyro.training.data import parts
+from studies import study
+from studies.study import Cell, Row, Settings, described
 
 LABELS, KNOWN = "gesture", "known"
 ALL, SPLITS = "all", ["last", "surgeon", "trial", "pusht"]

@@ -1,4 +1,4 @@
-"""Studies by scripts: cells are kept as those of ``ddco-pyro study``, and tidy tables get their numbers."""
+"""Studies by scripts: cells are kept as those of a declaration, and tidy tables get their numbers."""
 
 from __future__ import annotations
 
@@ -20,12 +20,10 @@ from ddco_pyro.data.files import only_one, write_text
 from ddco_pyro.drawing.page import Table
 from ddco_pyro.errors import BadInput, Failed
 from ddco_pyro.jobs import Workers
-from ddco_pyro.study import cells
-from ddco_pyro.study.report import shown as mean_and_interval
-from ddco_pyro.study.table import COLUMNS, estimate, read_tidy
-
-ROOT = Path(__file__).resolve().parents[1]
-RESULTS = ROOT / "docs" / "results"
+from studies import cells
+from studies.page import RESULTS
+from studies.page import shown as mean_and_interval
+from studies.statistics import COLUMNS, estimate, read_tidy
 
 
 class Row(NamedTuple):
@@ -41,7 +39,7 @@ class Row(NamedTuple):
 
 
 def tidy(rows: Iterable[Row]) -> pd.DataFrame:
-    """The rows as :func:`ddco_pyro.study.table.read_tidy` reads them."""
+    """The rows as :func:`studies.statistics.read_tidy` reads them."""
     text = [(*("" if part is None else str(part) for part in row[:-1]), row[-1]) for row in rows]
     return pd.DataFrame(text, columns=COLUMNS)
 
@@ -105,11 +103,11 @@ class Cell(ABC):
     @property
     def name(self) -> str:
         """Of its files."""
-        return "-".join(map(str, astuple(self)))
+        return "-".join(map(str, astuple(self)))  # type: ignore[call-overload]
 
     def depends(self, settings: Settings) -> dict[str, Any]:
         """What decides its results."""
-        return asdict(self) | settings.kept()
+        return asdict(self) | settings.kept()  # type: ignore[call-overload, no-any-return]
 
     def path(self, settings: Settings) -> Path:
         """Its file; other settings have other files."""

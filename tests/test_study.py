@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-import study
-from study import RESULTS, Cell, Row, Settings, add, described
 
 from ddco_pyro.data.files import only_one
-from ddco_pyro.study.table import COLUMNS, read_tidy
+from studies import study
+from studies.page import RESULTS
+from studies.statistics import COLUMNS, read_tidy
+from studies.study import Cell, Row, Settings, add, described
 
 DEFAULTS = Settings({"episodes": 3, "noise": 0.5}, Path("unused"))
 

@@ -20,7 +20,7 @@ from typing import Annotated, Any
 
 import typer
 
-from ddco_pyro.cli import NARROW, demos, fits, label, runs, starting, study
+from ddco_pyro.cli import NARROW, demos, fits, label, runs, starting
 from ddco_pyro.errors import BadInput, Failed, reason
 
 app = typer.Typer(
@@ -49,7 +49,6 @@ EXAMPLES: dict[Callable[..., None], str] = {
     runs.segment: "segment runs/mine mine.hdf5 --html segments.html",
     label.label: "label runs/mine mine.hdf5 --out labelled.hdf5",
     runs.export: "export runs/mine --out controller --onnx",
-    study.study: "study run studies/mine.yaml --jobs 2",
 }
 """Every command, in the order of ``--help``."""
 

@@ -1,16 +1,13 @@
-"""Every spec of the pushing task can be checked and fitted, and its policy acts in the task; features of pictures."""
+"""Every spec of the pushing task can be checked and fitted, and its policy acts in the task."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from ddco_tasks.pushing import environment as pushing
-from pushing_pictures import SIZE, encoded
-from random_demonstrations import numbered
 
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.demonstrations import Demonstrations
@@ -64,31 +61,3 @@ def test_specs_are_checked_against_the_task(path: Path) -> None:
     known = dimensions(spec)
     assert (known.control_size, known.steps) == (3, pushing.GOAL_STEPS)
     assert check_networks(spec, known).depth == LEVELS[path.stem.removeprefix("pushing_")]
-
-
-# --- features of pictures ---------------------------------------------------------------------------------------------
-
-
-def test_features_have_versions_of_pictures_that_are_moved() -> None:
-    """Each demonstration by moves of its own, all of its pictures alike; what is read here is the picture itself."""
-    pictures = np.random.default_rng(0).integers(0, 256, (10, 4, *SIZE, 3), dtype=np.uint8)
-    demos = numbered(({"camera": own}, np.zeros((4, 2))) for own in pictures)
-    reader = SimpleNamespace(encode=lambda seen: seen.reshape(len(seen), -1).astype(np.float32))
-    kept, by = encoded(reader, demos, versions=6, seed=3), set()
-    assert kept.names == demos.names
-    for demo, whole in zip(kept, pictures, strict=True):
-        np.testing.assert_array_equal(demo.observations["camera_features"], whole.reshape(4, -1))
-        inside = whole[:, 3:-3, 3:-3]
-        height, width = inside.shape[1:3]
-        for version in demo.observations["camera_features_moved"].swapaxes(0, 1):
-            seen = version.reshape(4, *SIZE, 3)
-            places = [
-                (row, column)
-                for row in range(7)
-                for column in range(7)
-                if (seen[:, row : row + height, column : column + width] == inside).all()
-            ]
-            assert len(places) == 1
-            by.update(places)
-    assert len(by) > 20  # of 49
-    assert list(encoded(reader, demos)[0].observations) == ["camera_features"]

@@ -7,10 +7,8 @@ another in the blocks of ``demonstrations`` and ``starts``. ``docs/studies.md`` 
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import combinations, product
 from pathlib import Path
 from pkgutil import resolve_name
@@ -21,9 +19,8 @@ from pydantic import Field, ValidationError
 from ddco_pyro.errors import BadInput, nearest
 from ddco_pyro.evaluation.agreement import MATCHED, UNMATCHED
 from ddco_pyro.selection.grid import point_name
-from ddco_pyro.simulation.task import find_task
-from ddco_pyro.spec import Spec, SpecError, load_spec, parse_spec, user_code
-from ddco_pyro.spec.base import Count, Importable, Items, Model, Problems, Seed, TaskName, Text, lines
+from ddco_pyro.spec import Spec, SpecError, load_spec, parse_spec
+from ddco_pyro.spec.base import Count, Items, Model, Problems, Seed, Text, lines
 from ddco_pyro.spec.model import Baseline
 from ddco_pyro.spec.yaml import read_mapping
 
@@ -49,8 +46,6 @@ NATS = "nats"
 
 PARTS = ("test", "development")
 AMONG = "is not among measures; add it there"
-Grid = dict[str, Annotated[Items[Any], Field(min_length=1)]]
-"""Key path in the spec to values, of which every combination is a point."""
 
 
 class Block(Model):
@@ -71,24 +66,25 @@ class Blocks(Model):
     development: Block | None = None
 
 
-class DataSpec(Model):
-    """The demonstrations of a study: of a file, or newly recorded for every training seed."""
+class DataSpec(Blocks):
+    """The demonstrations, which the world records newly for every training seed."""
 
-    path: Text | None = None
     counts: Annotated[Items[Count], Field(min_length=1)]
     held_out: Count = 10
-    supervisor: Text | None = None
-    test: Block | None = None  # with path: places in the file, from which every training seed draws
-    development: Block | None = None
 
 
 class MethodSpec(Model):
-    """What one method changes in the spec; with ``by``, what the adapter's method of this name is told."""
+    """What one method changes in the spec; with ``by``, what the world's method of this name is told."""
 
     baseline: Baseline | None = None
     by: Text | None = None
     overrides: dict[str, Any] = Field(default={})
-    grid: Grid = Field(default={})
+    grid: dict[str, Annotated[Items[Any], Field(min_length=1)]] = Field(default={})
+
+    @property
+    def points(self) -> list[dict[str, Any]]:
+        """The points of the grid, each with values by key path."""
+        return [dict(zip(self.grid, values, strict=True)) for values in product(*self.grid.values())]
 
 
 class ContrastSpec(Model):
@@ -128,12 +124,11 @@ class Declaration(Model):
 
     question: Text
     spec: Text = INIT
-    world: Annotated[Text, Importable()] | None = None
-    tasks: Items[TaskName] = ()
+    world: Text
+    tasks: Annotated[Items[Text], Field(min_length=1)]
     overrides: dict[str, Any] = Field(default={})
-    grid: Grid = Field(default={})
     choose: Text | None = None
-    choose_on: Items[TaskName] = ()
+    choose_on: Items[Text] = ()
     methods: Annotated[dict[Text, MethodSpec], Field(min_length=1)]
     seeds: Blocks
     demonstrations: DataSpec
@@ -141,7 +136,7 @@ class Declaration(Model):
     measures: Annotated[Items[Text], Field(min_length=1)] = (NATS,)
     contrasts: Items[ContrastSpec] = ()
     correction: Literal["holm", "fixed_sequence"] = "holm"
-    families: dict[Text, Annotated[Items[TaskName], Field(min_length=2)]] = Field(default={})
+    families: dict[Text, Annotated[Items[Text], Field(min_length=2)]] = Field(default={})
     failed: dict[Text, float] = Field(default={})
     pinned: bool = False
     kept: Items[KeptSpec] = ()
@@ -152,39 +147,37 @@ class Declaration(Model):
 
     def ranges(self, key: str) -> dict[str, range]:
         """All numbers of the blocks of ``seeds``, ``demonstrations`` or ``starts``, by key path."""
-        once = key == "seeds" or (key == "demonstrations" and self.demonstrations.path is not None)
         ranges = {}
         for part in PARTS:
             block, seeds = getattr(getattr(self, key), part, None), getattr(self.seeds, part)
-            if block is not None and seeds is not None:
-                ranges[f"{key}.{part}"] = range(block.first, block.of(0 if once else seeds.count - 1).stop)
+            if block and seeds:
+                last = 0 if key == "seeds" else seeds.count - 1
+                ranges[f"{key}.{part}"] = range(block.first, block.of(last).stop)
         return ranges
 
     def _data(self) -> Iterator[tuple[bool, str, str]]:
         data, needed = self.demonstrations, max(self.demonstrations.counts) + self.demonstrations.held_out
         seeds, recorded, starts = map(self.ranges, ("seeds", "demonstrations", "starts"))
-        for blocks in (seeds, recorded | starts) if data.path is None else (seeds, recorded, starts):
+        for blocks in (seeds, recorded | starts):
             for (one, ours), (other, theirs) in combinations(blocks.items(), 2):
                 taken = f"{one} ({ours.start} to {ours.stop - 1})"
                 text = f"{theirs.start} to {theirs.stop - 1} overlaps {taken}; move one of them"
                 yield ours.start < theirs.stop and theirs.start < ours.stop, other, text
         for part in (part for part in PARTS if getattr(self.seeds, part)):
-            block, at, missing = getattr(data, part), f"demonstrations.{part}", "missing; give first and count"
-            yield block is None and (data.path is None or data.development is not None), at, missing
-            few = block is not None and block.count < needed
-            yield few, f"{at}.count", f"must be at least {needed}, the most to train on and those held out"
+            block, missing = getattr(data, part), "missing; give first and count"
+            yield block is None, f"demonstrations.{part}", missing
             yield self.starts is not None and getattr(self.starts, part) is None, f"starts.{part}", missing
-        several = "are several, but demonstrations.path names one file; name one task"
-        yield data.path is not None and len(self.tasks) > 1, "tasks", several
-        yield self.world is not None and not self.tasks, "tasks", "missing; name tasks of the world"
+            few = block is not None and block.count < needed
+            text = f"must be at least {needed}, the most to train on and those held out"
+            yield few, f"demonstrations.{part}.count", text
         related = [task for tasks in self.families.values() for task in tasks]
         units = {*self.tasks} - {*related} | {*self.families}
-        wrong = {*related} - {*self.tasks} or len({*related}) < len(related) or len(units) < 2
+        wrong = bool({*related} - {*self.tasks} or len({*related}) < len(related) or len(units) < 2)
         text = "must have tasks of the study, each once, and leave several units"
-        yield bool(self.families and wrong), "families", text
+        yield bool(self.families) and wrong, "families", text
 
     def _named(self) -> Iterator[tuple[bool, str, str]]:
-        known, labels, counts = (NATS, *UNMATCHED, *MATCHED), self.labels, self.demonstrations.counts
+        known, counts = (NATS, *UNMATCHED, *MATCHED), self.demonstrations.counts
         for number, one in enumerate(self.measures):
             text = f"there is no measure {one!r}{nearest(one, known)}; without starts there is: {', '.join(known)}"
             yield self.starts is None and one not in known, f"measures.{number}", text
@@ -192,21 +185,18 @@ class Declaration(Model):
             at, count = f"contrasts.{number}", contrast.demonstrations
             yield contrast.measure not in self.measures, f"{at}.measure", f"{contrast.measure!r} {AMONG}"
             for name in contrast.pair:
-                text = f"{contrast.contrast!r}: there is no method {name!r}{nearest(name, labels)}"
-                text = f"{text}; write 'ours - theirs' with: {', '.join(labels)}"
-                yield name not in labels, f"{at}.contrast", text
+                text = f"{contrast.contrast!r}: there is no method {name!r}{nearest(name, self.methods)}"
+                text = f"{text}; write 'ours - theirs' with: {', '.join(self.methods)}"
+                yield name not in self.methods, f"{at}.contrast", text
             wrong = len(counts) > 1 if count is None else count not in counts
             yield wrong, f"{at}.demonstrations", f"must be one of {', '.join(map(str, counts))}"
             wrong = contrast.kind == "equivalence" and not contrast.margin
             yield wrong, f"{at}.margin", "missing; say which differences are none"
         for name, method in self.methods.items():
-            at = f"methods.{name}"
-            wrong = method.by is not None and self.world is None
-            yield wrong, f"{at}.by", "names a method of an adapter; give its world"
             both = method.by is not None and method.baseline is not None
-            yield both, f"{at}.baseline", "stands beside by; keep one of the two"
-            for path in method.overrides.keys() & (self.grid.keys() | method.grid.keys()):
-                yield True, f"{at}.overrides", f"has {path!r}, which the grid has, too; keep one of the two"
+            yield both, f"methods.{name}.baseline", "stands beside by; keep one of the two"
+            for path in method.overrides.keys() & method.grid.keys():
+                yield True, f"methods.{name}.overrides", f"has {path!r}, which the grid has, too; keep one of the two"
         yield from ((name not in self.measures, f"failed.{name}", f"{name!r} {AMONG}") for name in self.failed)
 
     def _chosen(self) -> Iterator[tuple[bool, str, str]]:
@@ -217,63 +207,44 @@ class Declaration(Model):
         for number, task in enumerate(self.choose_on):
             text = f"{task!r} is not among tasks, or there is nothing to choose; remove it"
             yield none or task not in self.tasks, f"choose_on.{number}", text
-        trials = {name: len({point_name(point) for point in self.points(name)}) for name in self.methods}
+        trials = {name: len({point_name(point) for point in one.points}) for name, one in self.methods.items()}
+        yield none and {*trials.values()} != {1}, "choose", "missing; name the measure that chooses among the points"
         counts = ", ".join(f"{name} {count}" for name, count in trials.items())
         text = f"have unequal numbers of points to choose from ({counts}); name as many for each"
         yield not none and len({*trials.values()}) > 1, "methods", text
-        yield not none and {*trials.values()} == {1}, "grid", "is empty; name what to choose from"
-
-    def points(self, method: str) -> list[dict[str, Any]]:
-        """The points of a method's grid, each with values by key path."""
-        grid = self.grid | self.methods[method].grid
-        return [dict(zip(grid, values, strict=True)) for values in product(*grid.values())]
+        yield not none and {*trials.values()} == {1}, "methods", "have nothing to choose from; give each a grid"
 
     def label(self, method: str, point: dict[str, Any], part: str = "test") -> str:
-        """The name of a method in tables: with the point of the grid, unless it was chosen."""
-        return f"{method} ({point_name(point)})" if point and (self.choose is None or part != "test") else method
-
-    @property
-    def labels(self) -> list[str]:
-        """The names of all methods in the tables of the test."""
-        return list(dict.fromkeys(self.label(name, point) for name in self.methods for point in self.points(name)))
+        """The name of a method in tables: in the development with the point of the grid."""
+        return f"{method} ({point_name(point)})" if point and part != "test" else method
 
 
 @dataclass(frozen=True)
 class Study:
-    """A declaration, its file, and the spec that it names (None for ``init``).
-
-    >>> study = Study.load("study.yaml")
-    >>> study.name, list(study.declared.methods)
-    ('study', ['options', 'flat'])
-    """
+    """A declaration, its file, and the spec that it names (None for ``init``)."""
 
     path: Path
     declared: Declaration
     base: Spec | None
 
     @classmethod
-    def load(cls, path: str | Path, allow_code: bool = False) -> Study:
+    def load(cls, path: Path) -> Study:
         """Read a declaration and check the spec of every method.
 
-        :param allow_code: whether adapter, spec and tasks may be user code (``module:name``).
-        :raises SpecError: the declaration or a spec is invalid, or names code that is not allowed; one line for each
-            problem.
+        :raises SpecError: the declaration or a spec is invalid; one line for each problem.
         """
-        path = Path(path)
         try:
             declared = Declaration.model_validate(read_mapping(path, "study"))
         except ValidationError as error:
             raise SpecError(*(f"{path}: {line}" for line in lines(error, Declaration))) from None
-        base = None if declared.spec == INIT else load_spec(path.parent / declared.spec, (), allow_code)
-        study = cls(path, declared, base)
-        if not study.tasks[0] and (declared.starts or declared.demonstrations.path is None):
-            where = "the task in which methods act" if declared.starts else "tasks, or a file in demonstrations.path"
-            raise SpecError(f"{path}: tasks: missing; name {where}")
-        code = user_code(declared) | {f"tasks.{n}": task for n, task in enumerate(declared.tasks) if ":" in task}
-        code |= {f"overrides of {where}": name for where, name in study._overridden_code()}
-        if code and not allow_code:
-            text = "pass --allow-code if you trust it"
-            raise SpecError(*(f"{path}: {at}: would import user code ({name}); {text}" for at, name in code.items()))
+        study = cls(path, declared, None if declared.spec == INIT else load_spec(path.parent / declared.spec, (), True))
+        given: Any = SKELETON if study.base is None else study.base.model_dump(exclude_unset=True)
+        for name, point in [(name, point) for name, method in declared.methods.items() for point in method.points]:
+            try:
+                parse_spec(given, study.changes(name, point))
+            except SpecError as error:
+                where = declared.label(name, point, "")
+                raise SpecError(*(f"{path}: {where}: {problem}" for problem in error.problems)) from None
         return study
 
     @property
@@ -281,61 +252,24 @@ class Study:
         """The name of the study, from its file."""
         return self.path.stem
 
-    @property
-    def tasks(self) -> tuple[str, ...]:
-        """The tasks; an empty name stands for a file of demonstrations without a task."""
-        return self.declared.tasks or ((self.base.task if self.base else None) or "",)
-
-    @property
-    def family_of(self) -> dict[str, str]:
-        """The family of each task that has one."""
-        return {task: family for family, tasks in self.declared.families.items() for task in tasks}
-
     def changes(self, method: str, point: dict[str, Any]) -> dict[str, Any]:
         """What a method with a point of the grid changes in the spec, by key path."""
         own, settings = {**self.declared.methods[method].overrides, **point}, self.settings(method, point)
         return {**ALONE, **self.declared.overrides, **{key: own[key] for key in own if key not in settings}}
 
     def settings(self, method: str, point: dict[str, Any]) -> dict[str, Any]:
-        """What an adapter's own method is told, by name: its overrides and its part of a point."""
+        """What a world's own method is told, by name: its overrides and its point."""
         own = self.declared.methods[method]
-        return {} if own.by is None else {**own.overrides, **{key: point[key] for key in own.grid}}
-
-    def _overridden_code(self) -> Iterator[tuple[str, str]]:
-        """The methods whose spec names user code, and that code.
-
-        :raises SpecError: the overrides of a method do not fit the spec.
-        """
-        given: Any = SKELETON if self.base is None else self.base.model_dump(exclude_unset=True)
-        for method, point in [(name, one) for name in self.declared.methods for one in self.declared.points(name)]:
-            where = self.declared.label(method, point, "")
-            try:
-                code = user_code(parse_spec(given, self.changes(method, point)))
-            except SpecError as error:
-                raise SpecError(*(f"{self.path}: {where}: {problem}" for problem in error.problems)) from None
-            if code:
-                yield where, ", ".join(code.values())
-
-    @cached_property
-    def source(self) -> Path | None:
-        """The file of demonstrations, where the declaration names one."""
-        named = self.declared.demonstrations.path
-        return None if named is None else self.path.parent / named
+        return {} if own.by is None else {**own.overrides, **point}
 
     def world(self) -> Any:
-        """The adapter of the simulator (:class:`ddco_pyro.study.cells.World`); None for the registered tasks.
+        """The simulator of the study (``docs/studies.md``).
 
-        :raises BadInput: the adapter or a task cannot be imported, or the adapter lacks a method.
+        :raises BadInput: it cannot be imported, or lacks a method.
         """
-        if self.declared.world is None:
-            for task in self.tasks if self.declared.starts or self.source is None else ():
-                find_task(task)
-            return None
-        if (folder := str(self.path.parent.resolve())) not in sys.path:
-            sys.path.append(folder)
         try:
-            world = resolve_name(self.declared.world)
-        except Exception as error:  # whatever the adapter's code raises
+            world = resolve_name(f"studies.{self.declared.world}")
+        except Exception as error:  # whatever the world's code raises
             raise BadInput(f"{self.path}: world: {self.declared.world} cannot be loaded: {error}") from error
         for by in (method.by for method in self.declared.methods.values()):
             if by is not None and by not in world.methods:

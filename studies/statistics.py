@@ -1,4 +1,4 @@
-"""Tidy tables of results, a number in each row, which a task, a method and a training seed name; estimates of means."""
+"""Tidy tables of results, a number in each row; estimates of means over them, and verdicts on contrasts."""
 
 from __future__ import annotations
 
@@ -6,39 +6,42 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+from scipy.stats import quantile_test, t
 
 from ddco_pyro.data.files import Damaged
 from ddco_pyro.errors import BadInput
 from ddco_pyro.statistics import CONFIDENCE, mean_interval, rate, t_quantile
-from ddco_pyro.study.declaration import Study
+from studies.declaration import ContrastSpec, Study
 
 COLUMNS = ["study", "task", "method", "demonstrations", "seed", "measure", "value"]
 """All but ``value`` are text. ``demonstrations`` is empty where a number does not depend on them. ``seed`` may name
 other repetitions, and is empty where there is one value."""
 
-CELL = ["task", "method", "demonstrations", "seed"]
+CELL = COLUMNS[1:5]
 """The columns that name a cell."""
 
 ORIGIN = ["key", "code"]
 """Further columns of a study's table: the digest of what the declaration says of a cell, and the commit of the code."""
 
+HOLDS, FAILS, NOT_TESTED, EQUIVALENCE = "holds", "does not hold", "not tested", "equivalence"
+LEVEL = (1 - CONFIDENCE) / 2
+"""One-sided level of the tests, which corresponds to two-sided 95 % intervals."""
+
 
 def read_tidy(path: Path) -> pd.DataFrame:
-    """A tidy table with :data:`COLUMNS`, and with :data:`ORIGIN` where it has them.
-
-    :raises BadInput: the file cannot be read.
-    """
-    remedy = "write it with: ddco-pyro study report"
+    """A table with :data:`COLUMNS`, and with :data:`ORIGIN` where it has them; raises BadInput if it cannot be read."""
     try:
         table = pd.read_csv(path, dtype=str, keep_default_na=False).astype({"value": float})
         return table[[*COLUMNS, *(column for column in ORIGIN if column in table)]]
     except OSError as error:
-        raise BadInput(f"{path}: cannot be read: {error.strerror}; {remedy}") from error
+        raise BadInput(f"{path}: cannot be read: {error.strerror}; check the path") from error
     except (KeyError, ValueError) as error:
-        raise Damaged(path, f"{type(error).__name__}: {' '.join(str(error).split())}", remedy) from error
+        said = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        raise Damaged(path, said, "write it with: python -m studies report") from error
 
 
 def earlier(study: Study) -> pd.DataFrame:
@@ -55,17 +58,15 @@ def earlier(study: Study) -> pd.DataFrame:
         names = {"task": kept.tasks, "method": kept.methods, "measure": kept.measures}
         names_here = {column: {there: here for here, there in own.items()} for column, own in names.items()}
         table = table.replace(names_here).assign(study=study.name)
-        tables.append(table[table.task.isin(study.tasks)])
+        tables.append(table[table.task.isin(study.declared.tasks)])
     whole = pd.concat(tables).drop_duplicates([*CELL, "measure"]).astype({"value": float})
     return whole.fillna(dict.fromkeys(ORIGIN, ""))
 
 
-def values(
-    table: pd.DataFrame, what: str, measure: str, demonstrations: Sequence[str | int], task: str | None = None
-) -> pd.Series:
+def values(table: pd.DataFrame, what: str, measure: str, counts: Sequence[str | int], task: str | None) -> pd.Series:
     """The values of a method, or the paired differences of ``ours - theirs``, indexed by ``task`` and ``seed``.
 
-    :param demonstrations: of a method; a second number is that of ``theirs``.
+    A second number of demonstrations among ``counts`` is that of ``theirs``.
     """
     table = table[(table.measure == measure) & (table.task.eq(task) if task is not None else True)]
 
@@ -73,25 +74,20 @@ def values(
         rows = table[(table.method == method.strip()) & (table.demonstrations == str(count))]
         return rows.groupby(["task", "seed"], sort=False).value.last()
 
-    found = of(what, demonstrations[0])
+    found = of(what, counts[0])
     if found.empty and " - " in what:
         ours, _, theirs = what.partition(" - ")
-        found = (of(ours, demonstrations[0]) - of(theirs, demonstrations[-1])).dropna()
+        found = (of(ours, counts[0]) - of(theirs, counts[-1])).dropna()
     seeds = found.index.get_level_values("seed")
     return found[(seeds != "") | (seeds == "").all()]  # a row without seed is the summary of the others
 
 
-LEVEL = (1 - CONFIDENCE) / 2
-"""One-sided level of the tests, which corresponds to two-sided 95 % intervals."""
-
-
 @dataclass(frozen=True)
 class Estimate:
-    """A mean over tasks of means over seeds.
+    """A mean over tasks of means over seeds, its standard error and its 95 % t interval.
 
-    :param error: the standard error; NaN, as the interval is, where the units have no spread or there is one.
-    :param interval: the 95 % t interval.
-    :param units: the means of the tasks or of their families, or the values of the seeds of a single one.
+    Without spread, error and interval are NaN. ``units`` are the means of the tasks or of their families, or the values
+    of the seeds of a single one.
     """
 
     value: float
@@ -102,8 +98,6 @@ class Estimate:
     @property
     def median(self) -> tuple[float, tuple[float, float]]:
         """The median unit and its exact interval of at least 95 %, whatever the distribution; NaN below six units."""
-        from scipy.stats import quantile_test
-
         middle = float(np.median(self.units))
         ends = quantile_test(self.units, q=middle, p=0.5).confidence_interval(CONFIDENCE)
         return middle, (float(ends.low), float(ends.high))
@@ -113,30 +107,23 @@ class Estimate:
 
         NaN without a standard error. One minus it is the p-value of the contrary claim.
         """
-        from scipy.stats import t
-
         freedom = len(self.units) - 1
         below, above = t.sf((self.value - low) / self.error, freedom), t.cdf((self.value - high) / self.error, freedom)
         return float(max(below, above))
 
 
 def estimate(
-    values: pd.Series, trials: int = 0, lowest: float = -1.0, families: Mapping[str, str] | None = None
+    values: pd.Series, trials: int = 0, lowest: float = -1.0, families: Mapping[str, Sequence[str]] | None = None
 ) -> Estimate:
-    """The mean and its t interval.
+    """The mean of values by task and seed, and its t interval.
 
-    >>> found = estimate(pd.Series({("push", 0): 1.0, ("push", 1): 2.0, ("push", 2): 3.0}))
-    >>> found.value, round(found.interval[0], 3)
-    (2.0, -0.484)
-
-    :param values: by task and training seed.
     :param trials: of each fit, where the values are rates or their differences. Equal units have Wilson's interval of
         all trials, a difference that of as many trials with different outcomes.
     :param lowest: the least possible value of a rate: 0, or -1 of a difference.
-    :param families: the name of the family of a task, whose mean is one unit; tasks that are left out are units.
+    :param families: tasks by the name of their family, whose mean is one unit; tasks that are left out are units.
     """
     of_task = {task: own.to_numpy().mean() for task, own in values.groupby(level=0, sort=False)}
-    related = families or {}
+    related = {task: family for family, tasks in (families or {}).items() for task in tasks}
     means = pd.Series(of_task).groupby(lambda task: related.get(task, task), sort=False).mean().to_numpy()
     units = means if len(means) > 1 else values.to_numpy()
     value, error, interval = float(means.mean()), math.nan, (math.nan, math.nan)
@@ -152,13 +139,65 @@ def estimate(
     return Estimate(value, error, interval, tuple(map(float, units)))
 
 
-def holm(p_values: Sequence[float] | np.ndarray) -> list[float]:
-    """Holm's adjusted p-values, in the given order; a NaN counts as 1.
+def estimated(
+    study: Study | None, table: pd.DataFrame, what: str, measure: str, counts: Sequence[str | int],
+    task: str | None = None, times: float = 1.0,
+) -> Estimate | None:  # fmt: skip
+    """The mean of a method or of a contrast, some times as large; rates of a study have the trials of their starts."""
+    own, starts = times * values(table, what, measure, counts, task), study and study.declared.starts
+    trials = starts.test.count if starts and measure.startswith("success") and times == 1 else 0
+    families, lowest = study.declared.families if study else {}, -1.0 if " - " in what else 0.0
+    return estimate(own, trials, lowest, families) if len(own) else None
 
-    >>> [round(p, 6) for p in holm([0.01, 0.04, 0.03])]
-    [0.03, 0.06, 0.06]
-    """
+
+def holm(p_values: Sequence[float] | np.ndarray) -> list[float]:
+    """Holm's adjusted p-values, in the given order; a NaN counts as 1."""
     known = np.nan_to_num(np.array(p_values, float), nan=1.0)
     order = np.argsort(known)
     known[order] = np.minimum(np.maximum.accumulate(known[order] * np.arange(len(known), 0, -1)), 1.0)
     return known.tolist()
+
+
+class Tested(NamedTuple):
+    """A primary contrast with its estimate (None without any cell), its verdict and its adjusted p-value."""
+
+    spec: ContrastSpec
+    demonstrations: int
+    estimate: Estimate | None
+    verdict: str
+    adjusted: float
+
+
+def tested(study: Study, table: pd.DataFrame) -> list[Tested]:
+    """The primary contrasts of a study, in their order."""
+    contrasts, counts = study.declared.contrasts, study.declared.demonstrations.counts
+    asked = [(one, one.demonstrations or counts[0]) for one in contrasts]
+    found = [estimated(study, table, one.contrast, one.measure, [number]) for one, number in asked]
+    p_values = [own.p_value(*one.bounds) if own else math.nan for own, one in zip(found, contrasts, strict=True)]
+    places: dict[Any, int] = {(one.kind, one.pair, one.measure, count): n for n, (one, count) in enumerate(asked)}
+    twins = {n: places.get(("superiority", *facts)) for (kind, *facts), n in places.items() if kind == EQUIVALENCE}
+    judged = verdicts(p_values, study.declared.correction, twins)
+    return [Tested(*one, own, *verdict) for one, own, verdict in zip(asked, found, judged, strict=True)]
+
+
+def verdicts(
+    p_values: Sequence[float], correction: str = "holm", twins: Mapping[int, int | None] | None = None
+) -> list[tuple[str, float]]:
+    """The verdict on each claim of a family, and its adjusted p-value.
+
+    ``does not hold``: the contrary does, whose p-value is one minus that of the claim. ``inconclusive``: neither does.
+    ``not reached``: in a fixed sequence, a claim before it does not hold. ``not tested``: there is no p-value.
+
+    :param twins: maps an equivalence test to the superiority test of the same contrast. In a fixed sequence it is
+        reached where its twin is, and no other claim waits for it.
+    """
+    given = np.array(p_values, float)
+    known, beside = np.nan_to_num(given, nan=1.0), {n: twin for n, twin in (twins or {}).items() if twin is not None}
+    before, claims, contraries = np.zeros(len(known)), np.array(holm(given)), np.array(holm(1 - given))
+    if correction == "fixed_sequence":
+        largest = np.maximum.accumulate([0.0, *(0.0 if place in beside else p for place, p in enumerate(known))])
+        before = np.array([largest[beside.get(place, place)] for place in range(len(known))])
+        claims, contraries = np.maximum(before, known), np.maximum(before, 1 - known)
+    named = {"not reached": before > LEVEL, NOT_TESTED: np.isnan(given), HOLDS: claims <= LEVEL,
+             FAILS: contraries <= LEVEL}  # fmt: skip
+    return [*zip(np.select([*named.values()], [*named], "inconclusive").tolist(), claims.tolist(), strict=True)]

@@ -16,11 +16,9 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
-from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
-import numpy as np
 import pandas as pd
 from pydantic import Field
 
@@ -33,98 +31,31 @@ from ddco_pyro.data.starting import TEMPLATE, starting_spec
 from ddco_pyro.errors import BadInput, reason
 from ddco_pyro.evaluation.agreement import MATCHED, UNMATCHED
 from ddco_pyro.events import CellDone, CellsBegan, OnEvent, ignore
-from ddco_pyro.fitting.digest import Digest, digest, recorded
 from ddco_pyro.fitting.fit import fit
-from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.inference import compile_all
 from ddco_pyro.jobs import Workers, processes, run_all
 from ddco_pyro.metrics import Record, read_record
-from ddco_pyro.simulation.collect import collect
-from ddco_pyro.simulation.episodes import run_episodes
-from ddco_pyro.spec import DemonstrationsSpec, Spec, SpecError, parse_spec, with_overrides
+from ddco_pyro.spec import Spec, SpecError, parse_spec, with_overrides
 from ddco_pyro.spec.yaml import read_yaml
-from ddco_pyro.study.declaration import NATS, PARTS, Study
-from ddco_pyro.study.table import CELL, COLUMNS, ORIGIN, earlier
 from ddco_pyro.training import data
 from ddco_pyro.training.devices import one_thread
 from ddco_pyro.training.networks import Dimensions, baseline_spec, named_baselines
+from studies.declaration import NATS, PARTS, Study
+from studies.statistics import CELL, COLUMNS, ORIGIN, earlier
 
+ROOT = Path(__file__).resolve().parents[1]
 FAILED, RISING, DIRTY = "failed", "not converged", "-dirty"
 """Measures, 1, of cells that failed and of fits that have not converged; a commit with later changes."""
 
 
-@dataclass(frozen=True)
-class Cell:
-    """One method on one task, with a number of demonstrations and a training seed.
-
-    :param part: ``test`` or ``development``.
-    :param method: its name in tables.
-    :param of: its name in the declaration, and its ``point`` of the grid.
-    :param place: of the training seed in its block.
-    """
-
-    part: str
-    task: str
-    method: str
-    demonstrations: int
-    seed: int
-    of: str = ""
-    point: dict[str, Any] = field(default_factory=dict, hash=False)
-    place: int = 0
-
-    def __str__(self) -> str:
-        task = f"{self.task}, " if self.task else ""
-        return f"{task}{self.method}, {self.demonstrations} demonstrations, seed {self.seed}"
-
-    @property
-    def row(self) -> tuple[str, ...]:
-        """What names the cell in a table."""
-        return self.task, self.method, str(self.demonstrations), str(self.seed)
-
-
-@dataclass(frozen=True)
-class Job:
-    """The work of a cell, for an adapter's own methods.
-
-    :param spec: the spec with the cell's overrides.
-    :param demos: with the masks ``train`` and ``valid``.
-    :param starts: seeds of initial states.
-    :param folder: keeps files of the fit.
-    :param settings: of the method, by name.
-    """
-
-    cell: Cell
-    spec: Spec
-    demos: Demonstrations
-    starts: range
-    folder: Path
-    settings: Mapping[str, Any]
-
-
-class World(Protocol):
-    """The adapter of a simulator.
-
-    :param methods: own methods by name; each trains and acts, and gives measures of its own.
-    """
-
-    methods: Mapping[str, Callable[[Job], Mapping[str, float]]]
-
-    def collect(self, task: str, seeds: range, count: int, path: Path) -> None:
-        """Write ``count`` demonstrations of episodes from these seeds into an HDF5 file, whole or not at all.
-
-        :raises Failed: the simulator cannot be used, or too few episodes succeed.
-        """
-
-    def play(self, task: str, fitted: Fit, starts: range, folder: Path) -> Sequence[Mapping[str, float]]:
-        """The outcome of an episode from each start, such as ``{"success": 1.0}``."""
+# --- any cell, of a declaration or of a script ------------------------------------------------------------------------
 
 
 class Done(Record):
     """The results of a cell, as its file has them.
 
-    :param depends: what they depend on; the ``key`` is a digest of the declaration's part.
-    :param values: by measure; empty where the cell failed for the reason ``failed``.
-    :param code: the commit of the code that gave them.
+    ``key`` is a digest of what the declaration says of it, ``depends`` all that decides its results, and ``code`` the
+    commit that gave them. ``values`` are by measure, or it failed for the reason ``failed``.
     """
 
     depends: dict[str, Any] = Field(default={})
@@ -147,44 +78,19 @@ def kept(path: Path, depends: Mapping[str, Any] | None) -> Done | None:
     return done if depends is None or done.depends == json.loads(json.dumps(depends)) else None
 
 
-def work_of(path: Path) -> Path:
-    """The folder with the fits of the cell whose results are in ``path``."""
-    return path.parents[1] / "work" / path.stem
-
-
-def commit_of(path: Path) -> str:
-    """The last commit that changed the library, a declaration or the scripts beside it; ``-dirty`` if changed since.
-
-    Where the library is in no repository: its version.
-    """
-    root, path = Path(__file__).parents[2], path.resolve()
-    beside = [str(path), f":(glob){path.parent}/*.py"] if path.is_relative_to(root) else []
-
-    def git(*words: str) -> str:
-        command = ["git", "-C", str(root), *words, "--", "ddco_pyro", "tasks", *beside]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-
-    try:
-        commit, changed = git("log", "-1", "--format=%H")[:10], git("status", "--porcelain")
-    except (OSError, subprocess.CalledProcessError):
-        commit = changed = ""
-    return commit + DIRTY * bool(changed) if commit else version("ddco-pyro")
-
-
 def do(
     path: Path, depends: Mapping[str, Any], work: Callable[[Path], Mapping[str, Any]], code: str = "", **named: Any
 ) -> str:
-    """Do a cell on one thread and keep its results; returns why it failed.
+    """Do a cell on one thread and keep its results in ``path``; returns why it failed.
 
     A cell that another process works on is left to it.
 
-    :param path: of its file.
-    :param work: fields of :class:`Done`; given a folder, which keeps the fits.
-    :param named: what its file says besides.
+    :param work: gives fields of :class:`Done`; its folder keeps the fits.
+    :param named: what the file says besides.
     """
-    began = time.perf_counter()
+    began, folder = time.perf_counter(), path.parents[1] / "work" / path.stem
     try:
-        with only_one(folder := work_of(path)):
+        with only_one(folder):
             if (before := kept(path, depends)) is not None and not before.failed:  # another process has done it
                 return ""
             begun = folder / "code"
@@ -205,14 +111,70 @@ def do(
 
 
 def do_all(calls: Mapping[str, Callable[[], str]], kept: int, workers: Workers, on_event: OnEvent = ignore) -> None:
-    """Make the calls of :func:`do`, by the name of the cell; ``kept`` is the number of other cells, which are done.
-
-    :raises Failed: a process died.
-    """
+    """Make the calls of :func:`do`, by the name of the cell; ``kept`` other cells are done already."""
     on_event(CellsBegan("study", len(calls) + kept, kept))
     with run_all(calls, workers, "did a cell") as done:
         for name, failed in done:
             on_event(CellDone(name, failed))
+
+
+def commit_of(path: Path) -> str:
+    """The last commit that changed library, tasks, ``studies`` or the declaration; ``-dirty`` if changed since.
+
+    ``unknown`` where git knows nothing of the checkout.
+    """
+    path = path.resolve()
+    paths = ["ddco_pyro", "tasks", ":(glob)studies/*.py", *([str(path)] if path.is_relative_to(ROOT) else [])]
+
+    def git(*words: str) -> str:
+        command = ["git", "-C", str(ROOT), *words, "--", *paths]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+    try:
+        return git("log", "-1", "--format=%H")[:10] + DIRTY * bool(git("status", "--porcelain"))
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+
+
+# --- the cells of a declaration ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One method on one task, with a number of demonstrations and a training seed.
+
+    ``part`` is test or development, ``method`` its name in tables, ``of`` that in the declaration, ``point`` one of its
+    grid, and ``place`` that of the training seed in its block.
+    """
+
+    part: str
+    task: str
+    method: str
+    demonstrations: int
+    seed: int
+    of: str = ""
+    point: dict[str, Any] = field(default_factory=dict, hash=False)
+    place: int = 0
+
+    def __str__(self) -> str:
+        return f"{self.task}, {self.method}, {self.demonstrations} demonstrations, seed {self.seed}"
+
+    @property
+    def row(self) -> tuple[str, ...]:
+        """What names the cell in a table."""
+        return self.task, self.method, str(self.demonstrations), str(self.seed)
+
+
+@dataclass(frozen=True)
+class Job:
+    """The work of a cell, for a world's own methods: demonstrations have the masks ``train`` and ``valid``."""
+
+    cell: Cell
+    spec: Spec
+    demos: Demonstrations
+    starts: range
+    folder: Path
+    settings: Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -220,27 +182,13 @@ class State:
     """The cells of a study, and the results of those that are done or have failed."""
 
     cells: Sequence[Cell]
-    results: Mapping[Cell, Done]
-
-    @cached_property
-    def done(self) -> dict[Cell, Done]:
-        """The results of the cells that are done."""
-        return {cell: one for cell, one in self.results.items() if not one.failed}
-
-    @cached_property
-    def failed(self) -> dict[Cell, Done]:
-        """The results of the cells that failed."""
-        return {cell: one for cell, one in self.results.items() if one.failed}
-
-    @cached_property
-    def missing(self) -> list[Cell]:
-        """The cells that are neither done nor failed."""
-        return [cell for cell in self.cells if cell not in self.results]
+    done: Mapping[Cell, Done]
+    failed: Mapping[Cell, Done]
 
     @property
-    def codes(self) -> list[str]:
-        """The commits of the results, each once."""
-        return [*dict.fromkeys(one.code for one in self.results.values())]
+    def missing(self) -> list[Cell]:
+        """The cells that are neither done nor failed."""
+        return [cell for cell in self.cells if cell not in self.done and cell not in self.failed]
 
 
 @dataclass(frozen=True)
@@ -250,8 +198,6 @@ class Folder:
     study: Study
     path: Path
 
-    # --- what there is ------------------------------------------------------------------------------------------------
-
     def cells(self, part: str, chosen: Mapping[str, dict[str, Any]] | None = None) -> list[Cell]:
         """The cells of a part: all of a training seed before another one.
 
@@ -259,12 +205,12 @@ class Folder:
         """
         declared, block = self.study.declared, getattr(self.study.declared.seeds, part)
         return [
-            Cell(part, task, declared.label(method, point, part), count, block.first + place, method, point, place)
+            Cell(part, task, declared.label(name, point, part), count, block.first + place, name, point, place)
             for place in range(block.count)
             for count in declared.demonstrations.counts
-            for task in (part != "test" and declared.choose_on) or self.study.tasks
-            for method in declared.methods
-            for point in ([chosen[method]] if chosen else declared.points(method))
+            for task in (part != "test" and declared.choose_on) or declared.tasks
+            for name, method in declared.methods.items()
+            for point in ([chosen[name]] if chosen else method.points)
         ]
 
     def state(self) -> State:
@@ -280,10 +226,12 @@ class Folder:
         return self._state([*state.cells, *self.cells("test", self.chosen(state))])
 
     def _state(self, cells: Sequence[Cell]) -> State:
-        state = State(cells, {cell: one for cell in cells if (one := self.kept(cell))})
-        if self.study.declared.pinned and len(codes := state.codes) > 1:
+        known = {cell: one for cell in cells if (one := self.kept(cell))}
+        codes = dict.fromkeys(one.code for one in known.values())
+        if self.study.declared.pinned and len(codes) > 1:
             raise BadInput(f"{self.study.path}: pinned: results are of commits {', '.join(codes)}; keep those of one")
-        return state
+        done, failed = ({cell: one for cell, one in known.items() if bool(one.failed) is way} for way in (False, True))
+        return State(cells, done, failed)
 
     def chosen(self, state: State) -> dict[str, dict[str, Any]]:
         """The point of each method with the highest mean over the development cells."""
@@ -321,11 +269,6 @@ class Folder:
         return known
 
     @cached_property
-    def code(self) -> str:
-        """The commit of the code."""
-        return commit_of(self.study.path)
-
-    @cached_property
     def _earlier(self) -> dict[Any, pd.DataFrame]:
         """The rows of the declaration's tables ``kept``, by cell."""
         return dict(iter(earlier(self.study).groupby(CELL)))
@@ -340,8 +283,6 @@ class Folder:
             rows += [(*named, *item, one.key, one.code) for item in values.items() if item[1] is not None]
         return pd.DataFrame(rows, columns=[*COLUMNS, *ORIGIN])
 
-    # --- keys ---------------------------------------------------------------------------------------------------------
-
     def place(self, cell: Cell) -> Path:
         """The file of a cell's results."""
         return self.path / "cells" / f"{self.key(cell)}.json"
@@ -353,124 +294,81 @@ class Folder:
 
     def depends(self, cell: Cell) -> dict[str, Any]:
         """What the results of a cell depend on; ``added`` is what the code adds: defaults, or the template of init."""
-        study, own, block = self.study, self.study.declared.demonstrations, self._block(cell)
-        method, starts = study.declared.methods[cell.of], self._starts(cell)
+        study, method, starts = self.study, self.study.declared.methods[cell.of], self._seeds("starts", cell)
         baseline, given, added = method.baseline, study.changes(cell.of, cell.point), dict[str, Any]()
         if study.base is None:
             added = {"template": hashlib.sha256(TEMPLATE.read_bytes()).hexdigest()[:16]}
         else:
-            spec = with_overrides(study.base, {**given, **self._placed(cell, "demonstrations.hdf5")})
+            spec = with_overrides(study.base, {**given, **_placed(cell, "demonstrations.hdf5")})
             baseline = baseline and named_baselines(spec).get(baseline.name, baseline)
             shown = {"report", "selection", "compare_with"}  # what a result does not depend on
             given, added = (
                 spec.model_dump(mode="json", exclude=shown, exclude_defaults=bare) for bare in (True, False)
             )
-        if study.source is None:
-            drawn = {"task": cell.task, "supervisor": own.supervisor, "first": block.of(cell.place).start,
-                     "train": cell.demonstrations, "held_out": own.held_out}  # fmt: skip
-        else:
-            drawn = {
-                "names": self._divided(cell),
-                "digest": self._digest.model_dump(include={"controls", "observations", "labels"}),
-            }
         return {
             "baseline": baseline and baseline.model_dump(exclude_unset=True, mode="json"),
             "by": method.by,
             "settings": study.settings(cell.of, cell.point),
             "world": study.declared.world,
-            "data": drawn,
+            "data": {
+                "task": cell.task,
+                "supervisor": None,  # keys of earlier results have it
+                "first": self._seeds("demonstrations", cell).start,
+                "train": cell.demonstrations,
+                "held_out": study.declared.demonstrations.held_out,
+            },
             "seed": cell.seed,
             "starts": [*starts[:1], len(starts)],
             "given": given,
             "added": added,
         }
 
-    def _block(self, cell: Cell) -> Any:
-        return getattr(self.study.declared.demonstrations, cell.part)
-
-    def _starts(self, cell: Cell) -> range:
-        starts = self.study.declared.starts
-        return range(0) if starts is None else getattr(starts, cell.part).of(cell.place)  # type: ignore[no-any-return]
-
-    @cached_property
-    def _digest(self) -> Digest:
-        """The digest of the file of demonstrations; pictures are read once."""
-        known = recorded(self.path)
-        found = digest(Demonstrations.read(str(self.study.source)), known)
-        if known != found and self.path.exists():
-            write_text(self.path / "demonstrations.json", found.model_dump_json(indent=1) + "\n")
-        return found
-
-    @cached_property
-    def _names(self) -> list[str]:
-        """The demonstrations in the study's file, in natural order."""
-        with open_source(str(self.study.source)) as source:
-            return sorted(source.names, key=natural)
-
-    def _divided(self, cell: Cell, names: Sequence[str] = ()) -> tuple[list[str], list[str]]:
-        """The names of the training and of the held-out demonstrations of a cell.
-
-        From a study's file they are drawn by the training seed; recorded ones are taken in their order. A seed's
-        demonstrations are among those that the seed has where there are more of them.
-
-        :param names: of recorded demonstrations.
-        :raises BadInput: there are too few demonstrations.
-        """
-        own, block, count = self.study.declared.demonstrations, self._block(cell), cell.demonstrations
-        if self.study.source is not None:
-            there = self._names if block is None else self._names[block.first : block.first + block.count]
-            if len(there) < (needed := own.held_out + max(own.counts)):
-                raise BadInput(
-                    f"{self.study.source}: has {len(there)} demonstrations for {cell.part}, but the study needs "
-                    f"{needed}; lower demonstrations.counts or held_out"
-                )
-            names = [there[n] for n in np.random.default_rng(cell.seed).permutation(len(there))]
-        train, valid = names[own.held_out : own.held_out + count], names[: own.held_out]
-        return sorted(train, key=natural), sorted(valid, key=natural)
+    def _seeds(self, key: str, cell: Cell) -> range:
+        """The seeds of a cell's ``demonstrations`` or ``starts``."""
+        block = getattr(getattr(self.study.declared, key), cell.part, None)
+        return range(0) if block is None else block.of(cell.place)  # type: ignore[no-any-return]
 
     # --- the work -----------------------------------------------------------------------------------------------------
 
     def run(self, workers: Workers, on_event: OnEvent = ignore) -> State:
         """Do all cells that are not done; failed ones are tried again. Returns the state afterwards.
 
-        :raises BadInput: the file of demonstrations, the adapter or a task cannot be used; a pinned study's code has
-            changes that are not committed, or other results are of another commit.
+        :raises BadInput: the world cannot be used; a pinned study's code has changes that are not committed, or other
+            results are of another commit.
         :raises Failed: a process died.
         """
         self.study.world()  # or something is wrong with it
-        if self.study.declared.pinned and self.code.endswith(DIRTY):
-            commit = self.code.removesuffix(DIRTY)
-            raise BadInput(f"{self.study.path}: pinned: the code has changes since {commit}; commit them")
+        code, state, tried = commit_of(self.study.path), self.state(), set[Cell]()
+        if self.study.declared.pinned:
+            self._check_code(code, state)
         compile_all()
         self.path.mkdir(parents=True, exist_ok=True)
-        there = Folder(replace(self.study, path=self.study.path.resolve()), self.path.resolve())  # wherever workers are
-        vars(there)["code"] = self.code  # of when the run began
-        state, tried = self.state(), set[Cell]()
-        if (
-            self.study.declared.pinned
-            and len(state.done) < len(state.cells)
-            and (others := [*{*state.codes} - {self.code}])
-        ):
-            raise BadInput(
-                f"{self.study.path}: pinned: results are of commit {others[0]}, here is {self.code}; run it at that "
-                "commit, or remove them"
-            )
         with processes(workers.number(len(state.cells))):
             while cells := [cell for cell in state.cells if cell not in state.done and cell not in tried]:
-                calls = {str(cell): partial(there.do, cell) for cell in cells}
+                calls = {str(cell): partial(self.do, cell, code) for cell in cells}
                 do_all(calls, len(state.done), workers, on_event)
                 tried |= {*cells}
                 state = self.state()  # development, once done, adds the cells of the test
         return state
 
-    def do(self, cell: Cell) -> str:
+    def _check_code(self, code: str, state: State) -> None:
+        """:raises BadInput: cells of a pinned study cannot be done at this commit."""
+        pinned, others = f"{self.study.path}: pinned:", {one.code for one in state.done.values()} - {code}
+        if code.endswith(DIRTY):
+            raise BadInput(f"{pinned} the code has changes since {code.removesuffix(DIRTY)}; commit them")
+        if others and len(state.done) < len(state.cells):
+            raise BadInput(
+                f"{pinned} results are of commit {others.pop()}, here is {code}; run it at that commit, or remove them"
+            )
+
+    def do(self, cell: Cell, code: str) -> str:
         """Do a cell, as :func:`do` does."""
-        return do(self.place(cell), self.depends(cell), partial(self._measured, cell), self.code, cell=asdict(cell))
+        return do(self.place(cell), self.depends(cell), partial(self._measured, cell), code, cell=asdict(cell))
 
     def _measured(self, cell: Cell, folder: Path) -> dict[str, Any]:
         """The measures of a cell."""
-        study, starts, world = self.study, self._starts(cell), self.study.world()
-        spec, demos = self._prepared(cell, world)
+        study, starts, world = self.study, self._seeds("starts", cell), self.study.world()
+        spec, demos = self._prepared(cell, self._recorded(cell, world))
         if (by := study.declared.methods[cell.of].by) is not None:
             job = Job(cell, spec, demos, starts, folder, study.settings(cell.of, cell.point))
             return {"values": dict(world.methods[by](job))}
@@ -480,25 +378,34 @@ class Folder:
         if spec.hierarchy and found and found.valid and (own := found.valid[0]):  # of the lowest level
             values |= {name: getattr(own, name) for name in UNMATCHED}
             values |= {name: getattr(own.matched_globally, name) for name in MATCHED}
-        if starts and world is not None:
-            values |= _means(world.play(cell.task, fitted, starts, folder))
-        elif starts:
-            episodes = run_episodes(cell.task, fitted.controller(), starts, 0, 1, spec.observed, ())
-            values |= _means([episode.outcome for episode in episodes])
+        if starts:  # an outcome that does not apply to an episode is NaN
+            means = pd.DataFrame(list(world.play(cell.task, fitted, starts, folder))).mean()
+            values |= {str(name): None if math.isnan(mean) else mean for name, mean in means.items()}
         return {"values": values, "converged": fitted.metrics.training.converged}
 
-    def _prepared(self, cell: Cell, world: World | None) -> tuple[Spec, Demonstrations]:
-        """The spec of a cell and its demonstrations, which are recorded first where they are not there."""
-        study, base = self.study, self.study.base
-        file = study.source or self._recorded(cell, world)
+    def _recorded(self, cell: Cell, world: Any) -> Path:
+        """The recorded demonstrations of a task and training seed, the same for all methods and numbers."""
+        own, seeds = self.study.declared.demonstrations, self._seeds("demonstrations", cell)
+        count = own.held_out + max(own.counts)
+        task = cell.task.replace(":", "-").replace("/", "-")
+        path = self.path / "demonstrations" / f"{task}-{seeds.start}-{count}.hdf5"
+        with only_one(self.path / "work" / path.stem, wait=True):
+            if not path.exists():
+                path.parent.mkdir(parents=True, exist_ok=True)
+                world.collect(cell.task, seeds, count, path)
+        return path
+
+    def _prepared(self, cell: Cell, file: Path) -> tuple[Spec, Demonstrations]:
+        """The spec of a cell and its demonstrations: the first ones of the file are held out, those after train."""
+        study, held_out = self.study, self.study.declared.demonstrations.held_out
         with open_source(file) as source:
             names = sorted(source.names, key=natural)
-        train, valid = self._divided(cell, names)
-        unused = [name for name in names if name not in {*train, *valid}]
-        if base is None:
+        valid, rest = names[:held_out], names[held_out:]
+        train, unused = rest[: cell.demonstrations], rest[cell.demonstrations :]
+        if (base := study.base) is None:
             facts = replace(inspect(file, exclude=[*valid, *unused]), excluded=(), masks={})  # no others are shown
             base = parse_spec(read_yaml(starting_spec(facts, file).text))
-        placed = self._placed(cell, study.declared.demonstrations.path or file.relative_to(self.path).as_posix())
+        placed = _placed(cell, file.relative_to(self.path).as_posix())
         spec = with_overrides(base, {**study.changes(cell.of, cell.point), **placed})
         reading = {"demonstrations.path": str(file), "demonstrations.exclude": unused}
         demos = data.demonstrations(with_overrides(spec, reading))
@@ -512,30 +419,8 @@ class Folder:
                 raise SpecError(*(f"methods.{cell.of}.{problem}" for problem in error.problems)) from error
         return with_overrides(spec, {"compare_with": []}), demos
 
-    def _placed(self, cell: Cell, path: str) -> dict[str, Any]:
-        """What a spec says of a cell's data, by key path. The path is relative: the study's folder may move."""
-        own = {"path": path, "exclude": [], "count": max(2, cell.demonstrations), "seed": 0}
-        changes = {f"demonstrations.{key}": value for key, value in own.items()}
-        task = {"task": cell.task} if cell.task and self.study.declared.world is None else {}
-        return changes | {"training.seed": None, "seed": cell.seed} | task
 
-    def _recorded(self, cell: Cell, world: World | None) -> Path:
-        """The recorded demonstrations of a task and training seed, the same for all methods and numbers."""
-        own, base = self.study.declared.demonstrations, self.study.base
-        seeds, count = self._block(cell).of(cell.place), own.held_out + max(own.counts)
-        path = self.path / "demonstrations" / f"{cell.task.replace(':', '-')}-{seeds.start}-{count}.hdf5"
-        if world is None:
-            wanted, observed = (base.demonstrations, base.observed) if base else (DemonstrationsSpec(), [])
-            how = {"count": count, "seed": seeds.start, "supervisor": own.supervisor or wanted.supervisor}
-            return collect(wanted.task or cell.task, wanted.model_copy(update=how), path, observed=observed)
-        with only_one(self.path / "work" / path.stem, wait=True):
-            if not path.exists():
-                path.parent.mkdir(parents=True, exist_ok=True)
-                world.collect(cell.task, seeds, count, path)
-        return path
-
-
-def _means(played: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
-    """The mean of each outcome over the episodes to which it applies (is no NaN)."""
-    means = pd.DataFrame(list(played)).mean()
-    return {str(name): None if math.isnan(mean) else mean for name, mean in means.items()}
+def _placed(cell: Cell, path: str) -> dict[str, Any]:
+    """What a spec says of a cell's data, by key path. The path is relative: the study's folder may move."""
+    own = {"path": path, "exclude": [], "count": max(2, cell.demonstrations), "seed": 0}
+    return {f"demonstrations.{key}": value for key, value in own.items()} | {"training.seed": None, "seed": cell.seed}
