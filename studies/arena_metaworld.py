@@ -108,8 +108,7 @@ def collect(
         steps = demonstrate(world, expert, phases, seed, noise)
         return steps and recorded(steps)
 
-    labels, about = {"phase": len(phases.lines)}, {"noise": noise, "lines": phases.lines}
-    arena_recording.collect(out, f"metaworld/{task}", demonstration, number, held_out, labels, first, attempts, **about)
+    arena_recording.collect(out, f"metaworld/{task}", demonstration, number, held_out, first, attempts)
 
 
 def recorded(steps: list[Step]) -> Recorded:

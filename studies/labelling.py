@@ -81,10 +81,6 @@ class LabellingCell(Cell):
         """Of its files."""
         return f"{self.task}-{self.order.replace(' ', '_')}-{self.orders}-{self.seed}"
 
-    def depends(self, settings: Settings) -> dict[str, Any]:
-        """What decides its results; the place of the data does not."""
-        return {"task": self.task, "order": self.order, "orders": self.orders, "seed": self.seed} | settings.kept()
-
     @property
     def target(self) -> float:
         """The share of right steps that is asked for."""

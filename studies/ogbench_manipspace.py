@@ -91,8 +91,7 @@ class Collector:
         kinds = dict.fromkeys(target.split()[0] for target in self.targets)
         counts = [ORACLES[kind][1] for kind in kinds]
         self.first = dict(zip(kinds, np.cumsum([0, *counts]).tolist(), strict=False))
-        values = {"phase": sum(counts), "object": len(self.targets)}
-        self.labels = {name: values[name] for name in labels}
+        self.labels = labels
         self.oracles = {kind: announcing(kind, self.env) for kind in kinds}
         self.task, self.noise, self.goal = task, noise, goal
 
@@ -183,11 +182,8 @@ def main() -> None:
         seeds = range(first, first + own.episodes)
         return play_all(Goals(own.task), own.out, named_controllers(own.controllers), seeds)
     collector = Collector(own.task, own.noise, bool(own.goal), own.labels)
-    about = {"noise": own.noise, "objects": collector.targets}
-    arena_recording.collect(
-        own.out, f"{own.task}-v0", collector.episode, own.number, own.held_out, collector.labels, first, own.attempts,
-        **about,
-    )  # fmt: skip
+    about = own.number, own.held_out, first, own.attempts
+    arena_recording.collect(own.out, f"{own.task}-v0", collector.episode, *about)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Phases and objects of OGBench's manipulation tasks: options, with and without labels, beside what else segments.
 
     python -m studies.ogbench_segments [--tasks cube-single scene ...] [--levels phase object] [--labelled 0 1 3]
-        [--seeds 3] [--noise 0.0] [--jobs 2] [--summarize]
+        [--seeds 3] [--noise 0.0] [--jobs 2]
 
 The demonstrations are those of OGBench's own scripted oracles (Park and others, 2025), recorded in an environment of
 its own from ``ogbench_requirements.txt`` by ``ogbench_manipspace.py``, which says what labels are. ``phase`` is what an
