@@ -49,9 +49,10 @@ def done(own: argparse.Namespace) -> str:
     lines = [f"failed, {n} cells: {why}" for why, n in Counter(one.failed for one in state.failed.values()).items()]
     missing = Counter(f"{cell.part}, {cell.method}" for cell in state.missing)
     lines += [f"missing, {n} cells: {named}" for named, n in missing.items()]
+    lines.append(f"{len(state.done)} of {len(state.cells)} cells are done")
     if own.action == "run" and state.failed:
-        lines.append("the same command tries failed cells again")
-    return "\n".join([*lines, f"{len(state.done)} of {len(state.cells)} cells are done"])
+        raise Failed("\n".join([*lines, "the same command tries failed cells again"]))
+    return "\n".join(lines)
 
 
 def main() -> None:

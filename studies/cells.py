@@ -1,8 +1,6 @@
 """Cells of a study: one fit each, with its rollouts, kept as soon as it is done.
 
-The folder of a study holds ``cells/KEY.json`` (the results), ``work/KEY`` (the fit) and ``demonstrations`` (recorded
-episodes). A key is a digest of what the declaration says of the cell. Nothing in the folder depends on its place, so
-another machine can go on with a copy.
+The folder of a study holds results (``cells/KEY.json``), fits (``work/KEY``) and ``demonstrations``. It may be moved.
 """
 
 from __future__ import annotations
@@ -48,15 +46,8 @@ FAILED, RISING, DIRTY = "failed", "not converged", "-dirty"
 """Measures, 1, of cells that failed and of fits that have not converged; a commit with later changes."""
 
 
-# --- any cell, of a declaration or of a script ------------------------------------------------------------------------
-
-
 class Done(Record):
-    """The results of a cell, as its file has them.
-
-    ``key`` is a digest of what the declaration says of it, ``depends`` all that decides its results, and ``code`` the
-    commit that gave them. ``values`` are by measure, or it failed for the reason ``failed``.
-    """
+    """The results of a cell by measure, or why it failed; all that decides them, and the commit that gave them."""
 
     depends: dict[str, Any] = Field(default={})
     values: dict[str, Any] = Field(default={})
@@ -68,10 +59,7 @@ class Done(Record):
 
 
 def kept(path: Path, depends: Mapping[str, Any] | None) -> Done | None:
-    """The results in a cell's file, if they depend on the same; with None in any case.
-
-    :raises Damaged: the file is damaged.
-    """
+    """The results in a cell's file, if they depend on the same; with None in any case."""
     if not path.exists():
         return None
     done = read_record(path, Done, "remove it and run the study again: this cell alone is done anew")
@@ -81,12 +69,9 @@ def kept(path: Path, depends: Mapping[str, Any] | None) -> Done | None:
 def do(
     path: Path, depends: Mapping[str, Any], work: Callable[[Path], Mapping[str, Any]], code: str = "", **named: Any
 ) -> str:
-    """Do a cell on one thread and keep its results in ``path``; returns why it failed.
-
-    A cell that another process works on is left to it.
+    """Do a cell on one thread, unless another process does, and keep its results in ``path``; returns why it failed.
 
     :param work: gives fields of :class:`Done`; its folder keeps the fits.
-    :param named: what the file says besides.
     """
     began, folder = time.perf_counter(), path.parents[1] / "work" / path.stem
     try:
@@ -119,10 +104,7 @@ def do_all(calls: Mapping[str, Callable[[], str]], kept: int, workers: Workers, 
 
 
 def commit_of(path: Path) -> str:
-    """The last commit that changed library, tasks, ``studies`` or the declaration; ``-dirty`` if changed since.
-
-    ``unknown`` where git knows nothing of the checkout.
-    """
+    """The last commit that changed library, tasks, ``studies`` or the declaration; ``-dirty`` if changed since."""
     path = path.resolve()
     paths = ["ddco_pyro", "tasks", ":(glob)studies/*.py", *([str(path)] if path.is_relative_to(ROOT) else [])]
 
@@ -136,15 +118,11 @@ def commit_of(path: Path) -> str:
         return "unknown"
 
 
-# --- the cells of a declaration ---------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Cell:
-    """One method on one task, with a number of demonstrations and a training seed.
+    """One method on one task, with a number of demonstrations and a training seed, in the test or the development.
 
-    ``part`` is test or development, ``method`` its name in tables, ``of`` that in the declaration, ``point`` one of its
-    grid, and ``place`` that of the training seed in its block.
+    ``method`` is its name in tables, ``of`` that in the declaration, and ``place`` that of the seed in its block.
     """
 
     part: str
@@ -199,10 +177,7 @@ class Folder:
     path: Path
 
     def cells(self, part: str, chosen: Mapping[str, dict[str, Any]] | None = None) -> list[Cell]:
-        """The cells of a part: all of a training seed before another one.
-
-        :param chosen: the point of the grid of each method; None for all points.
-        """
+        """The cells of a part, with all points of the grid or the chosen ones; a training seed before another."""
         declared, block = self.study.declared, getattr(self.study.declared.seeds, part)
         return [
             Cell(part, task, declared.label(name, point, part), count, block.first + place, name, point, place)
@@ -214,11 +189,7 @@ class Folder:
         ]
 
     def state(self) -> State:
-        """The state of all cells; those of the test are unknown until development has chosen the points.
-
-        :raises Damaged: the file of a cell is damaged.
-        :raises BadInput: the study is pinned, and results are of several commits or of other settings.
-        """
+        """The state of all cells; those of the test are unknown until development has chosen the points."""
         choose = self.study.declared.choose
         state = self._state(self.cells(PARTS[choose is not None]))
         if not choose or state.missing or (state.failed and choose not in self.study.declared.failed):
@@ -260,12 +231,9 @@ class Folder:
             known = Done(values=values, key=key, code=code, failed=failed, converged=converged)
         if known is None or known.failed:  # such a cell is tried again
             known = kept(self.place(cell), None if pinned else self.depends(cell)) or known
-        if known and pinned and known.key != self.key(cell):
-            there, here = known.key or "unknown", self.key(cell)
-            raise BadInput(
-                f"{self.study.path}: pinned: {cell}: was done with key {there}, here is {here}; go back to what was "
-                "declared then, or remove its results"
-            )
+        if known and pinned and known.key != (here := self.key(cell)):
+            text = f"was done with key {known.key or 'unknown'}, here is {here}; go back to what was declared then, or"
+            raise BadInput(f"{self.study.path}: pinned: {cell}: {text} remove its results")
         return known
 
     @cached_property
@@ -274,7 +242,7 @@ class Folder:
         return dict(iter(earlier(self.study).groupby(CELL)))
 
     def table(self, state: State) -> pd.DataFrame:
-        """The declared measures of all cells, tidy; methods of the development name their points."""
+        """The declared measures of all cells, tidy."""
         rows = []
         for cell, one in self.counted(state).items():
             values = {measure: one.values.get(measure) for measure in self.study.declared.measures}
@@ -328,19 +296,14 @@ class Folder:
         block = getattr(getattr(self.study.declared, key), cell.part, None)
         return range(0) if block is None else block.of(cell.place)  # type: ignore[no-any-return]
 
-    # --- the work -----------------------------------------------------------------------------------------------------
-
     def run(self, workers: Workers, on_event: OnEvent = ignore) -> State:
         """Do all cells that are not done; failed ones are tried again. Returns the state afterwards.
 
-        :raises BadInput: the world cannot be used; a pinned study's code has changes that are not committed, or other
-            results are of another commit.
-        :raises Failed: a process died.
+        :raises BadInput: the world cannot be used, or a pinned study's results would be of several commits.
         """
         self.study.world()  # or something is wrong with it
         code, state, tried = commit_of(self.study.path), self.state(), set[Cell]()
-        if self.study.declared.pinned:
-            self._check_code(code, state)
+        self._check_code(code, state)
         compile_all()
         self.path.mkdir(parents=True, exist_ok=True)
         with processes(workers.number(len(state.cells))):
@@ -352,14 +315,14 @@ class Folder:
         return state
 
     def _check_code(self, code: str, state: State) -> None:
-        """:raises BadInput: cells of a pinned study cannot be done at this commit."""
-        pinned, others = f"{self.study.path}: pinned:", {one.code for one in state.done.values()} - {code}
-        if code.endswith(DIRTY):
-            raise BadInput(f"{pinned} the code has changes since {code.removesuffix(DIRTY)}; commit them")
-        if others and len(state.done) < len(state.cells):
-            raise BadInput(
-                f"{pinned} results are of commit {others.pop()}, here is {code}; run it at that commit, or remove them"
-            )
+        pinned, others = self.study.declared.pinned, {one.code for one in state.done.values()} - {code}
+        if pinned and code.endswith(DIRTY):
+            text = f"the code has changes since {code.removesuffix(DIRTY)}; commit them"
+        elif pinned and others and len(state.done) < len(state.cells):
+            text = f"results are of commit {others.pop()}, here is {code}; run it at that commit, or remove them"
+        else:
+            return
+        raise BadInput(f"{self.study.path}: pinned: {text}")
 
     def do(self, cell: Cell, code: str) -> str:
         """Do a cell, as :func:`do` does."""

@@ -1,8 +1,4 @@
-"""The declaration of a study: methods, data, blocks of seeds, measures, and the contrasts that decide.
-
-A block of ``seeds`` has the training seeds. Each of them has demonstrations and starts of its own, which follow one
-another in the blocks of ``demonstrations`` and ``starts``. ``docs/studies.md`` says what each key is.
-"""
+"""The declaration of a study: ``docs/studies.md`` says what each key is."""
 
 from __future__ import annotations
 
@@ -229,10 +225,7 @@ class Study:
 
     @classmethod
     def load(cls, path: Path) -> Study:
-        """Read a declaration and check the spec of every method.
-
-        :raises SpecError: the declaration or a spec is invalid; one line for each problem.
-        """
+        """Read a declaration and check the spec of every method; raises SpecError, one line for each problem."""
         try:
             declared = Declaration.model_validate(read_mapping(path, "study"))
         except ValidationError as error:
@@ -263,10 +256,7 @@ class Study:
         return {} if own.by is None else {**own.overrides, **point}
 
     def world(self) -> Any:
-        """The simulator of the study (``docs/studies.md``).
-
-        :raises BadInput: it cannot be imported, or lacks a method.
-        """
+        """The simulator of the study; raises BadInput if it cannot be imported, or lacks a method."""
         try:
             world = resolve_name(f"studies.{self.declared.world}")
         except Exception as error:  # whatever the world's code raises

@@ -67,10 +67,7 @@ SHOWN: dict[str, Callable[[Estimate, str], str]] = {
 
 
 def render(text: str) -> str:
-    """A page's text with its generated tables as the results have them.
-
-    :raises BadInput: there is no such table or number.
-    """
+    """A page's text with its generated tables as the results have them; raises BadInput if one is not there."""
     numbers, templates = Numbers(), {match.groups(): template(*match.groups()) for match in BLOCK.finditer(text)}
     for one in templates.values():
         NUMBER.sub(numbers.shown, one)  # finds the families of differences
@@ -95,10 +92,7 @@ def template(place: str, name: str) -> str:
 
 @dataclass
 class Numbers:
-    """The numbers of a page, the families of their differences, and the verdicts on them.
-
-    The verdicts of ``STUDY.yaml`` are those on its primary contrasts, and it has no families.
-    """
+    """The numbers of a page, families of differences in ``.csv`` files, and verdicts on these and primary contrasts."""
 
     tables: dict[str, tuple[Study | None, pd.DataFrame]] = field(default_factory=dict)
     families: dict[Any, dict[Any, Estimate]] = field(default_factory=lambda: defaultdict(dict))
@@ -173,68 +167,45 @@ class Numbers:
         return f"**{text}**" if show in ("interval", "±") and verdict in (HOLDS, FAILS) else text
 
 
-# --- the report of a study --------------------------------------------------------------------------------------------
-
-
 def report(folder: Folder, state: State) -> str:
-    """Write ``table.csv`` into the folder of a study; returns its contrasts, means and cells as Markdown.
+    """Write ``table.csv`` into the folder of a study; returns its contrasts and means as Markdown.
 
-    :raises BadInput: no cell is done, or no cell has a declared measure.
+    :raises BadInput: no cell has a declared measure.
     """
-    study, table = folder.study, folder.table(state)
-    if table.empty:
-        raise BadInput(f"{folder.path}: no cell is done; do some with: python -m studies run {study.path}")
-    for measure in study.declared.measures:
-        if measure not in {*table.measure}:
-            there = sorted({name for done in state.done.values() for name in done.values})
-            text = f"{study.path}: measures: no cell has {measure!r}{nearest(measure, there)}; there is: "
-            raise BadInput(text + ", ".join(there))
+    study, declared, table = folder.study, folder.study.declared, folder.table(state)
+    there = sorted({name for one in state.done.values() for name in one.values}) or ["no cell that is done"]
+    for measure in {*declared.measures} - {*table.measure}:
+        text = f"{study.path}: measures: no cell has {measure!r}{nearest(measure, there)}; there is: "
+        raise BadInput(text + ", ".join(there))
     write_text(folder.path / "table.csv", table.to_csv(index=False, lineterminator="\n", float_format="%.9g"))
-    parts = [f"# Study {study.name}\n\n{study.declared.question}", _contrasts(study, table), _means(study, table)]
-    return "\n\n".join([*filter(None, parts), *cells(folder, state)])
-
-
-def _contrasts(study: Study, table: pd.DataFrame) -> str:
-    """A table of the primary contrasts and their verdicts."""
-    rows = []
+    contrasts, means = list[list[str]](), list[list[str]]()
     for one in tested(study, table):
-        (low, high), known = one.spec.bounds, one.estimate
-        if known is None:
-            continue
-        where = f"above {words.signed(low)}" if high == math.inf else f"within ±{high:g}"
-        facts = [one.spec.contrast, name_of(one.spec.measure), str(one.demonstrations), one.verdict, where]
-        p = "–" if one.verdict == NOT_TESTED else words.p_value(one.adjusted)
-        middle, ends = known.median
-        rows.append([*facts, shown(known, "+.2f"), _between(middle, ends, "+.2f"), p])
-    adjusted = "p (Holm)" if study.declared.correction == "holm" else "p (in order)"
-    head = ["contrast", "measure", "demos", "verdict", "has to lie", "mean [95 % t]", "median [95 %]", adjusted]
-    return Table(head, rows, {0, 1, 3}).markdown() if rows else ""
+        if (known := one.estimate) is not None:
+            facts = [one.spec.contrast, name_of(one.spec.measure), str(one.demonstrations), one.spec.kind, one.verdict]
+            p = "–" if one.verdict == NOT_TESTED else words.p_value(one.adjusted)
+            contrasts.append([*facts, shown(known, "+.2f"), SHOWN["median"](known, "+.2f"), p])
+    for count, method in product(declared.demonstrations.counts, declared.methods):
+        own = [estimated(study, table, method, measure, [count]) for measure in declared.measures]
+        means.append([str(count), method, *(shown(known) if known else "–" for known in own)])
+    head = ["contrast", "measure", "demonstrations", "kind", "verdict", "mean [95 % t]", "median [95 %]", "adjusted p"]
+    tables = [Table(head, contrasts, {0, 1, 3, 4}).markdown()] if contrasts else []
+    tables.append(Table(["demonstrations", "method", *map(name_of, declared.measures)], means, {1}).markdown())
+    return "\n\n".join([f"# Study {study.name}", declared.question, *tables, *_cells(folder, state)])
 
 
-def _means(study: Study, table: pd.DataFrame) -> str:
-    """A table of the means of every method."""
-    rows, measures = [], study.declared.measures
-    for count, method in product(study.declared.demonstrations.counts, study.declared.methods):
-        known = [estimated(study, table, method, measure, [count]) for measure in measures]
-        rows.append([str(count), method, *(shown(one) if one else "–" for one in known)])
-    return Table(["demonstrations", "method", *map(name_of, measures)], rows, {1}).markdown()
-
-
-def cells(folder: Folder, state: State) -> list[str]:
-    """The cells of the test that failed or are missing, the commits, fits that still rise, and the chosen points."""
+def _cells(folder: Folder, state: State) -> list[str]:
+    """Cells of the test that failed, commits, fits that still rise, and the chosen points."""
     declared, tests = folder.study.declared, [cell for cell in state.cells if cell.part == "test"]
     done = {cell: state.done[cell] for cell in tests if cell in state.done}
-    failed, count = sum(cell in state.failed for cell in tests), len(tests)
-    as_failed = ", ".join(f"{measure} {value:g}" for measure, value in declared.failed.items())
-    codes = ", ".join(f"{code} ({n} cells)" for code, n in Counter(one.code for one in done.values()).items() if code)
+    as_failed = ", ".join(f"{measure} {value:g}" for measure, value in declared.failed.items()) or "nothing"
+    failed, codes = sum(cell in state.failed for cell in tests), Counter(one.code for one in done.values() if one.code)
     rising = Counter(cell.method for cell, result in done.items() if not result.converged)
-    fits = ", ".join(f"{number} of {method}" for method, number in rising.items())
-    chosen = ", ".join(dict.fromkeys(declared.label(cell.of, cell.point, "") for cell in tests if cell.point))
-    lines = {
-        f"The points with the highest {declared.choose} on the development seeds: {chosen}.": chosen,
-        f"{failed} of {count} cells failed. They count {as_failed}; other pairs are left out.": failed and as_failed,
-        f"{count - len(done)} of {count} cells are failed or missing.": count > len(done),
-        f"Code: {codes}.": codes,
-        f"Fits that have not converged: {fits}. More epochs may change their results.": fits,
-    }
-    return [line for line, whether in lines.items() if whether]
+    chosen = dict.fromkeys(declared.label(cell.of, cell.point, "") for cell in tests if cell.point)
+    return [
+        f"{len(done)} of {len(tests)} cells are done, {failed} of {len(tests)} cells failed. They count {as_failed}.",
+        f"Code: {', '.join(f'{code} ({count} cells)' for code, count in codes.items())}.",
+        f"Fits that have not converged: {', '.join(f'{n} of {name}' for name, n in rising.items()) or 'none'}.",
+        *[f"The points with the highest {declared.choose} on the development seeds: {', '.join(chosen)}."][
+            : len(chosen)
+        ],
+    ]

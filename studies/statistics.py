@@ -18,8 +18,7 @@ from ddco_pyro.statistics import CONFIDENCE, mean_interval, rate, t_quantile
 from studies.declaration import ContrastSpec, Study
 
 COLUMNS = ["study", "task", "method", "demonstrations", "seed", "measure", "value"]
-"""All but ``value`` are text. ``demonstrations`` is empty where a number does not depend on them. ``seed`` may name
-other repetitions, and is empty where there is one value."""
+"""All but ``value`` are text. ``demonstrations`` and ``seed`` are empty where a number does not depend on them."""
 
 CELL = COLUMNS[1:5]
 """The columns that name a cell."""
@@ -45,10 +44,7 @@ def read_tidy(path: Path) -> pd.DataFrame:
 
 
 def earlier(study: Study) -> pd.DataFrame:
-    """The rows of a declaration's tables ``kept``, by the names of the declaration.
-
-    Rows of other cells, and of several seeds together, are left out. The first of several values decides.
-    """
+    """The rows of a declaration's tables ``kept``, by its names; the first of several values decides."""
     seeds = [str(seed) for block in study.declared.ranges("seeds").values() for seed in block]
     tables = [pd.DataFrame(columns=[*COLUMNS, *ORIGIN])]
     for kept in study.declared.kept:
@@ -64,10 +60,7 @@ def earlier(study: Study) -> pd.DataFrame:
 
 
 def values(table: pd.DataFrame, what: str, measure: str, counts: Sequence[str | int], task: str | None) -> pd.Series:
-    """The values of a method, or the paired differences of ``ours - theirs``, indexed by ``task`` and ``seed``.
-
-    A second number of demonstrations among ``counts`` is that of ``theirs``.
-    """
+    """The values of a method, or paired differences ``ours - theirs``, by ``task`` and ``seed``; ``counts`` of both."""
     table = table[(table.measure == measure) & (table.task.eq(task) if task is not None else True)]
 
     def of(method: str, count: str | int) -> pd.Series:
@@ -84,10 +77,9 @@ def values(table: pd.DataFrame, what: str, measure: str, counts: Sequence[str | 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean over tasks of means over seeds, its standard error and its 95 % t interval.
+    """A mean over tasks of means over seeds, its standard error and 95 % t interval; without spread these are NaN.
 
-    Without spread, error and interval are NaN. ``units`` are the means of the tasks or of their families, or the values
-    of the seeds of a single one.
+    ``units`` are the means of the tasks or of their families, or the values of the seeds of a single one.
     """
 
     value: float
@@ -103,10 +95,7 @@ class Estimate:
         return middle, (float(ends.low), float(ends.high))
 
     def p_value(self, low: float, high: float = math.inf) -> float:
-        """The larger p-value of two one-sided t tests, of "the mean is at most ``low``" and of "at least ``high``".
-
-        NaN without a standard error. One minus it is the p-value of the contrary claim.
-        """
+        """The larger p-value of two one-sided t tests, of "the mean is at most ``low``" and of "at least ``high``"."""
         freedom = len(self.units) - 1
         below, above = t.sf((self.value - low) / self.error, freedom), t.cdf((self.value - high) / self.error, freedom)
         return float(max(below, above))

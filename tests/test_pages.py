@@ -15,6 +15,7 @@ from scipy import stats
 
 from ddco_pyro.errors import BadInput
 from studies import page
+from studies.__main__ import main
 from studies.statistics import COLUMNS, estimate, verdicts
 
 ROOT = Path(__file__).parents[1]
@@ -181,6 +182,39 @@ def test_a_declaration_names_methods_and_measures_its_own_way(rendered, tmp_path
     study = STUDY | {"kept": kept, "methods": methods, "demonstrations": demonstrations, "starts": starts}
     (tmp_path / "study.yaml").write_text(yaml.safe_dump(study | {"measures": ["points"]}))
     assert rendered("{study.yaml: mine; points; 10; show=mean}") == "4.00"
+
+
+def test_the_command_renders_checks_and_refuses_in_one_line(rendered, tmp_path, monkeypatch, capsys):
+    rendered("| {hand.csv: one; goals; 10} |")
+    path = tmp_path / "page.md"
+    path.write_text("<!-- table: mine/own -->\n<!-- end -->\n")
+
+    def run(*words):
+        monkeypatch.setattr("sys.argv", ["studies", *map(str, words)])
+        try:
+            main()
+        except SystemExit as ended:
+            return ended.code, capsys.readouterr().err
+        return 0, capsys.readouterr().out
+
+    status, said = run("render", "--check", path)
+    assert (status, said) == (1, f"{path}: differs from the results; write it with: python -m studies render {path}\n")
+    assert run("render", path) == run("render", "--check", path) == (0, "1 pages agree with the results\n")
+    assert "| 4.00 [2.70, 5.30] |" in path.read_text()
+    for words, text in (
+        (("status", tmp_path / "none.yaml"), "none.yaml: cannot be read"),
+        (("status", path, path), "one study at a time"),
+        (("render", tmp_path), "is missing; check the path"),
+    ):
+        status, said = run(*words)
+        assert (status, said.count("\n")) == (2, 1)
+        assert text in said
+    status, said = run("status", ROOT / "studies" / "bins.yaml", "--out", tmp_path / "out")
+    assert (status, said) == (0, "9 of 9 cells are done\n")
+    status, said = run("report", ROOT / "studies" / "bins.yaml", "--out", tmp_path / "out")
+    assert status == 0
+    assert "| options - mixture | Success | 60 | superiority | inconclusive | −" in said
+    assert (tmp_path / "out" / "table.csv").read_text().startswith(",".join(COLUMNS))
 
 
 # --- the pages of the project -----------------------------------------------------------------------------------------

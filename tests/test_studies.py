@@ -397,7 +397,7 @@ def test_a_failed_cell_counts_what_is_declared(made, monkeypatch, tmp_path):
     rows = read_tidy(folder.path / "table.csv")
     (contrast,) = statistics.tested(folder.study, rows)
     assert contrast.estimate.units == pytest.approx([own + 50 for own in options], rel=1e-8)
-    assert "2 of 4 cells failed. They count nats -50;" in said
+    assert "2 of 4 cells failed. They count nats -50." in said
     second = made(**SMALL, failed={"nats": -50.0}, kept=[{"table": "out/table.csv"}])
     elsewhere = Folder(second.study, tmp_path / "elsewhere")
     assert (len(elsewhere.state().done), len(elsewhere.state().failed)) == (2, 2)
