@@ -39,7 +39,7 @@ def done(own: argparse.Namespace) -> str:
     if len(own.files) > 1:
         raise BadInput(f"{own.files[1]}: one study at a time")
     study, workers = Study.load(own.files[0]), Workers(own.jobs)
-    folder = Folder(study, own.out or ROOT / "runs" / "studies" / study.name)
+    folder = Folder(study, own.out or ROOT / "runs" / "studies" / study.path.stem)
     state = folder.state()
     if own.action == "report":
         return page.report(folder, state)

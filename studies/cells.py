@@ -10,13 +10,14 @@ import json
 import math
 import shutil
 import subprocess
-import time
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from pydantic import Field
 
@@ -33,7 +34,7 @@ from ddco_pyro.fitting.fit import fit
 from ddco_pyro.inference import compile_all
 from ddco_pyro.jobs import Workers, processes, run_all
 from ddco_pyro.metrics import Record, read_record
-from ddco_pyro.spec import Spec, SpecError, parse_spec, with_overrides
+from ddco_pyro.spec import Spec, parse_spec, with_overrides
 from ddco_pyro.spec.yaml import read_yaml
 from ddco_pyro.training import data
 from ddco_pyro.training.devices import one_thread
@@ -55,7 +56,6 @@ class Done(Record):
     code: str = ""
     failed: str = ""
     converged: bool = True
-    seconds: float = 0.0
 
 
 def kept(path: Path, depends: Mapping[str, Any] | None) -> Done | None:
@@ -73,7 +73,7 @@ def do(
 
     :param work: gives fields of :class:`Done`; its folder keeps the fits.
     """
-    began, folder = time.perf_counter(), path.parents[1] / "work" / path.stem
+    folder = path.parents[1] / "work" / path.stem
     try:
         with only_one(folder):
             if (before := kept(path, depends)) is not None and not before.failed:  # another process has done it
@@ -82,15 +82,14 @@ def do(
             if (path.exists() and before is None) or not begun.exists() or begun.read_text(encoding="utf-8") != code:
                 shutil.rmtree(folder / "fit", ignore_errors=True)  # of other defaults or of another commit
             write_text(begun, code)
-            done: dict[str, Any] = {"depends": dict(depends), "key": path.stem, "code": code}
             try:
                 with one_thread():
-                    done |= work(folder)
+                    found = work(folder)
             except Exception as error:  # other cells go on, and the reason is shown
-                done["failed"] = reason(error)
-            done["seconds"] = time.perf_counter() - began
-            write_text(path, json_text({**named, **Done(**done).model_dump()}))
-            return str(done.get("failed", ""))
+                found = {"failed": reason(error)}
+            done = Done(depends=dict(depends), key=path.stem, code=code, **found)
+            write_text(path, json_text({**named, **done.model_dump()}))
+            return done.failed
     except Busy:
         return ""
 
@@ -165,8 +164,12 @@ class State:
 
     @property
     def missing(self) -> list[Cell]:
-        """The cells that are neither done nor failed."""
         return [cell for cell in self.cells if cell not in self.done and cell not in self.failed]
+
+    @property
+    def counted(self) -> dict[Cell, Done]:
+        """The results of cells that have some: those that failed have what a failed cell counts."""
+        return {cell: one for cell, one in {**self.done, **self.failed}.items() if one.values}
 
 
 @dataclass(frozen=True)
@@ -202,24 +205,21 @@ class Folder:
         if self.study.declared.pinned and len(codes) > 1:
             raise BadInput(f"{self.study.path}: pinned: results are of commits {', '.join(codes)}; keep those of one")
         done, failed = ({cell: one for cell, one in known.items() if bool(one.failed) is way} for way in (False, True))
+        if values := self.study.declared.failed:
+            failed = {cell: one.model_copy(update={"values": values}) for cell, one in failed.items()}
         return State(cells, done, failed)
 
     def chosen(self, state: State) -> dict[str, dict[str, Any]]:
         """The point of each method with the highest mean over the development cells."""
-        rows = [
-            (cell.of, json.dumps(cell.point), one.values.get(str(self.study.declared.choose)))
-            for cell, one in self.counted(state).items()
-            if cell.part == "development"
-        ]
-        scores = pd.DataFrame(rows, columns=["of", "point", "value"]).fillna(-math.inf)
-        means = scores.groupby(["of", "point"], sort=False).value.mean()
-        return {str(of): json.loads(own.idxmax()[1]) for of, own in means.groupby("of")}
+        declared, scores = self.study.declared, defaultdict[str, list[float]](list)
+        for cell, one in state.counted.items():
+            value = one.values.get(str(declared.choose))
+            scores[cell.method].append(-math.inf if value is None else value)
 
-    def counted(self, state: State) -> dict[Cell, Done]:
-        """The results of all cells that are done, and those that failed ones count."""
-        values = self.study.declared.failed
-        failed = {cell: one.model_copy(update={"values": values}) for cell, one in state.failed.items() if values}
-        return {**state.done, **failed}
+        def mean(name: str, point: dict[str, Any]) -> float:
+            return float(np.mean(scores[declared.label(name, point, "development")]))
+
+        return {name: max(method.points, key=partial(mean, name)) for name, method in declared.methods.items()}
 
     def kept(self, cell: Cell) -> Done | None:
         """The results of a cell, if it is done: here, or in the declaration's tables ``kept``."""
@@ -244,10 +244,10 @@ class Folder:
     def table(self, state: State) -> pd.DataFrame:
         """The declared measures of all cells, tidy."""
         rows = []
-        for cell, one in self.counted(state).items():
+        for cell, one in state.counted.items():
             values = {measure: one.values.get(measure) for measure in self.study.declared.measures}
             values |= {FAILED: 1 if one.failed else None, RISING: None if one.converged else 1}
-            named = (self.study.name, *cell.row)
+            named = (self.study.path.stem, *cell.row)
             rows += [(*named, *item, one.key, one.code) for item in values.items() if item[1] is not None]
         return pd.DataFrame(rows, columns=[*COLUMNS, *ORIGIN])
 
@@ -376,10 +376,7 @@ class Folder:
         if (baseline := study.declared.methods[cell.of].baseline) is not None:
             bare = baseline.model_fields_set == {"kind"}
             beside = named_baselines(spec).get(baseline.name, baseline) if bare else baseline
-            try:
-                spec = baseline_spec(spec, beside, Dimensions.of(demos))
-            except SpecError as error:
-                raise SpecError(*(f"methods.{cell.of}.{problem}" for problem in error.problems)) from error
+            spec = baseline_spec(spec, beside, Dimensions.of(demos))
         return with_overrides(spec, {"compare_with": []}), demos
 
 

@@ -56,7 +56,7 @@ class Block(Model):
 
 
 class Blocks(Model):
-    """Blocks that share no number: for the results, and for the choice among points of the grid."""
+    """Blocks that share no number: for the results, and for the choice among points of grids."""
 
     test: Block
     development: Block | None = None
@@ -91,12 +91,6 @@ class ContrastSpec(Model):
     demonstrations: Count | None = None
     kind: Literal["superiority", "non_inferiority", "equivalence"] = "superiority"
     margin: float = Field(default=0.0, ge=0)
-
-    @property
-    def pair(self) -> tuple[str, str]:
-        """The names of both methods."""
-        ours, _, theirs = self.contrast.partition(" - ")
-        return ours.strip(), theirs.strip()
 
     @property
     def bounds(self) -> tuple[float, float]:
@@ -180,7 +174,7 @@ class Declaration(Model):
         for number, contrast in enumerate(self.contrasts):
             at, count = f"contrasts.{number}", contrast.demonstrations
             yield contrast.measure not in self.measures, f"{at}.measure", f"{contrast.measure!r} {AMONG}"
-            for name in contrast.pair:
+            for name in contrast.contrast.split(" - ", 1):
                 text = f"{contrast.contrast!r}: there is no method {name!r}{nearest(name, self.methods)}"
                 text = f"{text}; write 'ours - theirs' with: {', '.join(self.methods)}"
                 yield name not in self.methods, f"{at}.contrast", text
@@ -239,11 +233,6 @@ class Study:
                 where = declared.label(name, point, "")
                 raise SpecError(*(f"{path}: {where}: {problem}" for problem in error.problems)) from None
         return study
-
-    @property
-    def name(self) -> str:
-        """The name of the study, from its file."""
-        return self.path.stem
 
     def changes(self, method: str, point: dict[str, Any]) -> dict[str, Any]:
         """What a method with a point of the grid changes in the spec, by key path."""

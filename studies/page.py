@@ -23,7 +23,7 @@ from ddco_pyro.errors import BadInput, nearest
 from ddco_pyro.evaluation.agreement import MATCHED, UNMATCHED, measure_names
 from studies import statistics
 from studies.cells import ROOT, Folder, State
-from studies.declaration import NATS, Study
+from studies.declaration import NATS, Declaration, Study
 from studies.statistics import EQUIVALENCE, FAILS, HOLDS, NOT_TESTED, Estimate, estimated, tested
 
 STUDIES, RESULTS = ROOT / "studies", ROOT / "docs" / "results"
@@ -111,7 +111,7 @@ class Numbers:
             table = statistics.earlier(study) if study else statistics.read_tidy(RESULTS / source)
             self.tables[source] = study, table
             for one in tested(study, table) if study else ():
-                key = source, (), " - ".join(one.spec.pair), one.spec.measure, (str(one.demonstrations),), None
+                key = source, (), one.spec.contrast, one.spec.measure, (str(one.demonstrations),), None
                 if one.spec.kind == EQUIVALENCE:
                     self.verdicts[EQUIVALENCE, *key] = one.verdict
                     self.verdicts.setdefault(key, one.verdict)
@@ -175,37 +175,35 @@ def report(folder: Folder, state: State) -> str:
     study, declared, table = folder.study, folder.study.declared, folder.table(state)
     there = sorted({name for one in state.done.values() for name in one.values}) or ["no cell that is done"]
     for measure in {*declared.measures} - {*table.measure}:
-        text = f"{study.path}: measures: no cell has {measure!r}{nearest(measure, there)}; there is: "
-        raise BadInput(text + ", ".join(there))
+        text = f"measures: no cell has {measure!r}{nearest(measure, there)}; there is: {', '.join(there)}"
+        raise BadInput(f"{study.path}: {text}")
     write_text(folder.path / "table.csv", table.to_csv(index=False, lineterminator="\n", float_format="%.9g"))
-    contrasts, means = list[list[str]](), list[list[str]]()
+    rows, means = list[list[str]](), list[list[str]]()
     for one in tested(study, table):
-        if (known := one.estimate) is not None:
-            facts = [one.spec.contrast, name_of(one.spec.measure), str(one.demonstrations), one.spec.kind, one.verdict]
-            p = "–" if one.verdict == NOT_TESTED else words.p_value(one.adjusted)
-            contrasts.append([*facts, shown(known, "+.2f"), SHOWN["median"](known, "+.2f"), p])
+        numbers = [SHOWN[show](one.estimate, "+.2f") for show in ("interval", "median")] if one.estimate else ["–"] * 2
+        facts = [one.spec.contrast, name_of(one.spec.measure), str(one.demonstrations), one.spec.kind, one.verdict]
+        rows.append([*facts, *numbers, "–" if one.verdict == NOT_TESTED else words.p_value(one.adjusted)])
+    head = ["contrast", "measure", "demonstrations", "kind", "verdict", "mean [95 % t]", "median [95 %]", "adjusted p"]
+    tables = [Table(head, rows, {0, 1, 3, 4}).markdown()] if rows else []
     for count, method in product(declared.demonstrations.counts, declared.methods):
         own = [estimated(study, table, method, measure, [count]) for measure in declared.measures]
         means.append([str(count), method, *(shown(known) if known else "–" for known in own)])
-    head = ["contrast", "measure", "demonstrations", "kind", "verdict", "mean [95 % t]", "median [95 %]", "adjusted p"]
-    tables = [Table(head, contrasts, {0, 1, 3, 4}).markdown()] if contrasts else []
     tables.append(Table(["demonstrations", "method", *map(name_of, declared.measures)], means, {1}).markdown())
-    return "\n\n".join([f"# Study {study.name}", declared.question, *tables, *_cells(folder, state)])
+    return "\n\n".join([f"# Study {study.path.stem}", declared.question, *tables, *_cells(declared, state)])
 
 
-def _cells(folder: Folder, state: State) -> list[str]:
+def _cells(declared: Declaration, state: State) -> list[str]:
     """Cells of the test that failed, commits, fits that still rise, and the chosen points."""
-    declared, tests = folder.study.declared, [cell for cell in state.cells if cell.part == "test"]
+    tests = [cell for cell in state.cells if cell.part == "test"]
     done = {cell: state.done[cell] for cell in tests if cell in state.done}
     as_failed = ", ".join(f"{measure} {value:g}" for measure, value in declared.failed.items()) or "nothing"
     failed, codes = sum(cell in state.failed for cell in tests), Counter(one.code for one in done.values() if one.code)
     rising = Counter(cell.method for cell, result in done.items() if not result.converged)
     chosen = dict.fromkeys(declared.label(cell.of, cell.point, "") for cell in tests if cell.point)
+    lines = [f"The points with the highest {declared.choose} in development: {', '.join(chosen)}."] if chosen else []
     return [
         f"{len(done)} of {len(tests)} cells are done, {failed} of {len(tests)} cells failed. They count {as_failed}.",
         f"Code: {', '.join(f'{code} ({count} cells)' for code, count in codes.items())}.",
         f"Fits that have not converged: {', '.join(f'{n} of {name}' for name, n in rising.items()) or 'none'}.",
-        *[f"The points with the highest {declared.choose} on the development seeds: {', '.join(chosen)}."][
-            : len(chosen)
-        ],
+        *lines,
     ]

@@ -53,7 +53,7 @@ def earlier(study: Study) -> pd.DataFrame:
         table = table[np.all([table[column].isin(own or table[column]) for column, own in of.items()], axis=0)]
         names = {"task": kept.tasks, "method": kept.methods, "measure": kept.measures}
         names_here = {column: {there: here for here, there in own.items()} for column, own in names.items()}
-        table = table.replace(names_here).assign(study=study.name)
+        table = table.replace(names_here).assign(study=study.path.stem)
         tables.append(table[table.task.isin(study.declared.tasks)])
     whole = pd.concat(tables).drop_duplicates([*CELL, "measure"]).astype({"value": float})
     return whole.fillna(dict.fromkeys(ORIGIN, ""))
@@ -163,7 +163,7 @@ def tested(study: Study, table: pd.DataFrame) -> list[Tested]:
     asked = [(one, one.demonstrations or counts[0]) for one in contrasts]
     found = [estimated(study, table, one.contrast, one.measure, [number]) for one, number in asked]
     p_values = [own.p_value(*one.bounds) if own else math.nan for own, one in zip(found, contrasts, strict=True)]
-    places: dict[Any, int] = {(one.kind, one.pair, one.measure, count): n for n, (one, count) in enumerate(asked)}
+    places: dict[Any, int] = {(one.kind, one.contrast, one.measure, count): n for n, (one, count) in enumerate(asked)}
     twins = {n: places.get(("superiority", *facts)) for (kind, *facts), n in places.items() if kind == EQUIVALENCE}
     judged = verdicts(p_values, study.declared.correction, twins)
     return [Tested(*one, own, *verdict) for one, own, verdict in zip(asked, found, judged, strict=True)]
