@@ -10,8 +10,8 @@
 
 from __future__ import annotations
 
-import argparse
 from collections import Counter
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from ddco_pyro.cli.console import Progress
@@ -19,40 +19,63 @@ from ddco_pyro.data.files import write_text
 from ddco_pyro.errors import BadInput, Failed
 from ddco_pyro.jobs import Workers
 from studies import page
-from studies.cells import ROOT, Folder
+from studies.cells import ROOT, Folder, State
 from studies.declaration import Study
 from studies.study import described, printed
 
 
-def done(own: argparse.Namespace) -> str:
-    """Do what is asked for; what is to be printed."""
-    if own.action == "render":
-        for path in own.files:
-            if not path.is_file():
-                raise BadInput(f"{path}: is missing; check the path")
-            text = path.read_text(encoding="utf-8")
-            if (now := page.render(text)) != text and own.check:
-                raise Failed(f"{path}: differs from the results; write it with: python -m studies render {path}")
-            if now != text:
-                write_text(path, now)
-        return f"{len(own.files)} pages agree with the results"
-    if len(own.files) > 1:
-        raise BadInput(f"{own.files[1]}: one study at a time")
-    study, workers = Study.load(own.files[0]), Workers(own.jobs)
-    folder = Folder(study, own.out or ROOT / "runs" / "studies" / study.path.stem)
+def render(paths: Sequence[Path], check: bool) -> str:
+    """Bring the generated tables of pages up to date.
+
+    :raises Failed: with ``check``, a page differs.
+    """
+    for path in paths:
+        if not path.is_file():
+            raise BadInput(f"{path}: is missing; check the path")
+        text = path.read_text(encoding="utf-8")
+        if (now := page.render(text)) != text and check:
+            raise Failed(f"{path}: differs from the results; write it with: python -m studies render {path}")
+        if now != text:
+            write_text(path, now)
+    return f"{len(paths)} pages agree with the results"
+
+
+def study(action: str, paths: Sequence[Path], out: Path | None, jobs: int) -> str:
+    """Do the cells of a study, count them, or report what they say.
+
+    :raises Failed: cells failed.
+    """
+    if len(paths) > 1:
+        raise BadInput(f"{paths[1]}: one study at a time")
+    declared, workers = Study.load(paths[0]), Workers(jobs)
+    folder = Folder(declared, out or ROOT / "runs" / "studies" / declared.path.stem)
     state = folder.state()
-    if own.action == "report":
-        return page.report(folder, state)
-    if own.action == "run":
+    if action == "run":
         with Progress() as progress:
             state = folder.run(workers, progress)
-    lines = [f"failed, {n} cells: {why}" for why, n in Counter(one.failed for one in state.failed.values()).items()]
-    missing = Counter(f"{cell.part}, {cell.method}" for cell in state.missing)
-    lines += [f"missing, {n} cells: {named}" for named, n in missing.items()]
-    lines.append(f"{len(state.done)} of {len(state.cells)} cells are done")
-    if own.action == "run" and state.failed:
-        raise Failed("\n".join([*lines, "the same command tries failed cells again"]))
-    return "\n".join(lines)
+    lines = [page.report(folder, state)] if action == "report" else []
+    text = "\n".join([*lines, *told(folder, state)])
+    if action == "run" and state.failed:
+        raise Failed(f"{text}\nthe same command tries failed cells again")
+    return text
+
+
+def told(folder: Folder, state: State) -> Iterator[str]:
+    """The cells of a study, a line each: what is missing or wrong, commits, chosen points, and those that are done."""
+    declared = folder.study.declared
+    values = ", ".join(f"{measure} {value:g}" for measure, value in declared.failed.items()) or "nothing"
+    for what, found in (
+        ("missing", Counter(cell.method for cell in state.missing)),
+        (f"failed, and count {values}", Counter(one.failed for one in state.failed.values())),
+        ("not converged", Counter(cell.method for cell, one in state.done.items() if not one.converged)),
+        ("commits", Counter(one.code for one in state.done.values() if one.code)),
+    ):
+        if found:
+            yield f"{what}: {', '.join(f'{name} ({count})' for name, count in found.items())}"
+    chosen = dict.fromkeys(declared.label(cell.of, cell.point, "") for cell in state.cells if cell.part == "test")
+    if declared.choose and chosen:
+        yield f"the points with the highest {declared.choose} in development: {', '.join(chosen)}"
+    yield f"{len(state.done)} of {len(state.cells)} cells are done"
 
 
 def main() -> None:
@@ -64,7 +87,10 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=-1, help="processes; -1: one for each core")
     parser.add_argument("--check", action="store_true")
     own = parser.parse_args()
-    printed(lambda: done(own))
+    if own.action == "render":
+        printed(lambda: render(own.files, own.check))
+    else:
+        printed(lambda: study(own.action, own.files, own.out, own.jobs))
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ import shutil
 import subprocess
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -66,13 +66,8 @@ def kept(path: Path, depends: Mapping[str, Any] | None) -> Done | None:
     return done if depends is None or done.depends == json.loads(json.dumps(depends)) else None
 
 
-def do(
-    path: Path, depends: Mapping[str, Any], work: Callable[[Path], Mapping[str, Any]], code: str = "", **named: Any
-) -> str:
-    """Do a cell on one thread, unless another process does, and keep its results in ``path``; returns why it failed.
-
-    :param work: gives fields of :class:`Done`; its folder keeps the fits.
-    """
+def do(path: Path, depends: Mapping[str, Any], work: Callable[[Path], Mapping[str, Any]], code: str = "") -> str:
+    """Do a cell on one thread, unless another process does, and keep its results in ``path``; returns why it failed."""
     folder = path.parents[1] / "work" / path.stem
     try:
         with only_one(folder):
@@ -88,7 +83,7 @@ def do(
             except Exception as error:  # other cells go on, and the reason is shown
                 found = {"failed": reason(error)}
             done = Done(depends=dict(depends), key=path.stem, code=code, **found)
-            write_text(path, json_text({**named, **done.model_dump()}))
+            write_text(path, json_text(done.model_dump()))
             return done.failed
     except Busy:
         return ""
@@ -119,10 +114,7 @@ def commit_of(path: Path) -> str:
 
 @dataclass(frozen=True)
 class Cell:
-    """One method on one task, with a number of demonstrations and a training seed, in the test or the development.
-
-    ``method`` is its name in tables, ``of`` that in the declaration, and ``place`` that of the seed in its block.
-    """
+    """A fit in the test or the development: ``method`` is its name in tables, ``of`` that in the declaration."""
 
     part: str
     task: str
@@ -138,7 +130,6 @@ class Cell:
 
     @property
     def row(self) -> tuple[str, ...]:
-        """What names the cell in a table."""
         return self.task, self.method, str(self.demonstrations), str(self.seed)
 
 
@@ -238,7 +229,6 @@ class Folder:
 
     @cached_property
     def _earlier(self) -> dict[Any, pd.DataFrame]:
-        """The rows of the declaration's tables ``kept``, by cell."""
         return dict(iter(earlier(self.study).groupby(CELL)))
 
     def table(self, state: State) -> pd.DataFrame:
@@ -270,26 +260,20 @@ class Folder:
             spec = with_overrides(study.base, {**given, **_placed(cell, "demonstrations.hdf5")})
             baseline = baseline and named_baselines(spec).get(baseline.name, baseline)
             shown = {"report", "selection", "compare_with"}  # what a result does not depend on
-            given, added = (
-                spec.model_dump(mode="json", exclude=shown, exclude_defaults=bare) for bare in (True, False)
-            )
+            given, added = (spec.model_dump(mode="json", exclude=shown, exclude_defaults=own) for own in (True, False))
         return {
             "baseline": baseline and baseline.model_dump(exclude_unset=True, mode="json"),
             "by": method.by,
             "settings": study.settings(cell.of, cell.point),
             "world": study.declared.world,
-            "data": {
-                "task": cell.task,
-                "supervisor": None,  # keys of earlier results have it
-                "first": self._seeds("demonstrations", cell).start,
-                "train": cell.demonstrations,
-                "held_out": study.declared.demonstrations.held_out,
-            },
+            # keys of earlier results have a supervisor
+            "data": {"task": cell.task, "supervisor": None, "first": self._seeds("demonstrations", cell).start,
+                     "train": cell.demonstrations, "held_out": study.declared.demonstrations.held_out},
             "seed": cell.seed,
             "starts": [*starts[:1], len(starts)],
             "given": given,
             "added": added,
-        }
+        }  # fmt: skip
 
     def _seeds(self, key: str, cell: Cell) -> range:
         """The seeds of a cell's ``demonstrations`` or ``starts``."""
@@ -308,7 +292,10 @@ class Folder:
         self.path.mkdir(parents=True, exist_ok=True)
         with processes(workers.number(len(state.cells))):
             while cells := [cell for cell in state.cells if cell not in state.done and cell not in tried]:
-                calls = {str(cell): partial(self.do, cell, code) for cell in cells}
+                calls = {
+                    str(one): partial(do, self.place(one), self.depends(one), partial(self._measured, one), code)
+                    for one in cells
+                }
                 do_all(calls, len(state.done), workers, on_event)
                 tried |= {*cells}
                 state = self.state()  # development, once done, adds the cells of the test
@@ -323,10 +310,6 @@ class Folder:
         else:
             return
         raise BadInput(f"{self.study.path}: pinned: {text}")
-
-    def do(self, cell: Cell, code: str) -> str:
-        """Do a cell, as :func:`do` does."""
-        return do(self.place(cell), self.depends(cell), partial(self._measured, cell), code, cell=asdict(cell))
 
     def _measured(self, cell: Cell, folder: Path) -> dict[str, Any]:
         """The measures of a cell."""

@@ -20,9 +20,6 @@ from ddco_pyro.spec.base import Count, Items, Model, Problems, Seed, Text, lines
 from ddco_pyro.spec.model import Baseline
 from ddco_pyro.spec.yaml import read_mapping
 
-INIT = "init"
-"""The ``spec`` that stands for what ``ddco-pyro init`` writes for the training demonstrations of each cell."""
-
 SKELETON = {
     "demonstrations": {"path": "none.hdf5"},
     "observations": ["none"],
@@ -30,11 +27,7 @@ SKELETON = {
 }
 """A spec like those of ``init``, in which overrides are checked before there are demonstrations."""
 
-ALONE: dict[str, Any] = {
-    "demonstrations.leave_one_out": False,
-    "demonstrations.hold_out_by": None,
-    "selection.grid": {},
-}
+ALONE: Any = {"demonstrations.leave_one_out": False, "demonstrations.hold_out_by": None, "selection.grid": {}}
 """What every method changes in the spec: a cell is one fit."""
 
 NATS = "nats"
@@ -113,7 +106,7 @@ class Declaration(Model):
     """The contents of a declaration's file."""
 
     question: Text
-    spec: Text = INIT
+    spec: Text = "init"  # what ``ddco-pyro init`` writes for the training demonstrations of each cell
     world: Text
     tasks: Annotated[Items[Text], Field(min_length=1)]
     overrides: dict[str, Any] = Field(default={})
@@ -224,7 +217,9 @@ class Study:
             declared = Declaration.model_validate(read_mapping(path, "study"))
         except ValidationError as error:
             raise SpecError(*(f"{path}: {line}" for line in lines(error, Declaration))) from None
-        study = cls(path, declared, None if declared.spec == INIT else load_spec(path.parent / declared.spec, (), True))
+        study = cls(
+            path, declared, None if declared.spec == "init" else load_spec(path.parent / declared.spec, (), True)
+        )
         given: Any = SKELETON if study.base is None else study.base.model_dump(exclude_unset=True)
         for name, point in [(name, point) for name, method in declared.methods.items() for point in method.points]:
             try:

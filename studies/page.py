@@ -1,14 +1,13 @@
-"""Generated tables of pages, and the report of a study.
+"""Generated tables of pages, as ``docs/studies.md`` describes them, and the report of a study.
 
-A page has ``<!-- table: PAGE/NAME -->`` and ``<!-- end -->`` on lines of their own. Between them stands the table
-``## NAME`` of ``studies/tables/PAGE.md``, with its numbers from the results. ``docs/studies.md`` says what a number is.
+Between ``<!-- table: PAGE/NAME -->`` and ``<!-- end -->`` stands the table ``## NAME`` of ``studies/tables/PAGE.md``.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import product
@@ -23,7 +22,7 @@ from ddco_pyro.errors import BadInput, nearest
 from ddco_pyro.evaluation.agreement import MATCHED, UNMATCHED, measure_names
 from studies import statistics
 from studies.cells import ROOT, Folder, State
-from studies.declaration import NATS, Declaration, Study
+from studies.declaration import NATS, Study
 from studies.statistics import EQUIVALENCE, FAILS, HOLDS, NOT_TESTED, Estimate, estimated, tested
 
 STUDIES, RESULTS = ROOT / "studies", ROOT / "docs" / "results"
@@ -189,21 +188,4 @@ def report(folder: Folder, state: State) -> str:
         own = [estimated(study, table, method, measure, [count]) for measure in declared.measures]
         means.append([str(count), method, *(shown(known) if known else "–" for known in own)])
     tables.append(Table(["demonstrations", "method", *map(name_of, declared.measures)], means, {1}).markdown())
-    return "\n\n".join([f"# Study {study.path.stem}", declared.question, *tables, *_cells(declared, state)])
-
-
-def _cells(declared: Declaration, state: State) -> list[str]:
-    """Cells of the test that failed, commits, fits that still rise, and the chosen points."""
-    tests = [cell for cell in state.cells if cell.part == "test"]
-    done = {cell: state.done[cell] for cell in tests if cell in state.done}
-    as_failed = ", ".join(f"{measure} {value:g}" for measure, value in declared.failed.items()) or "nothing"
-    failed, codes = sum(cell in state.failed for cell in tests), Counter(one.code for one in done.values() if one.code)
-    rising = Counter(cell.method for cell, result in done.items() if not result.converged)
-    chosen = dict.fromkeys(declared.label(cell.of, cell.point, "") for cell in tests if cell.point)
-    lines = [f"The points with the highest {declared.choose} in development: {', '.join(chosen)}."] if chosen else []
-    return [
-        f"{len(done)} of {len(tests)} cells are done, {failed} of {len(tests)} cells failed. They count {as_failed}.",
-        f"Code: {', '.join(f'{code} ({count} cells)' for code, count in codes.items())}.",
-        f"Fits that have not converged: {', '.join(f'{n} of {name}' for name, n in rising.items()) or 'none'}.",
-        *lines,
-    ]
+    return "\n\n".join([f"# Study {study.path.stem}", declared.question, *tables])

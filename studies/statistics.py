@@ -20,11 +20,8 @@ from studies.declaration import ContrastSpec, Study
 COLUMNS = ["study", "task", "method", "demonstrations", "seed", "measure", "value"]
 """All but ``value`` are text. ``demonstrations`` and ``seed`` are empty where a number does not depend on them."""
 
-CELL = COLUMNS[1:5]
-"""The columns that name a cell."""
-
-ORIGIN = ["key", "code"]
-"""Further columns of a study's table: the digest of what the declaration says of a cell, and the commit of the code."""
+CELL, ORIGIN = COLUMNS[1:5], ["key", "code"]
+"""The columns that name a cell; further ones of a study's table: the digest of its declaration, and the commit."""
 
 HOLDS, FAILS, NOT_TESTED, EQUIVALENCE = "holds", "does not hold", "not tested", "equivalence"
 LEVEL = (1 - CONFIDENCE) / 2
@@ -106,9 +103,8 @@ def estimate(
 ) -> Estimate:
     """The mean of values by task and seed, and its t interval.
 
-    :param trials: of each fit, where the values are rates or their differences. Equal units have Wilson's interval of
-        all trials, a difference that of as many trials with different outcomes.
-    :param lowest: the least possible value of a rate: 0, or -1 of a difference.
+    :param trials: of each fit, where the values are rates (``lowest`` 0) or their differences (-1). Equal units have
+        Wilson's interval of all trials, a difference that of as many trials with different outcomes.
     :param families: tasks by the name of their family, whose mean is one unit; tasks that are left out are units.
     """
     of_task = {task: own.to_numpy().mean() for task, own in values.groupby(level=0, sort=False)}

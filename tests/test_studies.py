@@ -29,6 +29,7 @@ from ddco_pyro.jobs import Workers
 from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.spec import SpecError
 from studies import cells, declaration, labelling, statistics
+from studies.__main__ import told
 from studies.cells import Folder
 from studies.declaration import Study
 from studies.page import report
@@ -393,11 +394,11 @@ def test_a_failed_cell_counts_what_is_declared(made, monkeypatch, tmp_path):
     monkeypatch.setattr(cells, "fit", fails)
     state = folder.run(HERE)
     options = [state.done[cell].values["nats"] for cell in state.done]
-    said = report(folder, state)
+    report(folder, state)
     rows = read_tidy(folder.path / "table.csv")
     (contrast,) = statistics.tested(folder.study, rows)
     assert contrast.estimate.units == pytest.approx([own + 50 for own in options], rel=1e-8)
-    assert "2 of 4 cells failed. They count nats -50." in said
+    assert "failed, and count nats -50: unexpected ZeroDivisionError: division by zero (2)" in [*told(folder, state)]
     second = made(**SMALL, failed={"nats": -50.0}, kept=[{"table": "out/table.csv"}])
     elsewhere = Folder(second.study, tmp_path / "elsewhere")
     assert (len(elsewhere.state().done), len(elsewhere.state().failed)) == (2, 2)
@@ -423,7 +424,9 @@ def test_a_pinned_study_is_of_one_commit(made, monkeypatch, tmp_path):
         return str(error.value)
 
     first = pinned()
-    assert "Code: 11aa (4 cells)." in report(first, first.run(HERE))
+    state = first.run(HERE)
+    report(first, state)
+    assert "commits: 11aa (4)" in [*told(first, state)]
     shutil.copy(first.path / "table.csv", tmp_path)
     kept = [{"table": "table.csv"}]
     second = pinned(kept=kept)
@@ -532,11 +535,12 @@ def test_the_best_point_on_development_seeds_is_tested(made):
         ("options", 0.5),
         ("flat", 0.5),
     }
-    said = report(folder, state)
+    report(folder, state)
     rows = read_tidy(folder.path / "table.csv")
     names = {"options", "flat", *(f"{name} (std = {std})" for name in ("options", "flat") for std in (0.5, 50.0))}
     assert {*rows.method} == names
-    assert "in development: options (std = 0.5), flat (std = 0.5)." in said
+    chosen = "the points with the highest nats in development: options (std = 0.5), flat (std = 0.5)"
+    assert chosen in [*told(folder, state)]
     assert not made(**TUNED, methods=methods, kept=[{"table": "out/table.csv"}]).state().missing
 
 
