@@ -44,7 +44,7 @@ test-all: lint
 bench: $(DEMO)
 	$(PIP) -e '.[bench,segments]'
 	$(BIN)/python benchmarks/performance.py
-	$(BIN)/ddco-pyro study render README.md docs/results/*.md
+	$(BIN)/python -m studies render README.md docs/results/*.md
 
 # What reads the formats of segments, in an environment of its own: LeRobot needs Python 3.12. About 8 GB with CUDA.
 tools:

@@ -38,7 +38,6 @@ from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.tables import Tables, complete
 from ddco_pyro.spec import Spec, load_spec, parse_spec, with_overrides
-from ddco_pyro.study.table import COLUMNS
 from ddco_pyro.training.data import demonstrations, parts
 from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.restarts import Trainer
@@ -47,6 +46,7 @@ ROOT = Path(__file__).parents[1]
 COMMAND = ROOT / ".venv/bin/ddco-pyro" if (ROOT / ".venv").exists() else Path(sys.executable).with_name("ddco-pyro")
 RESULTS, PAGE = ROOT / "benchmarks/results", ROOT / "docs/performance.md"
 RATIOS = ROOT / "docs/results/performance.csv"
+COLUMNS = ["study", "task", "method", "demonstrations", "seed", "measure", "value"]
 BEGIN, END = "<!-- tables, written by make bench -->\n", "<!-- end of tables -->\n"
 SIZES = ((100, 15), (50, 200), (50, 2000))
 FEATURES, CONTROLS = 10, 3

@@ -1,13 +1,11 @@
 """What is done with Meta-World itself, by the Python of an environment of its own (``apart.py``).
 
-    python arena_metaworld.py collect TASK OUT.hdf5 [--number 70] [--held-out 20] [--noise 0.1]
-    python arena_metaworld.py play TASK OUT.json NAME=EXPORTED... [--episodes 50] [--recorded DEMONSTRATIONS.hdf5]
-    python arena_metaworld.py film TASK OUT.png NAME=EXPORTED [--frames 8]
+    python -m studies.arena_metaworld collect TASK OUT.hdf5 [--number 70] [--held-out 20] [--noise 0.1]
+    python -m studies.arena_metaworld play TASK OUT.json NAME=EXPORTED... [--episodes 50] [--first SEED]
 
 ``collect`` records the scripted expert, executed with normal noise on every control; of each step its phase is the
 return statement by which the expert's ``_desired_pos`` ended, or the assignment of ``delta_pos`` where it has none.
-``play`` lets exported controllers act from initial states that were never demonstrated, the same for all, and on the
-observations of a demonstration. ``film`` draws an episode.
+``play`` lets exported controllers act from initial states that were never demonstrated, the same for all.
 """
 
 from __future__ import annotations
@@ -22,14 +20,15 @@ from typing import Any
 
 os.environ.setdefault("MUJOCO_GL", "egl")
 
-import arena_recording
 import mujoco
 import numpy as np
-from arena_phases import Phases
-from arena_playing import Observation, arguments, named_controllers, play, play_all
-from arena_recording import Recorded
 from metaworld.env_dict import ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE
 from metaworld.policies import ENV_POLICY_MAP
+
+from studies import arena_recording
+from studies.arena_phases import Phases
+from studies.arena_playing import Observation, arguments, named_controllers, play_all
+from studies.arena_recording import Recorded
 
 OBSERVATIONS = {
     "hand_pos": slice(0, 3),
@@ -48,8 +47,6 @@ AFTER_SUCCESS = 5
 UNSEEN = 1_000_000
 """Seeds of initial states from here on are not demonstrated."""
 
-CAMERA = "corner2"
-
 _compiled = functools.cache(mujoco.MjModel.from_xml_path)
 mujoco.MjModel.from_xml_path = lambda path: copy.copy(_compiled(path))  # most of the time of a short episode
 
@@ -60,9 +57,8 @@ Step = tuple[Observation, np.ndarray, int, bool]
 class Sawyer:
     """A task of Meta-World; every episode has a world of its own, so that none depends on those before."""
 
-    def __init__(self, task: str, **drawing: Any) -> None:
+    def __init__(self, task: str) -> None:
         self._make = ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE[f"{task}-goal-observable"]
-        self._drawing = drawing
         self.outcome: dict[str, float] = {}
         self.world: Any = None
         self.seen = np.zeros(39)
@@ -71,7 +67,7 @@ class Sawyer:
         """The initial state of this seed."""
         if self.world is not None:
             self.world.close()
-        self.world = self._make(seed=seed, **self._drawing)
+        self.world = self._make(seed=seed)
         self.seen, _ = self.world.reset()
         return named(self.seen)
 
@@ -112,8 +108,7 @@ def collect(
         steps = demonstrate(world, expert, phases, seed, noise)
         return steps and recorded(steps)
 
-    labels, about = {"phase": len(phases.lines)}, {"noise": noise, "lines": phases.lines}
-    arena_recording.collect(out, f"metaworld/{task}", demonstration, number, held_out, labels, first, attempts, **about)
+    arena_recording.collect(out, f"metaworld/{task}", demonstration, number, held_out, first, attempts)
 
 
 def recorded(steps: list[Step]) -> Recorded:
@@ -127,46 +122,21 @@ def recorded(steps: list[Step]) -> Recorded:
     }
 
 
-def film(task: str, out: Path, controller: Any, frames: int) -> None:
-    """Pictures of an episode side by side, evenly spread over it."""
-    import imageio.v3 as imageio
-
-    drawn: list[np.ndarray] = []
-
-    class Filmed(Sawyer):
-        def reset(self, seed: int) -> Observation:
-            observation = super().reset(seed)
-            self.world.mujoco_renderer.camera_id = self.world.model.camera(CAMERA).id
-            return observation
-
-        def step(self, control: np.ndarray) -> tuple[Observation, bool, bool]:
-            drawn.append(np.rot90(self.world.render(), 2))  # this camera stands on its head
-            return super().step(control)
-
-    played = play(controller, Filmed(task, render_mode="rgb_array"), UNSEEN)
-    chosen = np.linspace(0, len(drawn) - 1, frames).round().astype(int)
-    imageio.imwrite(out, np.concatenate([drawn[place][::2, ::2] for place in chosen], axis=1))
-    print(played)
-
-
 def main() -> None:
-    """Collect, play or draw."""
-    parser = arguments(__doc__, ("collect", "play", "film"), 70)
+    """Collect, or let controllers act."""
+    parser = arguments(__doc__, ("collect", "play"), 70)
     parser.add_argument("--noise", type=float, default=0.1)
-    parser.add_argument("--frames", type=int, default=8)
     own = parser.parse_args()
     warnings.filterwarnings("ignore")  # the experts' gains are meant to saturate
     if own.task not in ENV_POLICY_MAP:
         print(f"there is no task {own.task!r}; Meta-World has: {', '.join(sorted(ENV_POLICY_MAP))}", file=sys.stderr)
         raise SystemExit(2)
-    controllers = named_controllers(own.controllers)
     if own.what == "collect":
         collect(own.task, own.out, own.number, own.held_out, own.noise, own.first or 0, own.attempts)
-    elif own.what == "play":
-        first = UNSEEN if own.first is None else own.first
-        play_all(Sawyer(own.task), own.out, controllers, range(first, first + own.episodes), own.recorded)
     else:
-        film(own.task, own.out, next(iter(controllers.values())), own.frames)
+        first = UNSEEN if own.first is None else own.first
+        seeds = range(first, first + own.episodes)
+        play_all(Sawyer(own.task), own.out, named_controllers(own.controllers), seeds)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Plays an exported controller (``ddco-pyro export``) in an environment. Needs numpy and h5py alone."""
+"""Plays an exported controller (``ddco-pyro export``) in an environment. Needs numpy alone."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-import h5py
 import numpy as np
 
 Observation = Mapping[str, np.ndarray]
@@ -46,7 +45,6 @@ def arguments(text: str | None, what: tuple[str, ...], number: int) -> argparse.
     parser.add_argument("--episodes", type=int, default=50)
     parser.add_argument("--first", type=int, help="the seed of the first episode")
     parser.add_argument("--attempts", type=int, help="to record episodes, at most")
-    parser.add_argument("--recorded", type=Path)
     return parser
 
 
@@ -121,38 +119,7 @@ def play(controller: Any, environment: Environment, seed: int) -> dict[str, Any]
     return {"success": success, "steps": steps, **environment.outcome}
 
 
-def controls(controller: Any, seen: Iterable[Observation], seed: int) -> np.ndarray:
-    """What a controller does on recorded observations, [T, A]."""
-    controller.reset(seed)
-    return np.stack([controller.act(observation) for observation in seen])
-
-
-def play_all(
-    environment: Environment,
-    out: Path,
-    controllers: Mapping[str, Any],
-    seeds: Sequence[int],
-    recorded: Path | None,
-    scripted: Mapping[str, Any] | None = None,
-) -> None:
-    """Episodes of each controller, and what it does on the first held-out demonstration, as JSON.
-
-    :param scripted: controllers of which only the episodes are wanted.
-    """
-    played: dict[str, Any] = {"episodes": {}}
-    for name, controller in {**controllers, **(scripted or {})}.items():
-        played["episodes"][name] = [play(controller, environment, seed) for seed in seeds]
-    if recorded is not None:
-        demonstration, seen = first_held_out(recorded)
-        played |= {"demonstration": demonstration, "controls": {}}
-        for name, controller in controllers.items():
-            played["controls"][name] = controls(controller, seen, 0).tolist()
-    out.write_text(json.dumps(played))
-
-
-def first_held_out(path: Path) -> tuple[str, list[Observation]]:
-    """Name and observations of a demonstration."""
-    with h5py.File(path) as file:
-        name = file["mask/valid"][0].decode()
-        seen = {key: values[()] for key, values in file[f"data/{name}/obs"].items()}
-    return name, [dict(zip(seen, values, strict=True)) for values in zip(*seen.values(), strict=True)]
+def play_all(environment: Environment, out: Path, controllers: Mapping[str, Any], seeds: Sequence[int]) -> None:
+    """Episodes of each controller, as JSON."""
+    played = {name: [play(one, environment, seed) for seed in seeds] for name, one in controllers.items()}
+    out.write_text(json.dumps({"episodes": played}))

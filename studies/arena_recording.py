@@ -23,24 +23,17 @@ def collect(
     demonstrate: Callable[[int], Recorded | None],
     number: int,
     held_out: int,
-    labels: Mapping[str, int],
     first: int = 0,
     attempts: int | None = None,
-    **about: Any,
 ) -> None:
     """Record the first successful episodes; of them the first ones are held out, however many there are.
 
-    The file's attribute ``expert`` says how many attempts it took, which ``shares`` of the steps each label has, and
-    what it is told ``about`` the expert.
-
     :param demonstrate: the episode of a seed; None where it had no success.
-    :param labels: how many values each of the labels can have.
     :param first: the seed of the first attempt; at most so many ``attempts``.
     :raises SystemExit: too few episodes succeed; nothing is written.
     """
     temporary, seed, names = out.with_name(f".{out.name}.tmp"), first, []
     attempts = GIVE_UP * number if attempts is None else attempts
-    counts = {label: np.zeros(values, int) for label, values in labels.items()}
     with h5py.File(temporary, "w") as file:
         data, total = file.create_group("data"), 0
         while len(names) < number:
@@ -53,17 +46,11 @@ def collect(
             if recorded is not None:
                 names.append(f"demo_{len(names)}")
                 total += _write(data.create_group(names[-1]), recorded, seed)
-                for label, count in counts.items():
-                    known = recorded[f"labels/{label}"]
-                    count += np.bincount(known[known >= 0], minlength=len(count))
             seed += 1
         for mask, chosen in (("valid", names[:held_out]), ("train", names[held_out:])):
             file[f"mask/{mask}"] = np.array(chosen, "S")
         data.attrs["total"] = total
         data.attrs["env_args"] = json.dumps({"env_name": environment, "type": 2, "env_kwargs": {}})
-        shares = {label: (count / total).tolist() for label, count in counts.items()}
-        said = {"successes": number, "attempts": seed - first, "shares": shares, **about}
-        file.attrs["expert"] = json.dumps(said)
     temporary.replace(out)
 
 

@@ -1,10 +1,10 @@
 """What the page of ``ddco-pyro label`` saves a person, by simulated people who know the true labels.
 
-    python studies/labelling.py [--tasks pick-place-v3 ...] [--data FOLDER] [--orders page random ...] [--seeds 4]
+    python -m studies.labelling [--tasks pick-place-v3 ...] [--data FOLDER] [--orders page random ...] [--seeds 4]
         [--fits 3] [--most 5] [--slack 1] [--jobs 2] [--runs DIR]
 
-Tasks are those of ``studies/arena.py``, with fifty demonstrations, and ``Knot_Tying`` and ``Suturing`` in FOLDER, as
-``studies/people.py`` has them. A person opens a demonstration and does a few commands of the page that make every name
+Tasks are nine of Meta-World, with fifty demonstrations, and ``Knot_Tying`` and ``Suturing`` in FOLDER, as
+``people.py`` has them. A person opens a demonstration and does a few commands of the page that make every name
 right, and every boundary within SLACK steps: the first of a plan, then that of a new plan for what the page shows next.
 Then the person accepts and opens another one, until the target is reached and at least MOST are labelled. Each command
 counts one, and so does the naming of an option. Adds its numbers to ``docs/results/labelling.csv``.
@@ -24,12 +24,7 @@ from unittest import mock
 
 import numpy as np
 import pandas as pd
-import study
-from arena import LABELS, TASKS, ArenaCell, chosen, recorded, sawyer
-from people import ALONE_WEIGHT, NOTHING, labelled_demonstrations
-from people import LABELS as GESTURES
 from scipy.optimize import linear_sum_assignment
-from study import Cell, Row, Settings, described
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import only_one
@@ -46,10 +41,17 @@ from ddco_pyro.labelling.session import Session
 from ddco_pyro.selection.small import decide
 from ddco_pyro.spec import parse_spec, with_overrides
 from ddco_pyro.spec.yaml import read_yaml
+from studies import study
+from studies.apart import HELD_OUT, Apart
+from studies.people import ALONE_WEIGHT, NOTHING, labelled_demonstrations
+from studies.people import LABELS as GESTURES
+from studies.study import Cell, Row, Settings, described
 
 SURGEONS = ("Knot_Tying", "Suturing")
 CHOSE = ("pick-place-v3", "hammer-v3", "stick-pull-v3")
 """Tasks by which settings of the page were chosen."""
+TASKS = (*CHOSE, "assembly-v3", "shelf-place-v3", "disassemble-v3", "basketball-v3", "hand-insert-v3", "sweep-into-v3")
+LABELS = "phase"
 TRAINED = 50
 ORDERS = ("page", "random", "longest", "recogniser", "equal parts", "from scratch")
 DEFAULTS = Settings({"demonstrations": 70, "noise": 0.1, "most": 5, "slack": 1}, Path("runs/arena"))
@@ -78,10 +80,6 @@ class LabellingCell(Cell):
     def name(self) -> str:
         """Of its files."""
         return f"{self.task}-{self.order.replace(' ', '_')}-{self.orders}-{self.seed}"
-
-    def depends(self, settings: Settings) -> dict[str, Any]:
-        """What decides its results; the place of the data does not."""
-        return {"task": self.task, "order": self.order, "orders": self.orders, "seed": self.seed} | settings.kept()
 
     @property
     def target(self) -> float:
@@ -132,9 +130,10 @@ class LabellingCell(Cell):
         """Those that are labelled, and the name of their true labels."""
         if self.task in SURGEONS:
             return labelled_demonstrations(Path(self.data) / f"{self.task}.hdf5"), GESTURES
-        source = recorded(self.task, settings)
-        names, _, _ = chosen(source, ArenaCell(self.task, TRAINED, 0))
-        return Demonstrations.read(source, labels=[LABELS]).select(names), LABELS
+        own = settings.values
+        options = {"number": own["demonstrations"], "held_out": HELD_OUT, "noise": own["noise"]}
+        demos = Demonstrations.read(sawyer(settings).collected(self.task, **options), labels=[LABELS])
+        return demos.select(demos.masks["train"][:TRAINED]), LABELS
 
     def rows(self, results: Mapping[str, Any]) -> Iterator[Row]:
         """What there is after some demonstrations, and the edits at the target beside those of labelling from scratch.
@@ -157,6 +156,11 @@ class LabellingCell(Cell):
         studies += [] if self.task in (*SURGEONS, *CHOSE) else ["kept aside"]
         for study_name, ((number, measure), value) in itertools.product(studies, found.items()):
             yield Row(study_name, self.task, self.order, number, self.seed, measure, value)
+
+
+def sawyer(settings: Settings) -> Apart:
+    """Meta-World in its environment."""
+    return Apart("arena_metaworld.py", "arena_requirements.txt", settings.runs)
 
 
 class Patient(Session):

@@ -1,7 +1,7 @@
 """What is done with OGBench's manipulation tasks, by the Python of an environment of its own (``apart.py``).
 
-    python ogbench_manipspace.py collect TASK OUT.hdf5 [--number 60] [--noise 0.0] [--goal 0] [--labels phase]
-    python ogbench_manipspace.py play TASK OUT.json NAME=EXPORTED... [--episodes 50] [--first 0]
+    python -m studies.ogbench_manipspace collect TASK OUT.hdf5 [--number 60] [--noise 0.0] [--goal 0] [--labels phase]
+    python -m studies.ogbench_manipspace play TASK OUT.json NAME=EXPORTED... [--episodes 50] [--first 0]
 
 ``collect`` records OGBench's scripted Markov oracles as OGBench's "noisy" data sets were: an episode has several
 targets one after another, drawn by the environment, and normal noise on every control, whose level is drawn for each
@@ -21,16 +21,17 @@ from typing import Any
 
 os.environ.setdefault("MUJOCO_GL", "egl")
 
-import arena_recording
 import gymnasium
 import numpy as np
 import ogbench.manipspace  # noqa: F401  registers the environments
-from arena_playing import Observation, arguments, named_controllers, play_all
-from arena_recording import Recorded
 from ogbench.manipspace.oracles.markov.button_markov import ButtonMarkovOracle
 from ogbench.manipspace.oracles.markov.cube_markov import CubeMarkovOracle
 from ogbench.manipspace.oracles.markov.drawer_markov import DrawerMarkovOracle
 from ogbench.manipspace.oracles.markov.window_markov import WindowMarkovOracle
+
+from studies import arena_recording
+from studies.arena_playing import Observation, arguments, named_controllers, play_all
+from studies.arena_recording import Recorded
 
 ORACLES = {
     "cube": (CubeMarkovOracle, 9),
@@ -90,8 +91,7 @@ class Collector:
         kinds = dict.fromkeys(target.split()[0] for target in self.targets)
         counts = [ORACLES[kind][1] for kind in kinds]
         self.first = dict(zip(kinds, np.cumsum([0, *counts]).tolist(), strict=False))
-        values = {"phase": sum(counts), "object": len(self.targets)}
-        self.labels = {name: values[name] for name in labels}
+        self.labels = labels
         self.oracles = {kind: announcing(kind, self.env) for kind in kinds}
         self.task, self.noise, self.goal = task, noise, goal
 
@@ -180,13 +180,10 @@ def main() -> None:
     first = own.first or 0
     if own.what == "play":
         seeds = range(first, first + own.episodes)
-        return play_all(Goals(own.task), own.out, named_controllers(own.controllers), seeds, own.recorded)
+        return play_all(Goals(own.task), own.out, named_controllers(own.controllers), seeds)
     collector = Collector(own.task, own.noise, bool(own.goal), own.labels)
-    about = {"noise": own.noise, "objects": collector.targets}
-    arena_recording.collect(
-        own.out, f"{own.task}-v0", collector.episode, own.number, own.held_out, collector.labels, first, own.attempts,
-        **about,
-    )  # fmt: skip
+    about = own.number, own.held_out, first, own.attempts
+    arena_recording.collect(own.out, f"{own.task}-v0", collector.episode, *about)
 
 
 if __name__ == "__main__":

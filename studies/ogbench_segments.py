@@ -1,7 +1,7 @@
 """Phases and objects of OGBench's manipulation tasks: options, with and without labels, beside what else segments.
 
-    python studies/ogbench_segments.py [--tasks cube-single scene ...] [--levels phase object] [--labelled 0 1 3]
-        [--seeds 3] [--noise 0.0] [--jobs 2] [--summarize]
+    python -m studies.ogbench_segments [--tasks cube-single scene ...] [--levels phase object] [--labelled 0 1 3]
+        [--seeds 3] [--noise 0.0] [--jobs 2]
 
 The demonstrations are those of OGBench's own scripted oracles (Park and others, 2025), recorded in an environment of
 its own from ``ogbench_requirements.txt`` by ``ogbench_manipspace.py``, which says what labels are. ``phase`` is what an
@@ -20,13 +20,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import people
-import study
-from apart import HELD_OUT, Apart
-from people import LABELS, PeopleCell
-from study import Row, Settings, described
 
 from ddco_pyro.data.demonstrations import Demonstrations
+from studies import people, study
+from studies.apart import HELD_OUT, Apart
+from studies.people import LABELS, PeopleCell
+from studies.study import Row, Settings, described
 
 RECORDED, TRAINED = 120, 40
 TASKS = ("cube-single", "scene", "cube-double", "puzzle-3x3")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from apart import Apart, World
+from studies.apart import Apart, World
 
 RUNS = Path(__file__).parents[1] / "runs" / "ogbench"
 NOISE = 0.1
@@ -28,7 +28,7 @@ class ManipSpace(World):
     def collect(self, task: str, seeds: range, count: int, path: Path) -> None:
         """Record the first episodes in which the oracle reaches all its targets."""
         options = {"number": count, "held_out": 1, "first": seeds.start, "attempts": len(seeds)}
-        self.simulator.collect(task, path, **options, noise=NOISE, goal=int(self.goal), labels="phase")
+        self.simulator.run("collect", task, path, **options, noise=NOISE, goal=int(self.goal), labels="phase")
 
 
 SHOWN, HIDDEN = ManipSpace(goal=True), ManipSpace(goal=False)

@@ -1,7 +1,7 @@
 """Gestures of surgeons: options without labels, and with a few, beside what a user would try instead (JIGSAWS).
 
-    python studies/people.py --data FOLDER [--tasks Knot_Tying Suturing] [--splits last surgeon trial pusht]
-        [--labelled 0 1 3 5 all] [--jobs 2] [--summarize]
+    python -m studies.people --data FOLDER [--tasks Knot_Tying Suturing] [--splits last surgeon trial pusht]
+        [--labelled 0 1 3 5 all] [--jobs 2]
 
 FOLDER holds ``TASK.hdf5``, of ``ddco-pyro import JIGSAWS/TASK --hz 10``. No licence lets anyone share these data; Johns
 Hopkins University gives them on request.
@@ -18,19 +18,17 @@ import argparse
 import itertools
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import study
 import torch
 from sklearn.cluster import KMeans
 from sklearn.decomposition import PCA
 from sklearn.metrics import normalized_mutual_info_score
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
-from study import Cell, Row, Settings, described
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.inspection import inspect
@@ -48,6 +46,8 @@ from ddco_pyro.spec.yaml import read_yaml
 from ddco_pyro.statistics import edit_score
 from ddco_pyro.training.data import demonstrations as read_demonstrations
 from ddco_pyro.training.data import parts
+from studies import study
+from studies.study import Cell, Row, Settings, described
 
 LABELS, KNOWN = "gesture", "known"
 ALL, SPLITS = "all", ["last", "surgeon", "trial", "pusht"]
@@ -78,10 +78,6 @@ class PeopleCell(Cell):
         """The file, and its demonstrations with the masks of the fold and the true labels as :data:`LABELS`."""
         path = Path(self.data) / f"{self.task}.hdf5"
         return path, divided(labelled_demonstrations(path), self.fold)
-
-    def depends(self, settings: Settings) -> dict[str, Any]:
-        """What decides its results; the place of the data does not."""
-        return {key: value for key, value in asdict(self).items() if key != "data"} | settings.kept()
 
     def results(self, settings: Settings, folder: Path) -> dict[str, Any]:
         """Fit, and compare with the gestures of the held-out demonstrations."""
@@ -151,7 +147,7 @@ class PushTCell(Cell):
 
     def depends(self, settings: Settings) -> dict[str, Any]:
         """What decides its results; the place of the data does not."""
-        return {"method": self.method, "seeds": SEEDS} | settings.kept()
+        return super().depends(settings) | {"seeds": SEEDS}
 
     def results(self, settings: Settings, folder: Path) -> dict[str, Any]:
         """Fit with each seed, and compare the segments of the held-out demonstrations."""

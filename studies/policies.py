@@ -21,16 +21,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import policies_acting
 import torch
-from arena_playing import Chunks, write_chunk
-from policies_acting import Acting, times
 from torch import Tensor, nn
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.errors import BadInput, nearest
 from ddco_pyro.spec.training import OptimizerSpec
 from ddco_pyro.training.optimizers import gradient_optimizer, learning_rate
+from studies import policies_acting
+from studies.arena_playing import Chunks, write_chunk
+from studies.policies_acting import Acting, times
 
 
 @dataclass(frozen=True)

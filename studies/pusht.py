@@ -7,7 +7,19 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from apart import Apart, World
+from studies.apart import Apart, World
+from studies.cells import ROOT
+from studies.files import drawn
 
-RUNS = Path(__file__).parents[1] / "runs" / "pusht"
-WORLD = World(Apart("pusht_gym.py", "pusht_requirements.txt", RUNS))
+RUNS = ROOT / "runs" / "pusht"
+
+
+class PushT(World):
+    """``runs/pusht/pusht_human.hdf5`` has the demonstrations, of which every training seed draws some."""
+
+    def collect(self, task: str, seeds: range, count: int, path: Path) -> None:
+        """Draw demonstrations."""
+        drawn(RUNS / "pusht_human.hdf5", seeds.start, count).write(path)
+
+
+WORLD = PushT(Apart("pusht_gym.py", "pusht_requirements.txt", RUNS))

@@ -1,6 +1,6 @@
 """What is done with PushT itself (gym-pusht), by the Python of an environment of its own (``apart.py``).
 
-    python pusht_gym.py play PushT OUT.json NAME=EXPORTED... [--episodes 50] [--first 100000]
+    python -m studies.pusht_gym play PushT OUT.json NAME=EXPORTED... [--episodes 50] [--first 100000]
 
 Lets exported controllers push the T onto its target from initial states of their own seeds.
 """
@@ -12,8 +12,9 @@ import os
 os.environ.setdefault("MUJOCO_GL", "egl")  # or the window of a person is asked for
 
 import numpy as np
-from arena_playing import Observation, arguments, named_controllers, play_all
 from gym_pusht.envs.pusht import PushTEnv
+
+from studies.arena_playing import Observation, arguments, named_controllers, play_all
 
 TIME = 300
 """Steps of an episode, as in the published results (Chi et al. 2023)."""
@@ -52,7 +53,7 @@ def main() -> None:
     own = arguments(__doc__, ("play",), 0).parse_args()
     first = own.first or 0
     seeds = range(first, first + own.episodes)
-    play_all(PushT(), own.out, named_controllers(own.controllers), seeds, own.recorded)
+    play_all(PushT(), own.out, named_controllers(own.controllers), seeds)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from apart import Apart, World
+from studies.apart import Apart, World
 
 RUNS = Path(__file__).parents[1] / "runs" / "metaworld"
 SIMULATOR = Apart("arena_metaworld.py", "arena_requirements.txt", RUNS)
@@ -21,7 +21,7 @@ class MetaWorld(World):
     def collect(self, task: str, seeds: range, count: int, path: Path) -> None:
         """Record the first successful episodes of the expert with noise on its controls."""
         options = {"number": count, "held_out": 1, "first": seeds.start, "attempts": len(seeds), "noise": NOISE}
-        self.simulator.collect(task, path, **options)
+        self.simulator.run("collect", task, path, **options)
 
 
 WORLD = MetaWorld(SIMULATOR)

@@ -5,30 +5,34 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from apart import Peers
-from policies import Policy
-
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.simulation.collect import collect
 from ddco_pyro.simulation.episodes import run_episodes
 from ddco_pyro.spec import DemonstrationsSpec
+from studies.apart import Peers
+from studies.policies import Policy
 
-SUPERVISOR = {"pushing_cue": "scripted_noisy_0.3"}
-"""The scripted policies that demonstrate, where it is another than ``supervisor``."""
+RECORDED = {
+    "pushing": ("pushing_goal", "scripted_noisy_0.3", ()),
+    "pushing_cue": ("pushing_cue", "scripted_noisy_0.3", ()),
+    "bin_picking": ("bin_picking", "supervisor", ("image",)),
+}
+"""The task, the scripted policy and the cameras of demonstrations, where they are not the task's supervisor alone."""
 
 
 class Simulated(Peers):
-    """Registered tasks."""
+    """Registered tasks, of installed packages or ``module:name``."""
 
     def collect(self, task: str, seeds: range, count: int, path: Path) -> None:
         """Record the supervisor."""
-        how = {"count": count, "seed": seeds.start, "supervisor": SUPERVISOR.get(task, "supervisor")}
-        collect(task, DemonstrationsSpec(**how), path)
+        recorded, supervisor, cameras = RECORDED.get(task, (task, "supervisor", ()))
+        how = {"count": count, "seed": seeds.start, "supervisor": supervisor}
+        collect(recorded, DemonstrationsSpec(**how), path, observed=cameras)
 
     def play(self, task: str, fitted: Fit | Policy, starts: range, folder: Path) -> Sequence[Mapping[str, float]]:
         """The outcome of an episode from each start."""
-        policy = fitted.controller() if isinstance(fitted, Fit) else fitted
-        return [episode.outcome for episode in run_episodes(task, policy, starts, jobs=1, keep=())]
+        policy, observed = (fitted.controller(), fitted.spec.observed) if isinstance(fitted, Fit) else (fitted, ())
+        return [episode.outcome for episode in run_episodes(task, policy, starts, 0, 1, observed, ())]
 
 
 WORLD = Simulated()

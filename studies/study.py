@@ -1,4 +1,4 @@
-"""Studies by scripts: cells are kept as those of ``ddco-pyro study``, and tidy tables get their numbers."""
+"""Studies by scripts: cells are kept as those of a declaration, and tidy tables get their numbers."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import json
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, astuple, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,15 +17,11 @@ import pandas as pd
 
 from ddco_pyro.cli.console import Progress
 from ddco_pyro.data.files import only_one, write_text
-from ddco_pyro.drawing.page import Table
 from ddco_pyro.errors import BadInput, Failed
 from ddco_pyro.jobs import Workers
-from ddco_pyro.study import cells
-from ddco_pyro.study.report import shown as mean_and_interval
-from ddco_pyro.study.table import COLUMNS, estimate, read_tidy
-
-ROOT = Path(__file__).resolve().parents[1]
-RESULTS = ROOT / "docs" / "results"
+from studies import cells
+from studies.page import RESULTS
+from studies.statistics import COLUMNS, read_tidy
 
 
 class Row(NamedTuple):
@@ -40,56 +36,29 @@ class Row(NamedTuple):
     value: float
 
 
-def tidy(rows: Iterable[Row]) -> pd.DataFrame:
-    """The rows as :func:`ddco_pyro.study.table.read_tidy` reads them."""
-    text = [(*("" if part is None else str(part) for part in row[:-1]), row[-1]) for row in rows]
-    return pd.DataFrame(text, columns=COLUMNS)
-
-
 def add(path: Path, rows: Iterable[Row]) -> None:
     """Write rows into a table, in the place of those of the same cell and measure; another process may do so too."""
+    text = [(*("" if part is None else str(part) for part in row[:-1]), row[-1]) for row in rows]
     with only_one(path.parent, wait=True):
         tables = [read_tidy(path)] if path.exists() else []
-        table = pd.concat([*tables, tidy(rows)]).groupby(COLUMNS[:-1], sort=False, as_index=False).last()
+        table = pd.concat([*tables, pd.DataFrame(text, columns=COLUMNS)])
+        table = table.groupby(COLUMNS[:-1], sort=False, as_index=False).last()
         write_text(path, table.to_csv(index=False, lineterminator="\n", float_format="%.9g"))
-
-
-def shown(rows: Iterable[Row]) -> str:
-    """Means over seeds with 95 % t intervals, as Markdown: a line for each method and number of demonstrations."""
-    table, lines = tidy(rows), []
-    measures = table.measure.unique()
-    for named, own_cells in table.groupby(COLUMNS[:4], sort=False):
-        by_measure = dict(iter(own_cells.set_index(["task", "seed"]).groupby("measure").value))
-        means = {measure: mean_and_interval(estimate(own), ".3g") for measure, own in by_measure.items()}
-        lines.append([*named, *(means.get(measure, "-") for measure in measures)])
-    return Table([*COLUMNS[:4], *measures], lines, range(4)).markdown() + "\n"
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What all cells of a study share.
-
-    :param values: numbers that decide a result, by the name of their option: a study has its own.
-    :param runs: the folder of everything but the results.
-    :param overrides: of the specs, each KEY=VALUE.
-    """
+    """What all cells of a study share: numbers that decide a result, by the name of their option, and a folder."""
 
     values: Mapping[str, float]
     runs: Path
-    overrides: tuple[str, ...] = ()
-
-    def kept(self) -> dict[str, Any]:
-        """What decides a result."""
-        return {**self.values, "overrides": list(self.overrides)}
-
-    def given(self, own: argparse.Namespace) -> Settings:
-        """What the command line says of all cells."""
-        values = {name: getattr(own, name) for name in self.values}
-        return replace(self, values=values, runs=own.runs, overrides=tuple(own.set))
 
 
 class Cell(ABC):
     """A cell of a study. Each study has a dataclass of its own, whose fields name a cell."""
+
+    name: str
+    """Of its files."""
 
     @abstractmethod
     def results(self, settings: Settings, folder: Path) -> dict[str, Any]:
@@ -102,27 +71,23 @@ class Cell(ABC):
     def rows(self, results: Mapping[str, Any]) -> Iterable[Row]:
         """Its numbers in the study's table."""
 
-    @property
-    def name(self) -> str:
-        """Of its files."""
-        return "-".join(map(str, astuple(self)))
-
     def depends(self, settings: Settings) -> dict[str, Any]:
-        """What decides its results."""
-        return asdict(self) | settings.kept()
+        """What decides its results; the place of the data does not."""
+        fields = asdict(self)  # type: ignore[call-overload]
+        return {key: value for key, value in fields.items() if key != "data"} | dict(settings.values)
 
     def path(self, settings: Settings) -> Path:
         """Its file; other settings have other files."""
-        digest = hashlib.sha256(json.dumps(settings.kept()).encode()).hexdigest()[:8]
+        digest = hashlib.sha256(json.dumps(dict(settings.values)).encode()).hexdigest()[:8]
         return settings.runs / "cells" / f"{self.name}-{digest}.json"
 
     def do(self, settings: Settings) -> str:
         """Do it, unless it is done; returns why it failed."""
-        return cells.do(
-            self.path(settings),
-            self.depends(settings),
-            lambda folder: {"values": self.results(settings, folder / "fit")},
-        )
+
+        def work(folder: Path) -> dict[str, Any]:
+            return {"values": self.results(settings, folder / "fit")}
+
+        return cells.do(self.path(settings), self.depends(settings), work)
 
     def kept(self, settings: Settings) -> dict[str, Any] | None:
         """Its results; None where they are missing."""
@@ -151,7 +116,7 @@ def main(
     asked: Callable[[argparse.Namespace], Sequence[Cell]],
     first: Callable[[Settings], object] = lambda settings: None,
 ) -> None:
-    """Do the cells of a study that are not done, write the rows of every one that is, and print their means.
+    """Do the cells of a study that are not done, and write the rows of every one that is.
 
     :param table: ``docs/results/TABLE.csv``.
     :param parser: has the options that ``asked`` reads.
@@ -160,27 +125,23 @@ def main(
     """
     for name, value in defaults.values.items():
         parser.add_argument(f"--{name}", type=type(value), default=value)
-    parser.add_argument("--set", action="append", default=list(defaults.overrides), metavar="KEY=VALUE")
     parser.add_argument("--runs", type=Path, default=defaults.runs)
     parser.add_argument("--jobs", type=int, default=1, help="cells at a time; each works on one thread")
-    parser.add_argument("--summarize", action="store_true", help="do nothing that is not done")
     parser.add_argument("--out", type=Path, default=RESULTS / f"{table}.csv")
     own = parser.parse_args()
 
     def work() -> str:
-        settings, wanted = defaults.given(own), list(asked(own))
+        settings, wanted = Settings({name: getattr(own, name) for name in defaults.values}, own.runs), [*asked(own)]
         if not wanted:
             raise BadInput(f"{Path(sys.argv[0]).name}: there is nothing to do: a list or a number is empty or 0")
+        first(settings)
         calls = {cell.name: partial(cell.do, settings) for cell in wanted if cell.kept(settings) is None}
-        if not own.summarize:
-            first(settings)
-            with Progress() as progress:
-                cells.do_all(calls, len(wanted) - len(calls), Workers(own.jobs), progress)
+        with Progress() as progress:
+            cells.do_all(calls, len(wanted) - len(calls), Workers(own.jobs), progress)
         done = {cell: found for cell in wanted if (found := cell.kept(settings)) is not None}
-        rows = [row for cell, found in done.items() for row in cell.rows(found)]
-        add(own.out, rows)
-        if not own.summarize and len(done) < len(wanted):
+        add(own.out, [row for cell, found in done.items() for row in cell.rows(found)])
+        if len(done) < len(wanted):
             raise Failed(f"{len(wanted) - len(done)} of {len(wanted)} cells failed; the same command tries them again")
-        return shown(rows)
+        return f"{own.out}: has the numbers of {len(done)} cells"
 
     printed(work)

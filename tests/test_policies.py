@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import apart
-import arena_playing
 import numpy as np
-import policies
 import pytest
 import torch
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.errors import BadInput
 from ddco_pyro.spec import parse_spec
-from ddco_pyro.study.cells import Cell, Job
+from studies import apart, arena_playing, policies
+from studies.cells import Cell, Job
 
 BRIEF = {"steps": 400, "hidden": [32, 32], "rate": 5e-3}
 

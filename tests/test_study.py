@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-import study
-from study import RESULTS, Cell, Row, Settings, add, described
 
 from ddco_pyro.data.files import only_one
-from ddco_pyro.study.table import COLUMNS, read_tidy
+from studies import study
+from studies.page import RESULTS
+from studies.statistics import COLUMNS, read_tidy
+from studies.study import Cell, Row, Settings, add, described
 
 DEFAULTS = Settings({"episodes": 3, "noise": 0.5}, Path("unused"))
 
@@ -22,6 +23,10 @@ class Toy(Cell):
 
     task: str
     seed: int
+
+    @property
+    def name(self):
+        return f"{self.task}-{self.seed}"
 
     def results(self, settings, folder):
         done = settings.runs / "done"
@@ -46,14 +51,13 @@ def run(monkeypatch, tmp_path, words):
 def test_cells_are_done_once_and_their_numbers_are_in_the_table(tmp_path, monkeypatch, capsys):
     add(tmp_path / "toy.csv", [Row("toy", "old", "ddco", 10, 0, "product", 7.0)])
     whole = ["a-2", "a-4", "b-2", "b-4"]
-    assert run(monkeypatch, tmp_path, ["--noise", "0.25", "--set", "a=1"]) == whole
+    assert run(monkeypatch, tmp_path, ["--noise", "0.25"]) == whole
     assert [row[1:] for row in read_tidy(tmp_path / "toy.csv").itertuples(index=False)] == [
         ("old", "ddco", "10", "0", "product", 7.0),
         *((task, "ddco", "", str(seed), "product", 0.25 * seed) for task in "ab" for seed in (2, 4)),
     ]
-    # t(0.975, 1) = 12.7062 times the standard error 0.25
-    assert "| toy | a | ddco |  | 0.75 [−2.43, 3.93] |" in capsys.readouterr().out
-    assert run(monkeypatch, tmp_path, ["--noise", "0.25", "--set", "a=1"]) == whole
+    assert "toy.csv: has the numbers of 4 cells" in capsys.readouterr().out
+    assert run(monkeypatch, tmp_path, ["--noise", "0.25"]) == whole
     assert run(monkeypatch, tmp_path, ["--tasks", "a"]) == [*whole, "a-2", "a-4"]  # other settings
     assert [*read_tidy(tmp_path / "toy.csv").value] == [7.0, 1.0, 2.0, 0.5, 1.0]
 

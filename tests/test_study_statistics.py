@@ -9,9 +9,8 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from ddco_pyro.study import report
-from ddco_pyro.study.declaration import ContrastSpec
-from ddco_pyro.study.table import COLUMNS, estimate, holm, values
+from studies.declaration import ContrastSpec
+from studies.statistics import COLUMNS, estimate, holm, values, verdicts
 
 ROOT = Path(__file__).parents[1]
 
@@ -29,7 +28,7 @@ def paired(ours, theirs):
         for method, own in (("ours", ours), ("theirs", theirs))
         for (task, seed), value in own.items()
     ]
-    return values(pd.DataFrame(rows, columns=COLUMNS), "ours - theirs", "nats", [5])
+    return values(pd.DataFrame(rows, columns=COLUMNS), "ours - theirs", "nats", [5], None)
 
 
 def test_one_task_is_the_paired_t_test_over_seeds():
@@ -142,7 +141,7 @@ def test_holm_gives_what_hand_computation_gives():
     ],
 )
 def test_a_fixed_sequence_ends_where_a_contrast_does_not_hold(p_values, said):
-    judged = report.verdicts(p_values, "fixed_sequence")
+    judged = verdicts(p_values, "fixed_sequence")
     assert [verdict for verdict, _ in judged] == said
     largest = [max(1.0 if np.isnan(p) else p for p in p_values[: n + 1]) for n in range(len(p_values))]
     assert [p for _, p in judged] == largest
@@ -158,13 +157,13 @@ def test_a_fixed_sequence_ends_where_a_contrast_does_not_hold(p_values, said):
 )
 def test_equivalence_is_read_off_the_interval_of_its_twin(p_values, said):
     """Claims 1 and 3 are the equivalence of 0 and of 2."""
-    assert [verdict for verdict, _ in report.verdicts(p_values, "fixed_sequence", {1: 0, 3: 2})] == said
+    assert [verdict for verdict, _ in verdicts(p_values, "fixed_sequence", {1: 0, 3: 2})] == said
 
 
 def test_a_fixed_sequence_errs_as_often_as_its_level_says():
     """Of ten claims the first is right; another one holds in at most 2.5 % of the studies, without a correction."""
     p_values = np.random.default_rng(6).random((2000, 10)) * [1e-3, *[1.0] * 9]
-    found = [[verdict for verdict, _ in report.verdicts(list(own), "fixed_sequence")] for own in p_values]
+    found = [[verdict for verdict, _ in verdicts(list(own), "fixed_sequence")] for own in p_values]
     assert all(one[0] == "holds" for one in found)
     assert np.mean(["holds" in one[1:] for one in found]) == pytest.approx(0.025, abs=0.01)
 
@@ -182,7 +181,7 @@ def test_equivalence_is_an_interval_within_the_margin():
             assert known.p_value(*contrast.bounds) == pytest.approx(max(sides))
             low, high = stats.ttest_1samp(units, 0).confidence_interval(0.95)
             within, beyond = -0.15 < low < high < 0.15, high < -0.15 or low > 0.15
-            ((verdict, _),) = report.verdicts([known.p_value(*contrast.bounds)])
+            ((verdict, _),) = verdicts([known.p_value(*contrast.bounds)])
             assert verdict == ("holds" if within else "does not hold" if beyond else "inconclusive")
             told.add(verdict)
     assert len(told) == 3
@@ -191,7 +190,7 @@ def test_equivalence_is_an_interval_within_the_margin():
 def test_siblings_are_one_unit():
     """Door 0.5 and 2, by hand 1.25; window 4; push 1."""
     own = by_seed(open=[0, 1], close=[1, 2, 3], window=[4], push=[1])
-    found = estimate(own, families={"open": "door", "close": "door"})
+    found = estimate(own, families={"door": ["open", "close"]})
     test = stats.ttest_1samp([1.25, 4, 1], 0.0, alternative="greater")
     assert found.units == (1.25, 4, 1)
     assert found.value == pytest.approx(6.25 / 3)

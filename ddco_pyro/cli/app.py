@@ -20,7 +20,7 @@ from typing import Annotated, Any
 
 import typer
 
-from ddco_pyro.cli import NARROW, demos, fits, label, runs, starting, study
+from ddco_pyro.cli import NARROW, demos, fits, label, runs, starting
 from ddco_pyro.errors import BadInput, Failed, reason
 
 app = typer.Typer(
@@ -47,7 +47,6 @@ EXAMPLES: dict[Callable[..., None], str] = {
     demos.collect: "collect specs/needle.yaml --out needle.hdf5",
     runs.rollout: "rollout runs/needle --episodes 200 --video",
     runs.export: "export runs/mine --out controller --onnx",
-    study.study: "study run studies/mine.yaml --jobs 2",
 }
 """Every command, in the order of ``--help``: as a user needs them."""
 

@@ -6,7 +6,6 @@ import re
 from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import NamedTuple
-from zipfile import is_zipfile
 
 TRAJECTORY, EPISODE = re.compile(r"traj_(\d+)"), re.compile(r"episode_(\d+)\.(?:hdf5|h5)")
 """Names of ManiSkill's groups, and of ACT's files."""
@@ -56,11 +55,6 @@ FORMATS = {
         "the folder of a Minari dataset",
         "data/metadata.json",
         parts=True,
-    ),
-    "ogbench": Format(
-        "ogbench:open_ogbench",
-        lambda path, names: path.is_file() and (path.suffix == ".npz" or is_zipfile(path)),
-        "an npz file of OGBench",
     ),
     "maniskill": Format(
         "hdf5_layouts:ManiSkill",

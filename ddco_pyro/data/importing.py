@@ -195,9 +195,7 @@ def _chosen(recording: Recording, choice: Choice, frequency: float | None) -> Re
                 f"{recording.name}: there is no observation {key!r}{nearest(key, keys)}; there is: {', '.join(names)}"
             )
     wanted = [keys[key] for key in choice.observations] or [
-        key
-        for key, column in known.items()
-        if column.dtype.kind in NUMBERS and not column.aside and (choice.videos or not column.video)
+        key for key, column in known.items() if column.dtype.kind in NUMBERS and (choice.videos or not column.video)
     ]
     if not wanted:
         why = "; ".join(_unread(recording, replace(recording, observations={}))) or "there is none"

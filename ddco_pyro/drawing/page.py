@@ -100,19 +100,11 @@ class Folded:
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure on a page: PNG as a data URI, its alternative text and its caption.
-
-    :param file: the file beside the page that Markdown shows; empty for none.
-    """
+    """A figure on a page: PNG as a data URI, its alternative text and its caption."""
 
     uri: str
     alt: str
     caption: str
-    file: str = ""
-
-    def markdown(self) -> str:
-        """The figure and its caption in Markdown."""
-        return f"![{self.alt}]({self.file})\n\n{self.caption}".rstrip() if self.file else ""
 
 
 @dataclass(frozen=True)
@@ -227,8 +219,6 @@ def _kind(block: Any) -> str:
 def _markdown(blocks: Sequence[Block]) -> str:
     flat = chain.from_iterable(block.blocks if isinstance(block, Folded) else [block] for block in blocks)
     shown = (
-        block.text if isinstance(block, Text) else block.markdown()
-        for block in flat
-        if isinstance(block, Table | Text | Picture)
+        block.text if isinstance(block, Text) else block.markdown() for block in flat if isinstance(block, Table | Text)
     )
     return "\n\n".join(filter(None, shown))

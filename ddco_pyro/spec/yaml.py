@@ -161,12 +161,7 @@ def user_code(spec: Spec) -> dict[str, str]:
     """
     tasks, registered = {"task": spec.task, "demonstrations.task": spec.demonstrations.task}, entry_points(group=TASKS)
     names = {place: name for place, name in tasks.items() if name and ":" in name and name not in registered.names}
-    return names | user_networks(spec)
-
-
-def user_networks(part: Model) -> dict[str, str]:
-    """Key path to ``module:Class`` of the user's networks in a part of a spec."""
-    return dict(_user_networks(part, ""))
+    return names | dict(_user_networks(spec, ""))
 
 
 def _user_networks(part: Any, place: str) -> Iterator[tuple[str, str]]:

@@ -14,7 +14,7 @@ from odd_files.hdf5 import instead
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.hdf5 import DemonstrationsError
-from ddco_pyro.data.importing import Choice, import_demonstrations
+from ddco_pyro.data.importing import import_demonstrations
 from ddco_pyro.data.inspection import inspect
 from ddco_pyro.errors import command
 
@@ -75,34 +75,6 @@ def test_the_base_of_a_mobile_robot_is_part_of_its_control(tmp_path: Path) -> No
     demos = imported(odd.act(tmp_path, base=True), tmp_path)
     for number, demo in enumerate(demos):
         np.testing.assert_array_equal(demo.actions, np.hstack([odd.control(number), -odd.control(number)]))
-
-
-@pytest.mark.parametrize("asked", [(), ("qpos", "observations"), ("state", "qpos")])
-def test_ogbench(asked: tuple[str, ...], tmp_path: Path) -> None:
-    path, out = odd.ogbench(tmp_path), tmp_path / "demos.hdf5"
-    assert inspect(path).format == "ogbench"
-    import_demonstrations(path, out, choice=Choice(asked))
-    demos = Demonstrations.read(out)
-    same_controls(demos)
-    assert set(demos.observation_shapes) == {"state", *("qpos" for _ in asked[:1])}
-    for number, demo in enumerate(demos):
-        for key, sign in (("state", 1), ("qpos", -1))[: 1 + bool(asked)]:
-            np.testing.assert_array_equal(demo.observations[key], sign * odd.state(number))
-
-
-def test_an_array_called_state_keeps_its_name(tmp_path: Path) -> None:
-    path = odd.ogbench(tmp_path, state=np.zeros((12, 1)))
-    assert set(inspect(path).fields) == {"actions", "obs/observations", "obs/qpos", "obs/state"}
-
-
-def test_ogbenchs_pictures_and_discrete_actions(tmp_path: Path) -> None:
-    frames = np.concatenate([odd.pictures(number) for number in range(3)])
-    path = odd.ogbench(tmp_path, observations=frames, actions=np.arange(12) % 3, timeouts=np.arange(12) == 5)
-    demos = imported(path, tmp_path)
-    assert demos.lengths == (3, 3, 2, 4)
-    np.testing.assert_array_equal(np.concatenate([np.asarray(demo.observations["state"]) for demo in demos]), frames)
-    np.testing.assert_array_equal(np.concatenate([demo.actions for demo in demos]).ravel(), np.arange(12) % 3)
-    assert demos[0].actions.dtype == np.int64
 
 
 @pytest.mark.parametrize("name", [name for name, row in odd.ROWS.items() if row.says not in (None, odd.IMPORT)])

@@ -6,11 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bin_picking import criteria
-from bin_picking_recovery import Load, Trial, counted
 from ddco_tasks.bin_picking import task
 from ddco_tasks.bin_picking.supervisor import JAW_OPEN
-from ddco_tasks.bin_picking.trials import Attempt, Trials
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.fitting.fit import fit
@@ -78,39 +75,3 @@ def test_demonstrations_are_fitted_and_rolled_out(demonstrations: Path, tmp_path
     measures = rolled.methods[fitted.name].measures
     assert measures.keys() == task.measures.keys()
     assert measures["attempts"].mean >= 1
-
-
-# --- what the studies make of demonstrations --------------------------------------------------------------------------
-
-
-def test_criteria_are_sums_over_bins() -> None:
-    nothing = Trials(()).measures() | dict.fromkeys(("cleared", "success"), 0.0)
-    first = nothing | {"cleared": 1, "attempts": 4, "single": 3, "due_recoveries": 2, "nothing": 1, "recovered": 2}
-    second = nothing | {"attempts": 2, "single": 0, "due_recoveries": 2, "recovered": 1, "nothing_recovered": 0}
-    found = criteria([first | {"nothing_recovered": 1}, second])
-    assert found["success"] == (1, 2)
-    assert found["grasp of exactly one"] == (3, 6)
-    assert found["recovery, recall"] == (3, 4)
-    assert found["recall where nothing is held"] == (1, 1)
-    assert found["recall where several are"] == (2, 3)
-
-
-def test_recoveries_are_of_what_is_held_where_it_is_shown() -> None:
-    """What is lost after it was shown alone is nobody's to take back; trials without a decision do not count."""
-    none, first, both = frozenset[int](), frozenset({0}), frozenset({0, 1})
-    back, several = Attempt(2, none, none, ("bin",), 10), Attempt(2, both, both, ("bin", "bin"), 10)
-    cup, lost = Attempt(2, first, first, ("accept",), 10), Attempt(2, first, none, ("accept",), 10)
-    dropped, kept = Attempt(2, first, first, ("bin",), 10), Attempt(2, first, first, (), 20)
-    shown = [(none, back), (none, lost), (both, several), (both, cup), (first, cup), (first, lost)]
-    others = [(first, dropped), (first, None), (None, back), (first, kept)]
-    trials = []
-    for held, attempt in shown + others:
-        load = None if held is None else Load(held, shown=True, seen=bool(held))
-        trials.append(Trial(slice(0, 10), first, attempt, load))
-    found = counted(trials)
-    falling = counted([Trial(slice(0, 10), first, lost, Load(none, shown=True, seen=True))])
-    assert found == {
-        "nothing": 2, "nothing back": 1, "unseen": 2, "unseen back": 1, "several": 2, "several back": 1, "one": 3,
-        "one back": 1, "one lost": 1, "due back": 4, "back": 2,
-    }  # fmt: skip
-    assert (falling["nothing"], falling["unseen"]) == (1, 0)

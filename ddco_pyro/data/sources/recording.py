@@ -49,7 +49,6 @@ class Column:
     :param video: whether reading decodes a video.
     :param kept: the array as lazy pictures in an HDF5 file; None for other arrays.
     :param named: the name of the array in its source; empty where that is its place in a :class:`Recording`.
-    :param aside: whether an import leaves the array out unless it is asked for.
     """
 
     shape: tuple[int, ...]
@@ -58,7 +57,6 @@ class Column:
     video: bool = False
     kept: Pictures | None = None
     named: str = ""
-    aside: bool = False
 
     @property
     def image(self) -> bool:

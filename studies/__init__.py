@@ -1,0 +1,1 @@
+"""Studies: methods compared over training seeds and tasks. A package of the checkout (``python -m studies``)."""
