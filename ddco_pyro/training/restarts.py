@@ -60,6 +60,8 @@ BESIDE = "the mixture beside"
 """What a restart that goes on from a baseline begins from."""
 ROUNDING = 1e-3
 """Nats per step by which objectives of models that say the same may differ."""
+SELDOM = -4.0
+"""A logit of ψ with which options last: 55 steps in the mean."""
 ALMOST_ALWAYS = 6.0
 """A logit of ψ with which options that last are as likely as the mixture, up to 0.004 nats per step."""
 
@@ -209,15 +211,15 @@ class Trainer:
     def contain(self, mixture: Hierarchy, objective: float) -> Hierarchy:
         """Keep no model that is less likely in training than a mixture which the hierarchy contains.
 
-        Where no restart is as likely, further ones go on from the mixture: first with ψ = 1/2, then with ψ nearly 1,
-        where options that last are as likely as the mixture from the first step on.
+        Where no restart is as likely, further ones go on from the mixture: first with options that last, then with ψ
+        nearly 1, where they are as likely as the mixture from the first step on.
 
         :param mixture: networks of the same spec, whose options end after every step.
         :param objective: of the mixture, nats per step of the same demonstrations.
         :returns: the best restart's hierarchy.
         """
         self._least = objective - ROUNDING
-        for logit in (0.0, ALMOST_ALWAYS):
+        for logit in (SELDOM, ALMOST_ALWAYS):
             if self.objective >= self._least:
                 break
             self._go_on(mixture, logit)
