@@ -133,7 +133,6 @@ def test_a_run_of_a_file_that_has_changed_is_not_shown(changing: Path) -> None:
         (run, ["fit", run / "spec.yaml", "--out", run, "--resume"]),
         (run, ["report", run]),
         (run / "baselines" / "flat", ["report", run / "baselines" / "flat"]),
-        (run, ["merge", run, "--out", changing / "merged"]),
         (run, ["compare", run, run / "baselines" / "flat", "--out", changing / "compared"]),
     ):
         assert call(*command) == (2, "", f"ddco-pyro: {REFUSED.format(folder=folder, what=what)}\n")

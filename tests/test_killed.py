@@ -131,7 +131,6 @@ CASES = {
     "select": Case("selected", same_selection, folds),
     "segment": Case("labelled.hdf5", same_segments),
     "segment in place": Case("toy.hdf5", same_segments, inputs=("toy.hdf5",)),
-    "merge": Case("merged", same_run, epochs, ("elsewhere/run",)),
     "rollout": Case("run", same_rollouts, rolled, ("elsewhere/run",)),
 }
 COMMANDS = {
@@ -142,7 +141,6 @@ COMMANDS = {
     "select": "select {inputs}/grid.yaml --out selected --jobs 2",
     "segment": "segment {inputs}/run {inputs}/toy.hdf5 --out labelled.hdf5 --csv a.csv --html a.html",
     "segment in place": "segment {inputs}/run toy.hdf5 --in-place --csv a.csv --html a.html",
-    "merge": "merge run --out merged --jobs 2 --allow-code",
     "rollout": "rollout run --episodes 40 --jobs 2 --allow-code",
 }
 
@@ -195,7 +193,7 @@ def check(name: str, inputs: Path, tmp_path: Path, kills: int, seed: int, by: si
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["collect", "fit", "fit to pictures", "select", "merge", "rollout"])
+@pytest.mark.parametrize("name", ["collect", "fit", "fit to pictures", "select", "rollout"])
 def test_terminated_and_called_again(inputs: Path, tmp_path: Path, name: str) -> None:
     """A scheduler's preemption, five times: each ends with a line, without helpers left behind, and goes on."""
     assert check(name, inputs, tmp_path, kills=5, seed=11, by=signal.SIGTERM) > 0

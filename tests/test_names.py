@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import re
-import shlex
 from dataclasses import replace
 
 import h5py
@@ -23,6 +22,7 @@ from ddco_pyro.exporting import write_numpy
 from ddco_pyro.fitting.names import accepted, matched
 from ddco_pyro.metrics import NamedByLabel
 from ddco_pyro.names import label_name
+from ddco_pyro.report.options import use_table
 from ddco_pyro.spec import parse_spec
 
 SPEC = {
@@ -153,12 +153,11 @@ def test_names_are_shown_wherever_options_are(files):
     rows = list(csv.DictReader(outputs["--csv"].open()))
     assert [row["skill_name"] for row in rows] == truth
     assert all(fit.names["skill"][int(row["skill"])] == row["skill_name"] for row in rows)
-    shown = call("name", run).out
-    (row,) = re.findall(r"pick & place \(option 2\).*", shown)
+    (row,) = (row for row in use_table(fit).rows if str(row[1]) == "pick & place (option 2)")
     (instances,) = re.findall(
         r"pick &amp; place \(option 2\).*?Segments</dt><dd>(\d+)", (run / "report.html").read_text(), re.DOTALL
     )
-    assert [cell.strip() for cell in row.split("│")][2:] == [instances, "4 steps", "grasp 1.00"]
+    assert row[3:] == [instances, "4 steps", "grasp 1.00"]
     with h5py.File(demos) as file:
         place = file["data/demo_0/obs/place"][0]
     controller, monitor = fit.controller(), fit.monitor()
@@ -186,28 +185,21 @@ def test_a_file_with_labels_keeps_the_names_of_options_and_of_labels(files, tmp_
     assert "# labels 0, 1, ...: reach, grasp, lift\n" in text
 
 
-def test_a_proposed_name_comes_with_the_command_that_takes_it(files, capsys):
+def test_a_proposed_name_comes_with_the_line_that_takes_it(files, capsys):
     fit = ddco_pyro.load(files / "run")
     half = [NamedByLabel(level="skill", option=2, labels="phase", name="hold", agreement=0.5)]
     console.names(replace(fit, named={}, metrics=fit.metrics.model_copy(update={"named_by_labels": half})))
     said = capsys.readouterr().out
     assert "names proposed, not written: option 2 as hold 0.50" in said
-    again = said.partition("to take them: ddco-pyro ")[2].splitlines()[0]
-    assert call(*shlex.split(again)).status == 0
+    line = said.partition(f"to take them, write into {files / 'run' / 'names.yaml'}: ")[2].splitlines()[0]
+    (files / "run" / "names.yaml").write_text(line)
     assert ddco_pyro.load(files / "run").names["skill"] == ("control", "option 1", "hold", "option 3")
 
 
-def test_the_command_writes_names_that_are_read_again(files):
-    ended = call("name", files / "run", "--level", "skill", "a, b ,c d")
-    assert ended.status == 0
-    assert "c d (option 3)" in ended.out
+def test_names_that_are_given_are_read_again(files):
     fit = ddco_pyro.load(files / "run")
-    assert fit.names == {"skill": ("control", "a", "b", "c d")}
     fit.name_options("skill", ["é", "010", "yes"])
     assert ddco_pyro.load(files / "run").names == fit.names == {"skill": ("control", "é", "010", "yes")}
-    merged = call("merge", files / "run", "--options", 1, 2, "--out", files / "merged", "--jobs", 1)
-    assert "Merged options é (option 1) and 010 (option 2)" in merged.out
-    assert set(ddco_pyro.load(files / "merged").names["skill"]) <= {"control", "é + 010", "yes", "option 1", "option 2"}
 
 
 @pytest.mark.parametrize(

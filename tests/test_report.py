@@ -215,16 +215,6 @@ def test_a_label_has_the_colour_of_the_option_that_it_is_matched_with(labelled):
     assert lanes["phase"]
 
 
-@pytest.mark.parametrize(("divergence", "proposed"), [(0.05, True), (0.5, False)])
-def test_only_options_that_act_alike_are_to_be_merged(labelled, divergence, proposed):
-    found, _, demos = labelled
-    data = found.metrics.model_dump()
-    for row in data["divergences"][0]:
-        row["divergence"] = divergence
-    other = replace(found, metrics=Metrics.model_validate(data))
-    assert ("ddco-pyro merge" in write_report(other, demos).read_text()) == proposed
-
-
 def test_a_long_list_is_folded_and_long_timelines_are_cut(labelled, monkeypatch, drawn_here):
     """With every figure drawn."""
     found, _, demos = labelled

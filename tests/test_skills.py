@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 import torch
 from matplotlib.colors import to_rgb
-from scipy.cluster.hierarchy import linkage
 
 from ddco_pyro.data.demonstrations import Demonstration
 from ddco_pyro.drawing.colours import CONTROL, OPTIONS, option_rgb
-from ddco_pyro.drawing.diagrams import dendrogram, path_film, transition_graph, typical_paths
+from ddco_pyro.drawing.diagrams import path_film, transition_graph, typical_paths
 from ddco_pyro.drawing.shown import frames, projection
 from ddco_pyro.report.inputs import _shares
 from ddco_pyro.report.skills import Instance, aligned, film_of, instances, sheet_of, transitions
@@ -130,14 +129,6 @@ def test_each_path_of_two_arms_has_a_line_of_its_own():
     assert re.findall(r'<polyline[^>]*stroke-dasharray="([^"]*)"', drawn) == ["none", "5 2.5"]
     assert drawn.count('class="faint"') == 4
     assert len(re.findall("<circle", path_film(both[:1], np.array([[0], [3], [5]]), 1.0, "#123456"))) == 2
-
-
-def test_a_dendrogram_joins_the_alike_first():
-    merges = linkage([1.0, 9.0, 16.0], "average")  # pairs (1, 2), (1, 3), (2, 3)
-    drawn = dendrogram(merges, [1, 2, 3], ["control", "reach", "grasp", "lift"])
-    assert re.findall(r">(\d+\.\d\d)<", drawn) == ["1.00", "12.50"]
-    names = re.findall(r">(reach|grasp|lift)<", drawn)
-    assert abs(names.index("reach") - names.index("grasp")) == 1
 
 
 def test_shares_are_those_of_the_weights_of_a_linear_policy():

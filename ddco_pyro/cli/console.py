@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Self
@@ -17,7 +18,6 @@ from ddco_pyro.data.controls import described, notes
 from ddco_pyro.data.hdf5 import printable
 from ddco_pyro.drawing import words
 from ddco_pyro.drawing.page import Table
-from ddco_pyro.errors import command
 from ddco_pyro.evaluation import effort, verdicts
 from ddco_pyro.events import (
     BaselineSegmented,
@@ -36,13 +36,12 @@ from ddco_pyro.events import (
     TrainingBegan,
     TrainingEnded,
 )
-from ddco_pyro.names import label_name, method, numbered_name, option_name
+from ddco_pyro.names import label_name, method, option_name
 
 if TYPE_CHECKING:
     from ddco_pyro.data.inspection import Field, Inspection
     from ddco_pyro.evaluation.annotators import Annotators
     from ddco_pyro.fitting.fitted import Fit
-    from ddco_pyro.fitting.merging import Pair
     from ddco_pyro.metrics import Metrics
     from ddco_pyro.model.hierarchy import Hierarchy
     from ddco_pyro.spec import Spec
@@ -230,7 +229,7 @@ def labels(spec: Spec, used: Labels | None, known: Mapping[str, Sequence[str]]) 
             say(f"warning: {what} {advice}")
 
 
-# --- fit, select, merge, rollout --------------------------------------------------------------------------------------
+# --- fit, select, rollout ---------------------------------------------------------------------------------------------
 
 
 ONE_FIT = (
@@ -269,15 +268,6 @@ def seeds(metrics: Metrics) -> None:
     say(verdicts.over_seeds(found, method(metrics.model), len(metrics.valid), sound, brief))
 
 
-def merged(pair: Pair, before: Fit, after: Fit) -> None:
-    """The merged options and the change of held-out log-likelihood."""
-    names = list(before.names.values())[pair.level]
-    first, second = (numbered_name(option, names).removeprefix("option ") for option in pair.options)
-    apart = "" if pair.divergence is None else f" ({pair.divergence:.2f} nats/step apart)"
-    values = [words.number(fit.metrics.log_likelihood_per_step.valid) for fit in (before, after)]
-    say(f"Merged options {first} and {second}{apart}: held-out {values[0]} → {values[1]} nats/step.")
-
-
 def warnings(fit: Fit) -> None:
     """Durations beside those asked for; warnings of a short training and of a degenerate solution, with remedies."""
     from ddco_pyro.evaluation.options import degeneracies, durations
@@ -289,7 +279,7 @@ def warnings(fit: Fit) -> None:
 
 
 def names(fit: Fit) -> None:
-    """The names in ``names.yaml``, with their agreement with labels, and the command that takes proposed ones."""
+    """The names in ``names.yaml``, with their agreement with labels, and the line there that takes proposed ones."""
     found = {(one.level, one.option): one for one in fit.metrics.named_by_labels}
     each = {
         level: [(name, found.get((level, option))) for option, name in enumerate(own[1:], start=1)]
@@ -299,20 +289,21 @@ def names(fit: Fit) -> None:
         say(f"labels: {told}")
     for row, (accuracy, edit) in effort.contributions(fit.metrics.training).items():
         say(f"  left out, {row}: accuracy {words.number(accuracy)}, edit score {words.number(edit)}")
+    file = fit.run_folder / "names.yaml"
     written = [
         f"{name} {words.number(one.agreement)}" if one and one.name == name else name
         for level in fit.named
         for name, one in each[level]
     ]
     if written:
-        say(f"names: {fit.run_folder / 'names.yaml'}: {', '.join(written)}")
+        say(f"names: {file}: {', '.join(written)}")
     for level, pairs in each.items():
         proposed = {name: one for name, one in pairs if one and name == option_name(one.option)}
         if proposed:
             said = [f"{name} as {one.name} {words.number(one.agreement)}" for name, one in proposed.items()]
-            taken = ",".join(proposed[name].name if name in proposed else name for name, _ in pairs)
-            again = command("name", fit.run_folder, "--level", level, taken)
-            say(f"names proposed, not written: {words.listed(said)}; to take them: {again}")
+            taken = [proposed[name].name if name in proposed else name for name, _ in pairs]
+            line = json.dumps({level: taken}, ensure_ascii=False)[1:-1]
+            say(f"names proposed, not written: {words.listed(said)}; to take them, write into {file}: {line}")
     if found:
         labels = words.listed(dict.fromkeys(f"labels/{one.labels}" for one in found.values()))
         say(f"Agreement with {labels}: the steps with both an option and its label, divided by the steps with either.")

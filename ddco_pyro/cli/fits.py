@@ -1,4 +1,4 @@
-"""Commands that fit: ``check``, ``fit``, ``select`` and ``merge``."""
+"""Commands that fit: ``check``, ``fit`` and ``select``."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ddco_pyro.cli import AllowCode, Backend, Level, Overrides, RunPath, Scheduler, SpecPath, hint, out_folder, written
+from ddco_pyro.cli import AllowCode, Backend, Overrides, Scheduler, SpecPath, hint, out_folder, written
 from ddco_pyro.data.files import Output, check_outputs
 from ddco_pyro.errors import BadInput, Failed, command
 from ddco_pyro.events import Event
@@ -232,41 +232,6 @@ def select(
     console.warnings(fitted)
     print(f"selection: {folder / 'selection.json'}")
     print(f"report: {write_report(fitted, fitted.demonstrations)}")
-
-
-def merge(
-    run: RunPath,
-    options: Annotated[
-        tuple[int, int] | None,
-        typer.Option(help="Numbers of the two options; by default those that act most alike.", show_default=False),
-    ] = None,
-    level: Level = None,
-    out: Annotated[Path | None, written(out_folder, "The run folder; by default RUN-merged.")] = None,
-    jobs: Annotated[int, typer.Option(help="Processes that train restarts; -1 is one for each core.")] = -1,
-    allow_code: AllowCode = False,
-) -> None:
-    """Merge two options of a run and fit again from its segments, into another run folder.
-
-    An unfinished one is continued.
-    """
-    from ddco_pyro.cli import console
-    from ddco_pyro.fitting import merging
-    from ddco_pyro.fitting.fitted import load
-    from ddco_pyro.report import write_report
-
-    named = run if run.name else run.resolve()
-    folder = out or named.with_name(f"{named.name}-merged")
-    check_outputs([Output("--out", folder, "folder")], [run])
-    before = load(run, allow_code)
-    pair = merging.chosen(before, level, options)
-    with console.Progress() as progress:
-        fitted = merging.merge(before, pair, folder, progress, jobs)
-    console.log_likelihoods(fitted)
-    console.merged(pair, before, fitted)
-    console.warnings(fitted)
-    console.names(fitted)
-    print(f"report: {write_report(fitted, fitted.demonstrations)}")
-    print(f"next: {command('compare', run, folder, *_allowed(fitted.spec))}")
 
 
 def _check_folder(folder: Path, spec: Path, loaded: Spec) -> None:

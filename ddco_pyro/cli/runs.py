@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import typer
 
-from ddco_pyro.cli import BRACKET, AllowCode, Level, Overrides, RunPath, out_file, out_folder, written
+from ddco_pyro.cli import BRACKET, AllowCode, Overrides, RunPath, out_file, out_folder, written
 from ddco_pyro.data.files import Output, check_outputs
-from ddco_pyro.errors import BadInput, command
+from ddco_pyro.errors import BadInput
 
 if TYPE_CHECKING:
     from ddco_pyro.data.sources import Source
@@ -104,31 +104,6 @@ def report(run: RunPath, overrides: Overrides = [], allow_code: AllowCode = Fals
     if overrides:
         claim(run, fitted.spec)
     print(f"report: {write_report(fitted, fitted.demonstrations)}")
-
-
-def name(
-    run: RunPath,
-    names: Annotated[
-        str | None,
-        typer.Argument(metavar="[NAMES]", help="The names of options 1 to k, with commas between.", show_default=False),
-    ] = None,
-    level: Level = None,
-    allow_code: AllowCode = False,
-) -> None:
-    """Name the options of a level in RUN/names.yaml; without NAMES, show the options with their shares and lengths."""
-    from ddco_pyro.cli import console
-    from ddco_pyro.fitting.fitted import load
-    from ddco_pyro.report.options import use_table
-
-    fitted = load(run, allow_code)
-    if names is not None:
-        check_outputs([Output("RUN", run / "names.yaml", "file")])
-        fitted.name_options(level or next(iter(fitted.names), ""), names.split(","))
-    elif not fitted.names or (level and level not in fitted.names):
-        raise BadInput(f"{run}: has no {f'level {level!r}' if fitted.names else 'options'}; name another")
-    console.show(use_table(fitted, [level] if level else None))
-    if names is not None:
-        print(f"{run / 'names.yaml'}: show them with: {command('report', run, *['--allow-code'] * allow_code)}")
 
 
 def _check_run(run: Path, *names: str) -> None:

@@ -1,4 +1,4 @@
-"""Drawings of options in SVG: transitions, likeness, and trajectories of instances."""
+"""Drawings of options in SVG: transitions and trajectories of instances."""
 
 from __future__ import annotations
 
@@ -112,36 +112,6 @@ def _edge(start: float, end: float, y: float, gap: float, share: float, title: s
         '<g opacity="{:.2f}"><title>{}</title><path class="edge" d="{}" stroke-width="{:.1f}"/>'
         '<path d="{}" fill="var(--soft)"/>{}</g>'
     ).format(0.45 + 0.55 * share, title, path, width, head, _text(middle, top - 7, count))
-
-
-def dendrogram(merges: np.ndarray, choices: Sequence[int], names: Sequence[str]) -> Markup:
-    """Options joined at their distance, from left (alike) to right, on a square-root scale.
-
-    :param merges: the result of :func:`scipy.cluster.hierarchy.linkage` for the options ``choices``.
-    """
-    from scipy.cluster.hierarchy import dendrogram as laid_out  # most commands draw none
-
-    found = laid_out(merges, no_plot=True)
-    left, row, most = 170.0, 26.0, float(merges[:, 2].max()) or 1.0
-    height = row * len(choices) + 34
-
-    def right(distance: float) -> float:
-        return left + (WIDTH - left - 60) * float(np.sqrt(distance / most))
-
-    parts: list[str] = []
-    for distances, rows in zip(found["dcoord"], found["icoord"], strict=True):
-        points = " ".join(f"{right(x):.1f},{row * y / 10:.1f}" for x, y in zip(distances, rows, strict=True))
-        parts.append(Markup('<polyline class="edge" points="{}"/>').format(points))
-        parts.append(
-            _text(right(distances[1]) + 4, row * (rows[1] + rows[2]) / 20 - 4, f"{distances[1]:.2f}", "start", "soft")
-        )
-    for place, leaf in enumerate(found["leaves"]):
-        choice, y = choices[leaf], row * (place + 0.5)
-        parts.append(Markup('<circle cx="{}" cy="{}" r="6" fill="{}"/>').format(left - 12, y, option_colour(choice)))
-        parts.append(_text(left - 24, y + 4, shortened(names[choice]), "end"))
-    parts.append(_text(left, height - 8, "0", kind="soft"))
-    parts.append(_text(WIDTH - 60, height - 8, f"{most:.2f} nats per step", kind="soft"))
-    return svg(WIDTH, height, "How alike options are", parts)
 
 
 # --- instances of an option -------------------------------------------------------------------------------------------

@@ -157,9 +157,8 @@ Kind = Literal["unused", "redundant", "dominating", "whole", "never_persisting",
 ADVICE: Mapping[Kind, str] = {
     "unused": "Fewer options may do: compare hierarchy.levels.*.count by cross-validation (ddco-pyro select), or try "
     "more starts (training.starts).",
-    "redundant": "Make them one and see what it costs (ddco-pyro merge), or compare hierarchy.levels.*.count by "
-    "cross-validation (ddco-pyro select). If they should differ, lower control.std, below which differences do not "
-    "count.",
+    "redundant": "Fewer options may do: compare hierarchy.levels.*.count by cross-validation (ddco-pyro select). If "
+    "they should differ, lower control.std, below which differences do not count.",
     "dominating": "Train layer by layer (training.layerwise: true), or give the options' policies less capacity, so "
     "that one of them cannot do all the work.",
     "whole": "Observe what is alike in all demonstrations: write positions relative to the first step, or differences "

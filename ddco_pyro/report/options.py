@@ -75,15 +75,12 @@ def section(fit: Fit, demos: Demonstrations, activity: Activity, paths: Sequence
     return Section("options", "Which option is active when", blocks, folded=True)
 
 
-def use_table(fit: Fit, levels: Sequence[str] | None = None) -> Table:
-    """The use of each choice of each level, the highest level first; control only where it is chosen.
-
-    :param levels: the levels to show; None for all.
-    """
+def use_table(fit: Fit) -> Table:
+    """The use of each choice of each level, the highest level first; control only where it is chosen."""
     rows, stands_for = [], {(one.level, one.option): agreeing(one) for one in fit.metrics.named_by_labels}
     for (level, names), use in reversed(list(zip(fit.names.items(), fit.metrics.options, strict=True))):
         total = sum(row.steps for row in use)
-        for row in use if levels is None or level in levels else ():
+        for row in use:
             if row.choice or row.segments:
                 named = Cell(numbered_name(row.choice, names), colour=option_colour(row.choice))
                 length = "–" if row.length is None else duration(fit.metrics.control_frequency, row.length)

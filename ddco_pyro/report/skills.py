@@ -11,27 +11,24 @@ import numpy as np
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.pictures import Observed
 from ddco_pyro.drawing.colours import option_colour, option_rgb
-from ddco_pyro.drawing.diagrams import curves, dendrogram, path_film, transition_graph, typical_paths
+from ddco_pyro.drawing.diagrams import curves, path_film, transition_graph, typical_paths
 from ddco_pyro.drawing.figures import data_uri
 from ddco_pyro.drawing.page import (
     Block,
     Card,
     Cell,
-    Code,
     Drawing,
     Facts,
     Film,
     Films,
-    Folded,
     Picture,
     Section,
     Text,
     note,
 )
 from ddco_pyro.drawing.shown import frames, in_words, jpeg, positions, projection
-from ddco_pyro.drawing.words import duration, number, percent
-from ddco_pyro.errors import command
-from ddco_pyro.evaluation.options import SMALLEST_DIVERGENCE, diagnose
+from ddco_pyro.drawing.words import duration, percent
+from ddco_pyro.evaluation.options import diagnose
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Use
 from ddco_pyro.names import numbered_name
@@ -134,7 +131,7 @@ def aligned(chosen: Sequence[Instance], most: int = FRAMES) -> np.ndarray:
 def section(
     fit: Fit, demos: Demonstrations, pictures: Sequence[Observed], paths: Sequence[PathSpec], activity: Activity
 ) -> Section:
-    """Every option of every level, the highest level first, then the order and the likeness of the options.
+    """Every option of every level, the highest level first, then the order of the options.
 
     :param demos: in the order of their segments.
     :param pictures: of each demonstration; empty for none.
@@ -180,7 +177,6 @@ def section(
             f"{', '.join(names[choice] for choice in order)}."
         )
         blocks.append(Drawing(transition_graph(counts, shares, names, order), caption))
-        blocks += _alike(fit, place, level, names)
     return Section("skills", "Skills", blocks)
 
 
@@ -207,33 +203,6 @@ def _frequent(counts: np.ndarray, names: Sequence[str], most: int = 2) -> str:
     """The most frequent neighbours with their shares."""
     first = np.argsort(-counts, kind="stable")[:most]
     return ", ".join(f"{names[place]} {percent(counts[place] / counts.sum())}" for place in first if counts[place])
-
-
-def _alike(fit: Fit, place: int, level: str, names: Sequence[str]) -> list[Block]:
-    """The dendrogram of a level's options, and the command that merges the closest pair where it acts alike."""
-    known = {row.options: row.divergence for row in fit.metrics.divergences[place] if row.divergence is not None}
-    used = [row.choice for row in fit.metrics.options[place] if row.choice and row.share > 0]
-    pairs = [(a, b) for n, a in enumerate(used) for b in used[n + 1 :]]
-    if not pairs or not known.keys() >= set(pairs):
-        return []
-    blocks: list[Block] = []
-    if len(used) > 2:
-        from scipy.cluster.hierarchy import linkage  # most commands draw none
-
-        merges = linkage([known[pair] for pair in pairs], "average")
-        caption = (
-            "How alike options act: the divergence of their policies, the mean of both Kullback–Leibler divergences in "
-            "nats per step, averaged over the pairs of two groups; square-root scale."
-        )
-        blocks.append(Folded("How alike options act", [Drawing(dendrogram(merges, used, names), caption)]))
-    held = fit.spec.training.labels is not None and fit.spec.training.labels.hold
-    if not held:
-        a, b = min(pairs, key=known.__getitem__)
-        if known[a, b] < SMALLEST_DIVERGENCE:
-            text = f"{names[a]} and {names[b]} act alike: {number(known[a, b])} nats per step. To fit with both as one:"
-            named = ("--level", level) if len(fit.names) > 1 else ()
-            blocks += [Text(text), Code(command("merge", fit.run_folder, *named, "--options", a, b))]
-    return blocks
 
 
 class _Shown:
