@@ -269,11 +269,9 @@ def seeds(metrics: Metrics) -> None:
 
 
 def warnings(fit: Fit) -> None:
-    """Durations beside those asked for; warnings of a short training and of a degenerate solution, with remedies."""
-    from ddco_pyro.evaluation.options import degeneracies, durations
+    """Warnings of a short training and of a degenerate solution, with remedies."""
+    from ddco_pyro.evaluation.options import degeneracies
 
-    for level, said in durations(fit.metrics, fit.spec).items():
-        say(f"{level}: {said}.")
     for what, advice in (*effort.unconverged(fit.metrics), *degeneracies(fit.metrics, fit.spec, fit.names)):
         say(f"warning: {what} {advice}")
 

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from ddco_pyro.data.pictures import Readers
@@ -226,8 +226,6 @@ class StageTraining:
             value = backward(self.objective, self.model, batch, rows)
         else:
             value = self._backward_in_shards(batch, rows, number)
-        if self.spec.clip_gradient is not None:
-            nn.utils.clip_grad_norm_(self.parameters, self.spec.clip_gradient)
         self.optimizer.step()
         if self.mean is not None:
             self.mean.update_parameters(self.model)
