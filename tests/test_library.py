@@ -414,7 +414,7 @@ MOST_BUILDS = 4
 @pytest.mark.parametrize("baselines", [(), ("flat", "mixture")])
 def test_a_model_is_built_a_few_times(in_memory: ddco_pyro.Fit, monkeypatch, baselines) -> None:
     builds, init = [], Hierarchy.__init__
-    short = {"training.epochs": 1, "training.layerwise": False, "training.initialize": "random"}
+    short = {"training.epochs": 1, "training.layerwise": False, "training.starts": ["random"]}
     spec = with_overrides(in_memory.spec, {**short, "compare_with": list(baselines)})
 
     def counted(self, *arguments, **named):

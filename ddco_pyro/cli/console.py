@@ -210,7 +210,7 @@ def device(spec: Spec) -> None:
     from ddco_pyro.training.devices import described, device_of
 
     if spec.training.device != "cpu":
-        say(f"networks: on {described(device_of(spec.training))}, {spec.training.precision} in gradient steps")
+        say(f"networks: on {described(device_of(spec.training))}")
 
 
 def labels(spec: Spec, used: Labels | None, known: Mapping[str, Sequence[str]]) -> None:

@@ -132,12 +132,8 @@ class TrainingSpec(Model):
     single outlier."""
     patience: Count | None = 20
     """Epochs without improvement after which a stage stops; null: never."""
-    workers: int = Field(default=0, ge=0)
-    """Number of processes that prefetch pictures; 0: no prefetching. Results do not depend on the number."""
     device: Literal["cpu", "cuda", "auto"] = "cpu"
     """Device of the networks: ``cpu``, ``cuda`` (a GPU), or ``auto`` (a GPU if there is one)."""
-    precision: Literal["float32", "bfloat16"] = "float32"
-    """Precision of matrix products in gradient steps (torch's autocast)."""
     labels: LabelsSpec | None = None
     """Labels that fix active options in some demonstrations; null: none."""
 

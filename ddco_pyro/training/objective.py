@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from functools import partial
 from itertools import chain
 from statistics import median
@@ -10,12 +10,10 @@ from statistics import median
 import torch
 from torch import Tensor
 
-from ddco_pyro.data.pictures import Job
 from ddco_pyro.errors import Failed
 from ddco_pyro.inference.engines import log_likelihood
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.model.networks.inputs import Frames
 from ddco_pyro.model.tables import Tables
 from ddco_pyro.training.checkpoint import Progress, State, TrainingData
 from ddco_pyro.training.initialization import WAYS, Given
@@ -143,11 +141,8 @@ class Objective:
     def tune(self, model: Hierarchy) -> float:
         """The objective per step of the tuning demonstrations: the mean, or the median over demonstrations."""
         tune = self.data.tune
-        pieces = list(tune.pieces(model.steps_at_once))
         with torch.no_grad():
-            if tune.picture_bytes:
-                read_ahead(model, tune, (piece for _, piece in self.ranks.own(pieces)))
-            each = self.ranks.each(partial(self._tuned, model, *piece) for piece in pieces)
+            each = self.ranks.each(partial(self._tuned, model, *piece) for piece in tune.pieces(model.steps_at_once))
             values = list(chain.from_iterable(each))
         if self.data.spec.training.tune_by == "median":
             return median(value / steps for value, steps in zip(values, tune.lengths.tolist(), strict=True))
@@ -167,19 +162,3 @@ class Objective:
             f"stage {self.stage.name}, epoch {self.progress.epoch + 1}: the log-likelihood of {where} is not "
             "finite; look at these demonstrations, raise control.std, or lower training.optimizer.lr"
         )
-
-
-def read_ahead(model: Hierarchy, whole: Batch, pieces: Iterable[Batch]) -> None:
-    """Prefetch the pictures of pieces of a batch, in the order in which the networks will ask for them."""
-    if isinstance(whole.inputs.images, Frames):
-        whole.inputs.images.readers.plan(_jobs(model, pieces))
-
-
-def _jobs(model: Hierarchy, pieces: Iterable[Batch]) -> Iterator[Job]:
-    """Chunk after chunk; where there are several and a gradient is asked for, then once more, the last first."""
-    for piece in pieces:
-        chunks = model.chunks(piece.inputs)
-        again = chunks[::-1] if len(chunks) > 1 and model.training else []
-        for chunk in (*chunks, *again):
-            assert isinstance(chunk.images, Frames)  # it is a part of such a piece
-            yield chunk.images.job
