@@ -296,7 +296,7 @@ def test_another_process_fits_a_baseline_whose_restarts_are_short(in_memory: ddc
         one, two = (ddco_pyro.fit(spec, two_skills(), jobs=jobs) for jobs in (1, 2))
         assert numbers(one) == numbers(two)
         assert numbers(one.baselines["flat"]) == numbers(two.baselines["flat"])
-        assert asked == 2 * beside  # this process, too, makes a share of them
+        assert asked == 2 * beside
         asked.clear()
 
 

@@ -9,9 +9,10 @@ from typing import Annotated
 
 import typer
 
-from ddco_pyro.cli import AllowCode, Backend, Scheduler, out_folder, written
+from ddco_pyro.cli import AllowCode, out_folder, written
 from ddco_pyro.data.files import Output, check_outputs, write_text
 from ddco_pyro.errors import BadInput, Failed, command
+from ddco_pyro.jobs import Workers
 
 
 class Action(StrEnum):
@@ -39,8 +40,6 @@ def study(
     ] = None,
     studies: Annotated[Path, typer.Option(help="The folder of the studies that render quotes.")] = Path("studies"),
     jobs: Annotated[int, typer.Option(help="Processes that do cells; -1 is one for each core.")] = -1,
-    backend: Annotated[Backend, typer.Option(help="Where cells are done: loky (here) or dask.")] = Backend.LOKY,
-    scheduler: Scheduler = None,
     check: Annotated[
         bool, typer.Option("--check", help="With render: change nothing, and fail if a page differs.")
     ] = False,
@@ -56,7 +55,7 @@ def study(
         return
     if len(files) > 1:
         raise BadInput(f"{files[1]}: one study at a time")
-    workers = backend.workers(jobs, scheduler)
+    workers = Workers(jobs)
     from ddco_pyro.cli import console
     from ddco_pyro.drawing.page import Table
     from ddco_pyro.study.cells import Folder
@@ -66,7 +65,6 @@ def study(
     folder = Folder(declared, out or Path("runs/studies") / declared.name)
     check_outputs([Output("--out", folder.path, "folder")], [files[0]])
     if action is Action.RUN:
-        workers.check()
         folder.state()  # or something is wrong with its data or files
         with console.Progress() as progress:
             folder.run(workers, progress)

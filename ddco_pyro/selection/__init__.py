@@ -18,7 +18,7 @@ from ddco_pyro.events import CandidateGivenUp, CellDone, CellsBegan, OnEvent, ig
 from ddco_pyro.fitting.digest import record
 from ddco_pyro.fitting.run import claimed
 from ddco_pyro.inference import compile_all
-from ddco_pyro.jobs import Workers, processes, run_all
+from ddco_pyro.jobs import Workers, run_all
 from ddco_pyro.selection import choice as choosing
 from ddco_pyro.selection import folds as dividing
 from ddco_pyro.selection import grid
@@ -30,8 +30,8 @@ from ddco_pyro.training import data
 
 __all__ = ["Choice", "Selection", "SelectionFailed", "Workers", "check", "final_spec", "known_demonstrations", "select"]
 
-HERE = Workers()
-"""One process for each core of this machine."""
+ALL_CORES = Workers()
+"""One process for each core."""
 
 
 class SelectionFailed(Failed):
@@ -53,14 +53,13 @@ def known_demonstrations(spec: Spec) -> Demonstrations | None:
     return data.known_demonstrations(grid.wide(spec))
 
 
-def check(spec: Spec, workers: Workers = HERE, demos: Demonstrations | None = None) -> list[Candidate]:
-    """Check every candidate, the folds and the workers, without collecting or training anything.
+def check(spec: Spec, demos: Demonstrations | None = None) -> list[Candidate]:
+    """Check every candidate and the folds, without collecting or training anything.
 
     :param demos: :func:`known_demonstrations`, where they have been read.
     :returns: the candidates.
     :raises SpecError: a candidate is not valid, or the grid is empty.
     :raises FoldError: there are fewer demonstrations than folds.
-    :raises BackendError: the workers cannot be reached.
     """
     wide, own = grid.wide(spec), spec.demonstrations
     demos = data.outline(wide) if demos is None and data.in_file(wide) else demos
@@ -69,7 +68,6 @@ def check(spec: Spec, workers: Workers = HERE, demos: Demonstrations | None = No
         dividing.assign(own.count - len(set(own.exclude)), spec.selection.folds, spec.seed)
     else:
         dividing.divide(demos, spec.selection.folds, spec.seed)
-    workers.check()
     return candidates
 
 
@@ -77,7 +75,7 @@ def select(
     spec: Spec,
     folder: str | Path,
     on_event: OnEvent = ignore,
-    workers: Workers = HERE,
+    workers: Workers = ALL_CORES,
     stop_early: bool = False,
     demos: Demonstrations | None = None,
     resume: bool = True,
@@ -127,24 +125,23 @@ def _score_all(
     on_event(CellsBegan("cross-validation", len(pairs), len(done)))
     running = list(candidates)
     compile_all()
-    with processes(workers.number(len(pairs))):
-        for numbers in [[fold] for fold in range(count)] if stop_early else [list(range(count))]:
-            pending = [(one, fold) for fold in numbers for one in running if (one.number, fold) not in done]
-            calls = {(one.number, fold): partial(dividing.score, folds, one, fold) for one, fold in pending}
-            with run_all(calls, workers, "trained a fold") as scores:
-                for pair, score in scores:
-                    dividing.keep_score(folder, score)
-                    done[pair] = score
-                    on_event(CellDone(f"{candidates[score.candidate].name}, fold {score.fold}", score.failed))
-            if stop_early:
-                numbers_running = {one.number for one in running}
-                seen = [s for s in done.values() if s.fold <= numbers[-1] and s.candidate in numbers_running]
-                hopeless = choosing.hopeless(running, seen)
-                for number in sorted(hopeless):  # later scores, which an earlier selection may have left, do not count
-                    later = [(number, fold) for fold in range(numbers[-1] + 1, count)]
-                    missing = [pair for pair in later if done.pop(pair, None) is None]
-                    on_event(CandidateGivenUp(candidates[number].name, len(missing)))
-                running = [one for one in running if one.number not in hopeless]
+    for numbers in [[fold] for fold in range(count)] if stop_early else [list(range(count))]:
+        pending = [(one, fold) for fold in numbers for one in running if (one.number, fold) not in done]
+        calls = {(one.number, fold): partial(dividing.score, folds, one, fold) for one, fold in pending}
+        with run_all(calls, workers, "trained a fold") as scores:
+            for pair, score in scores:
+                dividing.keep_score(folder, score)
+                done[pair] = score
+                on_event(CellDone(f"{candidates[score.candidate].name}, fold {score.fold}", score.failed))
+        if stop_early:
+            numbers_running = {one.number for one in running}
+            seen = [s for s in done.values() if s.fold <= numbers[-1] and s.candidate in numbers_running]
+            hopeless = choosing.hopeless(running, seen)
+            for number in sorted(hopeless):  # later scores, which an earlier selection may have left, do not count
+                later = [(number, fold) for fold in range(numbers[-1] + 1, count)]
+                missing = [pair for pair in later if done.pop(pair, None) is None]
+                on_event(CandidateGivenUp(candidates[number].name, len(missing)))
+            running = [one for one in running if one.number not in hopeless]
     return [done[pair] for pair in sorted(done)]
 
 

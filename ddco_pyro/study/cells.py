@@ -37,7 +37,7 @@ from ddco_pyro.fitting.digest import Digest, digest, recorded
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.inference import compile_all
-from ddco_pyro.jobs import Workers, processes, run_all
+from ddco_pyro.jobs import Workers, run_all
 from ddco_pyro.metrics import Record, read_record
 from ddco_pyro.simulation.collect import collect
 from ddco_pyro.simulation.episodes import run_episodes
@@ -455,12 +455,11 @@ class Folder:
                 f"{self.study.path}: pinned: results are of commit {others[0]}, here is {self.code}; run it at that "
                 "commit, or remove them"
             )
-        with processes(workers.number(len(state.cells))):
-            while cells := [cell for cell in state.cells if cell not in state.done and cell not in tried]:
-                calls = {str(cell): partial(there.do, cell) for cell in cells}
-                do_all(calls, len(state.done), workers, on_event)
-                tried |= {*cells}
-                state = self.state()  # development, once done, adds the cells of the test
+        while cells := [cell for cell in state.cells if cell not in state.done and cell not in tried]:
+            calls = {str(cell): partial(there.do, cell) for cell in cells}
+            do_all(calls, len(state.done), workers, on_event)
+            tried |= {*cells}
+            state = self.state()  # development, once done, adds the cells of the test
         return state
 
     def do(self, cell: Cell) -> str:
