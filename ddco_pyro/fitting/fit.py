@@ -177,8 +177,6 @@ def _fit_model(
     :param short: whether baselines may go to other processes; several long restarts share those among themselves.
     :param name: of the model in events.
     """
-    if folder:
-        on_event = clock.go_on(folder, on_event)
     split, size = parts(spec, demos), Dimensions.of(demos)
     checkpoints = folder / "checkpoints" if folder else None
     specs = {name: its for name, (its, _) in baselines.items()}
@@ -241,7 +239,7 @@ def _fit_model(
                 named = accepted(spec, metrics.named_by_labels)
                 if folder and named:
                     write_names(folder, named)
-    metrics.seconds = clock.end()
+    metrics.seconds = clock.seconds
     if folder:
         metrics.write(folder)
     return replace(fitted, metrics=metrics, named=named or {})
