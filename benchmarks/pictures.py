@@ -1,7 +1,6 @@
-"""Parts of the benchmark about pictures: reading, training on them, in chunks of time.
+"""Parts of the benchmark about pictures: training on them, in chunks of time.
 
-Reading goes on in other processes and is compared by the clock; the rest by the time of this process's processor, which
-other work on the machine changes little.
+Times are of this process's processor, which other work on the machine changes little.
 """
 
 from __future__ import annotations
@@ -14,14 +13,11 @@ from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
-import h5py
 import numpy as np
 import torch
 from measuring import Row, of_pairs, seconds, side_by_side
-from torch.utils.data import DataLoader, Dataset
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.data.pictures import Job, Readers, Transform
 from ddco_pyro.events import EpochEnded, Event
 from ddco_pyro.inference import log_likelihood
 from ddco_pyro.model import hierarchy as networks
@@ -35,41 +31,11 @@ AIMS = {"epoch of pictures in a file / pictures in memory": ("≤", 1.15)}
 FF = {"network": "conv", "filters": 64, "kernel": 5, "hidden": [64]}
 """The paper's: a convolution of 64 filters of 5 × 5 and a fully connected layer (SM 1.2)."""
 
-NUMBER, STEPS, SIZE = 12, 60, (120, 160, 3)
+SIZE = (120, 160, 3)
 FEW, SHORT = 4, 16
 """Demonstrations that are trained on, beside one to tune with, and the steps of each."""
 
-WORKERS, BATCH = 2, 16
-"""Of both ways to read: robomimic's settings for pictures."""
-
 ROUNDS = 5
-
-
-class SingleSteps(Dataset):
-    """robomimic's loading pattern, rebuilt: ``SequenceDataset`` with ``hdf5_cache_mode="low_dim"``.
-
-    Vectors and controls are in memory; a sample is a single step, whose picture is read from the file, which each
-    worker opens once.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path, self.file = path, None
-        with h5py.File(path) as file:
-            self.low = {
-                name: {"pose": demo["obs/pose"][()], "actions": demo["actions"][()].astype(np.float32)}
-                for name, demo in file["data"].items()
-            }
-        self.index = [(name, step) for name, each in self.low.items() for step in range(len(each["actions"]))]
-
-    def __len__(self) -> int:
-        return len(self.index)
-
-    def __getitem__(self, number: int) -> dict[str, np.ndarray]:
-        if self.file is None:
-            self.file = h5py.File(self.path, "r", swmr=True, libver="latest")
-        name, step = self.index[number]
-        camera = self.file[f"data/{name}/obs/camera"][step : step + 1]
-        return {"camera": camera, **{key: values[step : step + 1] for key, values in self.low[name].items()}}
 
 
 def made(number: int, steps: int) -> Demonstrations:
@@ -90,47 +56,18 @@ def measured(names: tuple[str, str], *calls: Callable[[], float]) -> Row:
     return of_pairs(names, [tuple(1e3 * call() for call in calls) for _ in range(ROUNDS + 1)][1:])
 
 
-def reading() -> Iterator[Row]:
-    """Frames from two reading processes, beside robomimic's pattern with two, by the clock."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "demos.hdf5"
-        made(NUMBER, STEPS).write(path)
-        loader = DataLoader(SingleSteps(path), BATCH, shuffle=True, num_workers=WORKERS, persistent_workers=True)
-        demos = list(Demonstrations.read(path))
-
-        def theirs() -> None:
-            assert sum(len(batch["camera"]) for batch in loader) == NUMBER * STEPS
-
-        with Readers(WORKERS) as readers:
-
-            def ours() -> None:
-                order = np.random.default_rng(0).permutation(len(demos)).tolist()
-                jobs = [_job(demos[number], number) for number in order]
-                readers.plan(jobs)
-                assert sum(readers.take(job)["camera"].shape[1] for job in jobs) == NUMBER * STEPS
-
-            yield side_by_side(("robomimic's pattern of reading", "reading"), theirs, ours, ROUNDS, time.perf_counter)
-
-
-def _job(demo: Demonstration, number: int) -> Job:
-    pictures = {"camera": (demo.observations["camera"],)}
-    return Job((number,), pictures, slice(0, len(demo)), {"camera": Transform()}, {})
-
-
 def training() -> Iterator[Row]:
     """An epoch of the paper's FF networks, tuning included."""
     with tempfile.TemporaryDirectory() as folder:
         memory, stored = made(FEW + 1, SHORT), Path(folder) / "few.hdf5"
         memory.write(stored)
         streamed = Demonstrations.read(stored)
-        held = partial(epoch, memory)
-        read, ahead = partial(epoch, streamed), partial(epoch, streamed, workers=WORKERS)
+        held, read = partial(epoch, memory), partial(epoch, streamed)
         yield measured(("epoch of pictures in a file", "pictures in memory"), read, held)
-        yield measured(("epoch of pictures in a file, two workers", "pictures in memory"), ahead, held)
         yield measured(("epoch of pictures in memory", "networks alone"), held, networks_alone(memory))
 
 
-def trainer(demos: Demonstrations, workers: int = 0) -> Trainer:
+def trainer(demos: Demonstrations) -> Trainer:
     """The paper's FF networks, three options, a few epochs; the last demonstration tunes."""
     level = {"count": 3, "policy": FF, "termination": {"network": "linear", "inputs": ["pose"]}}
     train, tune = demos.select(demos.names[:-1]), demos.select(demos.names[-1:])
@@ -140,13 +77,13 @@ def trainer(demos: Demonstrations, workers: int = 0) -> Trainer:
             "demonstrations": {"path": "unused.hdf5"},
             "observations": ["pose", "camera"],
             "hierarchy": {"levels": [level], "meta_policy": FF},
-            "training": {"starts": ["random"], "layerwise": False, "workers": workers, **budget},
+            "training": {"starts": ["random"], "layerwise": False, **budget},
         }
     )
     return Trainer(spec, Dimensions.of(demos), train, tune)
 
 
-def epoch(demos: Demonstrations, workers: int = 0) -> float:
+def epoch(demos: Demonstrations) -> float:
     """Seconds of an epoch of this process's processor, the first epoch left out."""
     clocks: list[float] = []
 
@@ -154,7 +91,7 @@ def epoch(demos: Demonstrations, workers: int = 0) -> float:
         if isinstance(event, EpochEnded):
             clocks.append(time.process_time())
 
-    made_for = trainer(demos, workers)
+    made_for = trainer(demos)
     made_for.on_event = tell
     made_for.run()
     return statistics.median(after - before for before, after in pairwise(clocks))
@@ -214,4 +151,4 @@ def chunks() -> Iterator[Row]:
         yield side_by_side((f"gradient of {name} in chunks", "in one piece"), *calls, ROUNDS)
 
 
-PARTS = {"reading": reading, "pictures": training, "chunks": chunks}
+PARTS = {"pictures": training, "chunks": chunks}

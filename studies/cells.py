@@ -32,7 +32,7 @@ from ddco_pyro.evaluation.agreement import MATCHED, UNMATCHED
 from ddco_pyro.events import CellDone, CellsBegan, OnEvent, ignore
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.inference import compile_all
-from ddco_pyro.jobs import Workers, processes, run_all
+from ddco_pyro.jobs import Workers, run_all
 from ddco_pyro.metrics import Record, read_record
 from ddco_pyro.spec import Spec, parse_spec, with_overrides
 from ddco_pyro.spec.yaml import read_yaml
@@ -290,15 +290,14 @@ class Folder:
         self._check_code(code, state)
         compile_all()
         self.path.mkdir(parents=True, exist_ok=True)
-        with processes(workers.number(len(state.cells))):
-            while cells := [cell for cell in state.cells if cell not in state.done and cell not in tried]:
-                calls = {
-                    str(one): partial(do, self.place(one), self.depends(one), partial(self._measured, one), code)
-                    for one in cells
-                }
-                do_all(calls, len(state.done), workers, on_event)
-                tried |= {*cells}
-                state = self.state()  # development, once done, adds the cells of the test
+        while cells := [cell for cell in state.cells if cell not in state.done and cell not in tried]:
+            calls = {
+                str(one): partial(do, self.place(one), self.depends(one), partial(self._measured, one), code)
+                for one in cells
+            }
+            do_all(calls, len(state.done), workers, on_event)
+            tried |= {*cells}
+            state = self.state()  # development, once done, adds the cells of the test
         return state
 
     def _check_code(self, code: str, state: State) -> None:

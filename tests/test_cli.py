@@ -222,8 +222,6 @@ GRID = with_set("selection.grid.hierarchy.levels.0.count=[1, 2]")
         (["fit", "RUN/spec.yaml", "--out", "RUN"], "holds a run of this spec already; show it with --resume, or"),
         (["select", "SPEC"], "selection.grid: is empty; name what to try, such as selection.grid: {.*}"),
         (["select", "SPEC", *GRID, "--jobs", "0"], "--jobs 0: give a number of processes, or -1 for one on each core"),
-        (["select", "SPEC", *GRID, "--backend", "dask"], "--backend dask and --scheduler tcp://HOST:PORT go"),
-        (["select", "SPEC", *GRID, "--backend", "spark"], "Invalid value for '--backend': .*'spark' is not one of .*"),
         (["compare", "RUN"], "one run alone cannot be compared; name at least two, such as RUN and RUN/baselines/flat"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",

@@ -56,11 +56,10 @@ def test_what_it_says_at_the_end_is_what_the_demonstration_says(counts, network)
 def watched():
     """A hierarchy of two levels with a recogniser of the upper one, and demonstrations."""
     demos = of_states([9, 7, 8, 9], seed=4)
-    labels = [np.where(np.arange(len(demo)) % 5 == 4, -1, np.arange(len(demo)) // 3 % 2) for demo in demos]
+    labels = [np.where(np.arange(len(demo)) % 4 == 3, -1, np.arange(len(demo)) // 4 % 2) for demo in demos]
     known = (replace(demo, labels={"phase": own}) for demo, own in zip(demos, labels, strict=True))
     demos = Demonstrations(tuple(known))
-    recogniser = {"weight": 0.8, "windows": [1, 3]}
-    own = {"level": "level-2", "from": "phase", "recogniser": recogniser}
+    own = {"level": "level-2", "from": "phase", "recogniser": {"weight": 0.8}}
     return make_trainer(make_spec((2, 2), labels=own), demos, None).hierarchy.eval(), demos
 
 
@@ -81,7 +80,7 @@ def test_a_recogniser_of_the_past_is_evidence_at_every_step(watched):
         batch = encode(Demonstrations([demo]), hierarchy.encoder, hierarchy.scaling).select(torch.tensor([0]), t + 1)
         actions = torch.cat([torch.zeros(1, 1, 2), batch.actions[:, :t]], dim=1)
         x = torch.cat([batch.inputs.vector, actions], dim=-1)[0].double()
-        rows = [torch.cat([x[s], *(x[max(s - w, 0) : s + 1].mean(0) for w in (1, 3))]) for s in range(t + 1)]
+        rows = [torch.cat([x[s], *(x[max(s - w, 0) : s + 1].mean(0) for w in (1, 2))]) for s in range(t + 1)]
         ratio = (torch.stack(rows) @ past.weight + past.bias).log_softmax(-1).clamp(min=-12) - past.share.log()
         evidence = torch.cat([torch.zeros(t + 1, 1), 0.8 * ratio], dim=1)[None]
         with torch.no_grad():

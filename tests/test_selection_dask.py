@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import socket
 import subprocess
 import sys
 
+import joblib
 import pytest
-import yaml
-from command_line import call
 from killing import HANGS
-from selecting import Told, data_at, kept, spec_at
+from selecting import Told, kept, spec_at
 
-from ddco_pyro.jobs import BackendError
 from ddco_pyro.selection import Workers, select
 
 distributed = pytest.importorskip("distributed")
@@ -65,7 +62,8 @@ def test_a_worker_that_is_killed_changes_nothing(cluster, tmp_path):
     address, workers = cluster
     spec = spec_at(tmp_path)
     told = Killing(workers[0], after=3)
-    select(spec, tmp_path / "cluster", told, Workers(scheduler=address))
+    with distributed.Client(address), joblib.parallel_config("dask"):
+        select(spec, tmp_path / "cluster", told)
     assert workers[0].returncode == -signal.SIGKILL
     assert workers[1].poll() is None
     assert sorted(pair[1] for pair in told.pairs) == [""] * 8
@@ -75,27 +73,3 @@ def test_a_worker_that_is_killed_changes_nothing(cluster, tmp_path):
     there, here = kept(tmp_path / "cluster"), kept(tmp_path / "here")
     assert there.keys() == here.keys()
     assert all(there[key]["log_likelihood"] == here[key]["log_likelihood"] for key in here)
-
-
-@pytest.mark.slow
-def test_the_command_runs_on_the_cluster(cluster, tmp_path):
-    """After the other test, with the worker that is left."""
-    address, _ = cluster
-    spec = tmp_path / "spec.yaml"
-    spec.write_text(yaml.safe_dump(data_at(tmp_path) | {"selection": {"folds": 2, "grid": {"seed": [1, 2]}}}))
-    out = tmp_path / "run"
-    ended = call("select", spec, "--backend", "dask", "--scheduler", address, "--out", out)
-    assert ended.status == 0, ended.err
-    assert len(json.loads((out / "selection.json").read_text())["candidates"]) == 2
-
-
-def test_a_scheduler_that_does_not_answer_is_one_line(tmp_path, monkeypatch):
-    monkeypatch.setattr("ddco_pyro.jobs.CONNECT_SECONDS", 0.5)
-    with pytest.raises(BackendError, match=r"^--scheduler tcp://127.0.0.1:9: no dask scheduler answers there within"):
-        Workers(scheduler="tcp://127.0.0.1:9").check()
-
-
-def test_without_dask_it_is_said_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(BackendError, match=r"dask is not installed; pip install 'ddco-pyro\[dask\]'"):
-        Workers(scheduler="tcp://127.0.0.1:9").check()

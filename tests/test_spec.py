@@ -293,7 +293,6 @@ def specs(draw: st.DrawFn) -> dict[str, Any]:
         "training": {
             "epochs": draw(counts),
             "patience": draw(st.none() | counts),
-            "clip_gradient": draw(st.none() | positive),
             "average": draw(st.none() | st.floats(0.01, 0.99)),
         },
         "selection": {"grid": draw(st.sampled_from([{}, {"seed": [1, 2]}, {"control.std": [0.1, {"learn": True}]}]))},
@@ -421,15 +420,9 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         {"hierarchy.meta_policy.emits": ["control"], "training.labels": {"level": "option", "from": "phase"}},
         "training.labels.level: no policy selects the options of 'option'; let the policies above emit options",
     ),
-    (
-        {"training": {"starts": ["random"], "labels": {"level": "option", "from": "phase", "hold": False}}},
-        "training.labels.hold: false uses labels in initialisation alone, and that is random; say vq there",
-    ),
     ({"training.starts": ["clusters"]}, "training.starts.0: must be vq or vq_controls or windows or equal_parts"),
     ({"training.starts": []}, "training.starts: "),
     ({"training": {"starts": ["mixture"], "lower_levels": "frozen"}}, "training.lower_levels: mixture trains all"),
-    ({"training.duration.mean": [20, 2]}, "training.duration.mean: has 2 numbers, but the number of levels is 1"),
-    ({"hierarchy": None, "baseline": "flat", "training.duration.mean": 20}, "training.duration: there are no options"),
     ({"task": None}, "task: missing; name a task, or give a file in demonstrations.path"),
     ({"observations": ["a", "a"]}, "observations.1.key: 'a' is given twice; keep one"),
     ({"observations": ["hand_pos", "goal"], "report.trajectory": "hand_po"}, "report.trajectory: there is no"),

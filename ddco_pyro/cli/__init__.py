@@ -6,15 +6,11 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from enum import StrEnum
 from pathlib import Path
 from shutil import get_terminal_size
 from typing import Annotated, Any
 
 import typer
-
-from ddco_pyro.errors import BadInput
-from ddco_pyro.jobs import Workers
 
 NARROW = get_terminal_size().columns < 60
 """Whether tables of help would cut the names of options: help is plain text then."""
@@ -66,28 +62,11 @@ def written(parser: Any, text: str, **how: Any) -> Any:
     return typer.Option(help=text, parser=parser, metavar="PATH", **how)
 
 
-class Backend(StrEnum):
-    """Where a command does its work."""
-
-    LOKY = "loky"
-    DASK = "dask"
-
-    def workers(self, jobs: int, scheduler: str | None) -> Workers:
-        """The processes that the options ask for.
-
-        :raises BadInput: options contradict each other, or ``jobs`` is not a number of processes.
-        """
-        if (self is Backend.DASK) != (scheduler is not None):
-            raise BadInput("--backend dask and --scheduler tcp://HOST:PORT go together; give both or neither")
-        return Workers(jobs, scheduler)
-
-
 SpecPath = Annotated[Path, typer.Argument(metavar="SPEC", help="The spec, a YAML file.", show_default=False)]
 Overrides = Annotated[
     list[str], typer.Option("--set", metavar="KEY=VALUE", help="Override a key of the spec; repeatable.")
 ]
 RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="The folder of a finished fit.", show_default=False)]
-Scheduler = Annotated[str | None, typer.Option(help="Address of the dask scheduler, tcp://HOST:PORT.")]
 Level = Annotated[str | None, typer.Option(help="Name of their level; by default the lowest.")]
 AllowCode = Annotated[
     bool, typer.Option("--allow-code", help="Import the user code (module:name) that the spec names.")

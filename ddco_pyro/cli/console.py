@@ -204,7 +204,7 @@ def device(spec: Spec) -> None:
     from ddco_pyro.training.devices import described, device_of
 
     if spec.training.device != "cpu":
-        say(f"networks: on {described(device_of(spec.training))}, {spec.training.precision} in gradient steps")
+        say(f"networks: on {described(device_of(spec.training))}")
 
 
 def labels(spec: Spec, used: Labels | None, known: Mapping[str, Sequence[str]]) -> None:
@@ -263,11 +263,9 @@ def seeds(metrics: Metrics) -> None:
 
 
 def warnings(fit: Fit) -> None:
-    """Durations beside those asked for; warnings of a short training and of a degenerate solution, with remedies."""
-    from ddco_pyro.evaluation.options import degeneracies, durations
+    """Warnings of a short training and of a degenerate solution, with remedies."""
+    from ddco_pyro.evaluation.options import degeneracies
 
-    for level, said in durations(fit.metrics, fit.spec).items():
-        say(f"{level}: {said}.")
     for what, advice in (*effort.unconverged(fit.metrics), *degeneracies(fit.metrics, fit.spec, fit.names)):
         say(f"warning: {what} {advice}")
 

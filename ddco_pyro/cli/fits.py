@@ -6,27 +6,23 @@ import json
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ddco_pyro.cli import AllowCode, Backend, Overrides, Scheduler, SpecPath, hint, out_folder, written
+from ddco_pyro.cli import AllowCode, Overrides, SpecPath, hint, out_folder, written
 from ddco_pyro.data.files import Output, check_outputs
 from ddco_pyro.errors import BadInput, Failed, command
 from ddco_pyro.events import Event
-from ddco_pyro.jobs import LONG, Workers, processes
+from ddco_pyro.jobs import Workers
 from ddco_pyro.logs import Log
 from ddco_pyro.spec import Spec, SpecError, dump_spec, load_spec, spec_schema, user_code
 
 if TYPE_CHECKING:
     from ddco_pyro.fitting.fitted import Fit
     from ddco_pyro.training.processes import Ranks
-
-
-TRAINING = ("ddco_pyro.fitting.fit", "sklearn.cluster")
-"""Modules of processes that train."""
 
 
 def check(
@@ -107,8 +103,7 @@ def fit(
         if ranks.size > 1 and jobs not in (None, 1):
             raise SpecError(f"--jobs {jobs}: the processes of torchrun train together; leave --jobs out")
         jobs = 1 if ranks.size > 1 else -1 if jobs is None else jobs
-        with _ready(loaded, jobs):
-            _fit_and_report(loaded, spec, out, jobs, seeds, resume, [*dict.fromkeys(log)])
+        _fit_and_report(loaded, spec, out, jobs, seeds, resume, [*dict.fromkeys(log)])
 
 
 def _follow(ranks: Ranks) -> None:
@@ -117,15 +112,6 @@ def _follow(ranks: Ranks) -> None:
 
     with suppress(BadInput, Failed):
         follow(ranks)
-
-
-def _ready(spec: Spec, jobs: int) -> AbstractContextManager[object]:
-    """A block inside which other processes are ready to train beside the model, if they are of use."""
-    number = Workers(jobs).number(sys.maxsize if spec.demonstrations.leave_one_out else 1 + len(spec.compare_with)) - 1
-    long = spec.training.epochs is None or spec.training.epochs >= LONG
-    short = len(spec.training.starts) == 1 or spec.training.optimizer.name == "em"
-    useful = number > 0 and long and short and spec.training.device == "cpu"
-    return processes(number, *TRAINING) if useful else nullcontext()
 
 
 def _fit_and_report(
@@ -191,31 +177,26 @@ def select(
     folds: Annotated[int | None, typer.Option(help="Number of folds; by default the spec's selection.folds.")] = None,
     jobs: Annotated[int, typer.Option(help="Processes that train folds; -1 is one for each core.")] = -1,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the unfinished selection in --out.")] = False,
-    backend: Annotated[Backend, typer.Option(help="Where folds are trained: loky (here) or dask.")] = Backend.LOKY,
-    scheduler: Scheduler = None,
     allow_code: AllowCode = False,
 ) -> None:
     """Choose among the candidates of the spec's grid by cross-validation; then fit the chosen one to all the data."""
     number = [] if folds is None else [f"selection.folds={folds}"]
-    loaded = load_spec(spec, [*overrides, *number], allow_code)
-    workers = backend.workers(jobs, scheduler)
-    ready = processes(workers.number(), *TRAINING) if scheduler is None and workers.number() > 1 else nullcontext()
+    loaded, workers = load_spec(spec, [*overrides, *number], allow_code), Workers(jobs)
     folder = out or Path("runs") / f"{spec.stem}-select-{time.strftime('%Y%m%d-%H%M%S')}"
-    with ready:
-        from ddco_pyro import selection
-        from ddco_pyro.cli import console
-        from ddco_pyro.fitting.fit import fit as fitted_to
+    from ddco_pyro import selection
+    from ddco_pyro.cli import console
+    from ddco_pyro.fitting.fit import fit as fitted_to
 
-        _check_folder(folder, spec, loaded)
-        demos = selection.known_demonstrations(loaded)
-        selection.check(loaded, workers, demos)  # before anything is collected, trained or written
-        again = command("select", folder / "spec.yaml", "--out", folder, "--resume", *_allowed(loaded))
-        with _continued(again, folder), console.Progress() as progress:
-            made = selection.select(loaded, folder, progress, workers, demos, resume)
-            progress.end()
-            assert made.choice.chosen is not None  # or it would have failed
-            final = selection.final_spec(made.choice.chosen.candidate)
-            fitted = fitted_to(final, made.demos, folder / "fit", progress, jobs, keep=False)
+    _check_folder(folder, spec, loaded)
+    demos = selection.known_demonstrations(loaded)
+    selection.check(loaded, demos)  # before anything is collected, trained or written
+    again = command("select", folder / "spec.yaml", "--out", folder, "--resume", *_allowed(loaded))
+    with _continued(again, folder), console.Progress() as progress:
+        made = selection.select(loaded, folder, progress, workers, demos, resume)
+        progress.end()
+        assert made.choice.chosen is not None  # or it would have failed
+        final = selection.final_spec(made.choice.chosen.candidate)
+        fitted = fitted_to(final, made.demos, folder / "fit", progress, jobs, keep=False)
     from ddco_pyro.report import write_report
     from ddco_pyro.selection.choice import table
 

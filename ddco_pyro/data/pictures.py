@@ -1,23 +1,16 @@
-"""Pictures: lazy arrays in files, crops and scaling, padded batches, and prefetching by other processes."""
+"""Pictures: lazy arrays in files, crops and scaling, and padded batches."""
 
 from __future__ import annotations
 
 import math
-import multiprocessing
-import os
-from collections import deque
-from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ddco_pyro.data.hdf5 import DAMAGE, DemonstrationsError, opened
-from ddco_pyro.errors import BadInput, Failed
-from ddco_pyro.jobs import end_with, from_outside
+from ddco_pyro.errors import BadInput
 
 BLOCK_BYTES = 16 * 2**20
 """Most bytes of an array that are read at a time in a pass over the whole array; one step at least."""
@@ -234,11 +227,8 @@ def padded(
     return whole
 
 
-def shift_into(target: Any, frames: Any, down: int, right: int) -> None:
-    """Write pictures [T, H, W, C] into ``target``, shifted by whole pixels; the edge is repeated.
-
-    Both are arrays, or tensors on one device.
-    """
+def shift_into(target: np.ndarray, frames: np.ndarray, down: int, right: int) -> None:
+    """Write pictures [T, H, W, C] into ``target``, shifted by whole pixels; the edge is repeated."""
     height, width = frames.shape[1:3]
     down, right = (max(1 - size, min(size - 1, by)) for size, by in ((height, down), (width, right)))
     top, left, bottom, end = max(down, 0), max(right, 0), height + min(down, 0), width + min(right, 0)
@@ -254,90 +244,3 @@ def shifted(frames: np.ndarray, down: int, right: int) -> np.ndarray:
     moved = np.empty_like(frames)
     shift_into(moved, frames, down, right)
     return moved
-
-
-# --- prefetching ------------------------------------------------------------------------------------------------------
-
-Read = dict[str, np.ndarray]
-"""Pictures by observation, [N, T, H, W, C]."""
-
-
-class Job(NamedTuple):
-    """Pictures to read together.
-
-    :param rows: indices that identify the trajectories.
-    :param arrays: for each observation the pictures of each trajectory; ``transforms`` and ``shifts`` likewise.
-    """
-
-    rows: tuple[int, ...]
-    arrays: Mapping[str, tuple[Observed, ...]]
-    steps: slice
-    transforms: Mapping[str, Transform]
-    shifts: Mapping[str, np.ndarray]
-
-    @property
-    def key(self) -> Hashable:
-        """Identity of the job among the jobs of one plan."""
-        return (*self.arrays, self.rows, self.steps.start, self.steps.stop)
-
-
-def read(job: Job) -> Read:
-    """The pictures of a job.
-
-    :raises DemonstrationsError: a file cannot be read.
-    """
-    return {
-        key: padded(arrays, job.steps, job.transforms[key], job.shifts.get(key)) for key, arrays in job.arrays.items()
-    }
-
-
-class Readers:
-    """Processes that prefetch planned jobs in order; without processes, jobs are read when taken.
-
-    A job that is taken out of order is read by the caller, so a wrong plan affects speed alone.
-    """
-
-    def __init__(self, processes: int) -> None:
-        self._processes = processes
-        self._pool: ProcessPoolExecutor | None = None
-        self._planned: Iterator[Job] = iter(())
-        self._begun: deque[tuple[Hashable, Future[Read]]] = deque()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(wait=False, cancel_futures=True)
-
-    def plan(self, jobs: Iterable[Job]) -> None:
-        """Replace the plan by these jobs, in the order in which they will be taken."""
-        self._planned = iter(jobs if self._processes else ())
-        self._begun.clear()
-        self._prefetch()
-
-    def take(self, job: Job) -> Read:
-        """The pictures of a job.
-
-        :raises DemonstrationsError: a file cannot be read.
-        :raises Failed: a process died.
-        """
-        if not self._begun or self._begun[0][0] != job.key:
-            return read(job)
-        _, future = self._begun.popleft()
-        self._prefetch()
-        try:
-            return future.result()
-        except BrokenProcessPool as error:
-            raise Failed(from_outside("read pictures", "training.workers")) from error
-
-    def _prefetch(self) -> None:
-        """Submit planned jobs until one more than there are processes is under way."""
-        while len(self._begun) <= self._processes and (job := next(self._planned, None)) is not None:
-            if self._pool is None:
-                spawn = multiprocessing.get_context("spawn")
-                self._pool = ProcessPoolExecutor(self._processes, spawn, end_with, (os.getpid(),))
-            try:
-                self._begun.append((job.key, self._pool.submit(read, job)))
-            except BrokenProcessPool as error:
-                raise Failed(from_outside("read pictures", "training.workers")) from error

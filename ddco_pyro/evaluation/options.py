@@ -165,8 +165,8 @@ ADVICE: Mapping[Kind, str] = {
     "alone, into the file.",
     "never_persisting": "A simpler termination (network: linear), fewer options, or observations that change more "
     "slowly (differences: false) let options last.",
-    "brief": "Options so short are parts of one movement, not skills. Ask for longer ones (training.duration), take "
-    "fewer options, or import at a lower rate (ddco-pyro import --hz).",
+    "brief": "Options so short are parts of one movement, not skills. Ask for longer ones (control.power, or "
+    "ddco-pyro init --segment), take fewer options, or import at a lower rate (ddco-pyro import --hz).",
     "high_fitting": "Train layer by layer (training.layerwise: true), give the calling policy less capacity, or let it "
     "emit options only (emits: [options]).",
 }
@@ -339,29 +339,6 @@ def degeneracies(metrics: Metrics, spec: Spec, names: Mapping[str, Sequence[str]
         signs.append((text, findings[0].advice(spec.training)))
     less = _less_than_equal_parts(metrics.agreement, [*names]) if metrics.agreement else ()
     return [*signs, *less, *unlabelled_start(spec.training)]
-
-
-def durations(metrics: Metrics, spec: Spec) -> dict[str, str]:
-    """For each level, what ``training.duration`` asks for and how long segments last; empty where nothing is asked."""
-    asked, levels = spec.training.duration, spec.hierarchy.levels if spec.hierarchy else ()
-    if asked is None or not metrics.segments:
-        return {}
-    means = asked.mean if isinstance(asked.mean, tuple) else (asked.mean,) * len(levels)
-    said: dict[str, str] = {}
-    below = sum(use.steps for use in metrics.options[0])
-    for level, mean, segments in zip(levels, means, metrics.segments, strict=True):
-        lasts, what = below / segments.number, "segments of the level below" if said else "steps"
-        text = f"{number(mean, 1)} {what} asked by training.duration, {number(lasts, 1)} on the most likely paths"
-        said[f"Mean duration, level “{level.name}”"] = f"{text}{TOO_SHORT if 2 * lasts < mean else ''}"
-        below = segments.number
-    return said
-
-
-TOO_SHORT = (
-    ". What controls say of each step outweighs the prior: raise training.duration.weight, take fewer options, or "
-    "observe what changes more slowly"
-)
-"""What is said of segments that last less than half of what is asked."""
 
 
 def _less_than_equal_parts(found: Agreement, levels: Sequence[str]) -> Iterator[tuple[str, str]]:

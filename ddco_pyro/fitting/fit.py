@@ -37,7 +37,7 @@ from ddco_pyro.fitting.run import (
     write_model,
 )
 from ddco_pyro.inference import compile_all
-from ddco_pyro.jobs import LONG, BackendError, Workers, run_all
+from ddco_pyro.jobs import BackendError, Workers, run_all
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec, load_spec, with_overrides
 from ddco_pyro.training.data import demonstrations as read_demonstrations
@@ -177,8 +177,6 @@ def _fit_model(
     :param short: whether baselines may go to other processes; several long restarts share those among themselves.
     :param name: of the model in events.
     """
-    if folder:
-        on_event = clock.go_on(folder, on_event)
     split, size = parts(spec, demos), Dimensions.of(demos)
     checkpoints = folder / "checkpoints" if folder else None
     specs = {name: its for name, (its, _) in baselines.items()}
@@ -193,7 +191,9 @@ def _fit_model(
     waiting = {name: training_began(its, name) for name, its in specs.items()}
     if long:
         compile_all()
-    with run_all(long, workers, "trained a baseline", on_event, beside=1, waiting=waiting) as fitted_beside:
+    with run_all(
+        long, workers, "trained a baseline", on_event, ordered=True, beside=True, waiting=waiting
+    ) as fitted_beside:
         with clock("training"):
             free = max(1, workers.number() - len(long))
             trained = train_model(spec, size, split["train"], on_event, checkpoints, split.get("valid"), name, free)
@@ -239,7 +239,7 @@ def _fit_model(
                 named = accepted(spec, metrics.named_by_labels)
                 if folder and named:
                     write_names(folder, named)
-    metrics.seconds = clock.end()
+    metrics.seconds = clock.seconds
     if folder:
         metrics.write(folder)
     return replace(fitted, metrics=metrics, named=named or {})
@@ -286,7 +286,7 @@ def _leave_one_out(
         return {}
     places = left_out(folder, demos) if folder else {}
     calls = {name: partial(_train_without, spec, size, demos, name, places.get(name)) for name in demos.names}
-    with run_all(calls, workers, "trained without a demonstration", on_event, beside=0) as trained:
+    with run_all(calls, workers, "trained without a demonstration", on_event) as trained:
         models = dict(trained)
     return {name: models[name] for name in demos.names}
 
@@ -328,6 +328,8 @@ def _fit_baseline(
 
 # --- in other processes -----------------------------------------------------------------------------------------------
 
+LONG = 1000
+"""Gradient steps, at least, of a training that takes longer than starting a process."""
 LITTLE = 256e6
 """Bytes of demonstrations, at most, that another process gets a copy of."""
 

@@ -17,7 +17,6 @@ from ddco_pyro.evaluation.worth import success_worth
 from ddco_pyro.events import EpisodeEnded, OnEvent, ignore
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.fitting.run import RunError
-from ddco_pyro.jobs import Workers, processes
 from ddco_pyro.metrics import Method, Record, Rollouts, read_record, write_table
 from ddco_pyro.simulation.episodes import run_episodes, summarize
 from ddco_pyro.simulation.film import write_film
@@ -80,20 +79,19 @@ def roll_out(
         return held
     unfinished, total = folder / "rollouts.unfinished.json", len(played) * episodes
     rolled = _unfinished(unfinished, seeds)
-    with processes(Workers(jobs).number(episodes)):
-        for name, policy in played.items():
-            if name in rolled.outcomes and _filmed(fit, name, seeds[:film]):
-                for _ in seeds:
-                    on_event(EpisodeEnded(name, total))
-                continue
-            outcomes = []
-            for episode in run_episodes(str(fit.spec.task), policy, seeds, film, jobs, fit.spec.observed, ()):
-                outcomes.append(episode.outcome)
-                if episode.frames:
-                    write_film(_film(fit, name, episode.seed), episode, _names(policy))
+    for name, policy in played.items():
+        if name in rolled.outcomes and _filmed(fit, name, seeds[:film]):
+            for _ in seeds:
                 on_event(EpisodeEnded(name, total))
-            rolled.outcomes[name] = outcomes
-            write_text(unfinished, json_text(rolled.model_dump()))
+            continue
+        outcomes = []
+        for episode in run_episodes(str(fit.spec.task), policy, seeds, film, jobs, fit.spec.observed, ()):
+            outcomes.append(episode.outcome)
+            if episode.frames:
+                write_film(_film(fit, name, episode.seed), episode, _names(policy))
+            on_event(EpisodeEnded(name, total))
+        rolled.outcomes[name] = outcomes
+        write_text(unfinished, json_text(rolled.model_dump()))
     task, by_method = find_task(str(fit.spec.task)), {name: rolled.outcomes[name] for name in played}
     rows = [
         {"method": name, "seed": seed, **outcome}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -16,12 +15,10 @@ from ddco_pyro.data.controls import ControlPart
 from ddco_pyro.data.files import Damaged, leftovers, only_one, write_text
 from ddco_pyro.data.tensors import read_tensors, write_tensors
 from ddco_pyro.errors import BadInput
-from ddco_pyro.events import EpochEnded, Event, OnEvent
-from ddco_pyro.metrics import read_record, refit, write_table
+from ddco_pyro.metrics import refit, write_table
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec, SpecError, dump_spec, load_spec
 from ddco_pyro.training.checkpoint import copy_of
-from ddco_pyro.training.loop import SAVE_EVERY
 from ddco_pyro.training.networks import Dimensions, build_hierarchy
 
 
@@ -129,57 +126,15 @@ def write_history(folder: Path, rows: Sequence[dict[str, Any]]) -> None:
 
 
 class Clock:
-    """Seconds by phase, summed over the processes that worked on an interrupted run."""
+    """Seconds of this process by phase."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
-        self._phase, self._since = "", 0.0
-        self._path: Path | None = None
-        self._kept_at = -math.inf
 
     @contextmanager
     def __call__(self, phase: str) -> Iterator[None]:
-        self._phase, self._since = phase, time.perf_counter()
+        since = time.perf_counter()
         try:
             yield
         finally:
-            self._add()
-            if self._kept_at > -math.inf:
-                self._keep()
-
-    def go_on(self, folder: Path, on_event: OnEvent) -> OnEvent:
-        """Add the seconds that an interrupted run kept in its folder, and keep them there from the first epoch on.
-
-        :returns: the callback to use in place of ``on_event``, which it calls.
-        :raises Damaged: ``seconds.json`` is damaged.
-        """
-        self._path = folder / "seconds.json"
-        if self._path.exists():
-            kept = read_record(self._path, dict[str, float], "remove it and do the same again")
-            self.seconds = {
-                phase: kept.get(phase, 0) + self.seconds.get(phase, 0) for phase in {**kept, **self.seconds}
-            }
-
-        def told(event: Event) -> None:
-            self._add()
-            if isinstance(event, EpochEnded) and self._since - self._kept_at > SAVE_EVERY:
-                self._keep()
-            on_event(event)
-
-        return told
-
-    def end(self) -> dict[str, float]:
-        """The seconds of all phases; ``seconds.json`` is removed, since ``metrics.json`` has them."""
-        if self._path is not None:
-            self._path.unlink(missing_ok=True)
-        return self.seconds
-
-    def _add(self) -> None:
-        now = time.perf_counter()
-        self.seconds[self._phase] = self.seconds.get(self._phase, 0.0) + now - self._since
-        self._since = now
-
-    def _keep(self) -> None:
-        if self._path is not None:
-            self._kept_at = self._since
-            write_text(self._path, json.dumps(self.seconds))
+            self.seconds[phase] = self.seconds.get(phase, 0.0) + time.perf_counter() - since

@@ -13,7 +13,7 @@ from ddco_pyro.events import OnEvent, SeedFitted, ignore
 from ddco_pyro.fitting.fit import fit as fit_again
 from ddco_pyro.fitting.fitted import Fit, load
 from ddco_pyro.fitting.rollouts import roll_out
-from ddco_pyro.jobs import Workers, processes, run_all
+from ddco_pyro.jobs import Workers, run_all
 from ddco_pyro.metrics import Metrics, Seeds, SuccessOfSeeds
 from ddco_pyro.spec import Spec, user_code, with_overrides
 
@@ -73,10 +73,9 @@ def roll_out_repetitions(first: Fit, on_event: OnEvent = ignore, jobs: int = -1)
     if seeds is None or rollouts is None:
         return
     each = [rollouts]
-    with processes(Workers(jobs).number(rollouts.episodes)):
-        for again in first.repetitions:
-            alone = replace(again, spec=with_overrides(again.spec, {"rollout.policies": []}))  # scripts have no seeds
-            each.append(roll_out(alone, rollouts.episodes, 0, on_event, jobs, resume=True))
+    for again in first.repetitions:
+        alone = replace(again, spec=with_overrides(again.spec, {"rollout.policies": []}))  # scripts have no seeds
+        each.append(roll_out(alone, rollouts.episodes, 0, on_event, jobs, resume=True))
     rates = {name: [one.success_rates[name].rate for one in each] for name in each[-1].success_rates}
     pairs = [dict(one.worth or ()) for one in each]
     worth = {

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import importlib
+import os
 import tempfile
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from ddco_pyro.errors import Failed, reason
 from ddco_pyro.events import EpochEnded, Event, TrainingBegan
-from ddco_pyro.jobs import processes
+from ddco_pyro.jobs import end_with, without_lost_calls
+
+if TYPE_CHECKING:
+    from joblib.externals.loky import ProcessPoolExecutor
 
 Result = TypeVar("Result")
 
@@ -57,7 +60,8 @@ class Background:
         self.lock, self.changed, self.modules, self.error = lock, changed, modules, ""
         self.work: Work | None = None
         self._after: Work | None = None
-        self._process, self._folder = ExitStack(), tempfile.TemporaryDirectory(prefix="ddco-pyro-")
+        self._process: ProcessPoolExecutor | None = None
+        self._folder = tempfile.TemporaryDirectory(prefix="ddco-pyro-")
         self._told = Path(self._folder.name) / "done"
 
     def ready(self) -> None:
@@ -81,7 +85,7 @@ class Background:
         with self.lock:
             if self.work is not None:
                 self.work = self._after = None
-                self._process.close()
+                self._end()
                 self.ready()
                 self.changed()
 
@@ -89,7 +93,7 @@ class Background:
         """End the process."""
         with self.lock:
             self.work = self._after = None
-            self._process.close()
+            self._end()
             self._folder.cleanup()
 
     @property
@@ -116,7 +120,7 @@ class Background:
                 return  # it was cancelled
             self.error = error and f"{work.message} failed: {error}"
             if error:
-                self._process.close()
+                self._end()
             self.work, after, self._after = None, self._after, None
             self.changed()
             if after is not None:
@@ -147,8 +151,17 @@ class Background:
 
     def _submit(self, call: Callable[[], Result]) -> Future[Result]:
         """Have a call made by the process, which stays for the next call."""
-        submit, _ = self._process.enter_context(processes(1))
-        return submit(call)
+        if self._process is None:
+            from joblib.externals.loky import ProcessPoolExecutor
+
+            self._process = ProcessPoolExecutor(1, initializer=end_with, initargs=(os.getpid(),))
+        return self._process.submit(call)
+
+    def _end(self) -> None:
+        if self._process is not None:
+            with without_lost_calls():
+                self._process.shutdown(kill_workers=True)
+            self._process = None
 
 
 def _telling(call: Call[Result], file: Path) -> Result:

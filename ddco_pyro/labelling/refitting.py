@@ -64,7 +64,7 @@ def refit(
         known = _padded([demo.labels[SAID] for demo in demos])
         known = torch.where(known > 0, known, -1)
         fitted = before.encoder.state_dict(), scaling.state_dict()
-        labels = Labels(1, True, tuple(range(1, count + 1)), names, known, known)
+        labels = Labels(1, tuple(range(1, count + 1)), names, known, known)
         data = TrainingData(spec, size, batch, batch, names, *fitted, labels)
         model = data.hierarchy(0)
         data, _ = recognise(model, data, demos)

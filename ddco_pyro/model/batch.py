@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
-from ddco_pyro.data.pictures import Readers
 from ddco_pyro.model.controls import ControlScaling, refuse_impossible
 from ddco_pyro.model.encoder import ObservationEncoder, padded
 from ddco_pyro.model.networks import Inputs
@@ -74,29 +73,10 @@ class Batch:
         """
         random = np.random.default_rng(seed)
         shifts = {key: random.integers(-pixels, pixels + 1, (len(self), 2)) for key, pixels in most.items()}
-        return self._with(lambda images: replace(images, shifts=shifts))
-
-    def read_by(self, readers: Readers) -> Batch:
-        """The batch whose pictures in files are read by ``readers``."""
-        return self._with(lambda images: replace(images, readers=readers) if images.stored else images)
-
-    def held(self, device: torch.device) -> Batch:
-        """The batch with all pictures on a device.
-
-        :raises DemonstrationsError: a file cannot be read.
-        """
-        return self._with(lambda images: images.held(device))
-
-    @property
-    def picture_bytes(self) -> int:
-        """Bytes of all pictures as networks see them."""
-        return self.inputs.images.size if isinstance(self.inputs.images, Frames) else 0
-
-    def _with(self, change: Callable[[Frames], Frames]) -> Batch:
         images = self.inputs.images
         if not isinstance(images, Frames):
             return self
-        return replace(self, inputs=Inputs(self.inputs.vectors, change(images), self.inputs.time))
+        return replace(self, inputs=replace(self.inputs, images=replace(images, shifts=shifts)))
 
 
 def encode(

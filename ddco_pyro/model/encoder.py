@@ -201,8 +201,7 @@ class ObservationEncoder(nn.Module):
         vector = padded(vectors).float()
         by_key, steps = dict(zip(self.keys, vector.split(self.sizes, -1), strict=True)), vector.shape[1]
         pictures = {key: tuple(_as_pictures(sequence[key]) for sequence in sequences) for key in self.images}
-        rows = tuple(range(len(sequences)))
-        images = Frames(pictures, self.transforms, rows, slice(0, steps)) if pictures else {}
+        images = Frames(pictures, self.transforms, slice(0, steps)) if pictures else {}
         return Inputs(by_key, images, torch.arange(steps))
 
 

@@ -6,7 +6,6 @@ A flat policy is a hierarchy without option levels, whose meta-policy emits the 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import nullcontext
 from functools import cached_property
 from types import MappingProxyType
 from typing import Literal
@@ -146,7 +145,6 @@ class Hierarchy(nn.Module):
     ) -> None:
         super().__init__()
         self.steps, self.device = steps, HOST
-        self._reduced = spec.training.precision == "bfloat16"
         self.encoder = ObservationEncoder(spec.observations, shapes)
         power = spec.control.power if spec.hierarchy is not None else 1.0  # nothing is latent in a flat policy
         self.register_buffer("power", torch.tensor(power, dtype=torch.float64))
@@ -286,25 +284,21 @@ class Hierarchy(nn.Module):
         inputs, states = inputs.loaded().to(self.device), before or self.initial_states(inputs.batch[0])
         after: dict[str, State] = {}
         raw: list[Tensor] = []
-        reduced = self._reduced and self.training
 
         def run(place: str, network: Network, seen: Inputs | Tensor) -> Tensor:
             output, after[place] = network(seen, states[place])
             return output
 
-        with torch.autocast(self.device.type, torch.bfloat16) if reduced else nullcontext():
-            read = inputs if self.trunk is None else run("trunk", self.trunk, inputs)
-            for number, level in enumerate(self.option_levels()[:discovering]):
-                place = f"levels.{number}"
-                own = read if level.trunk is None else run(f"{place}.trunk", level.trunk, read)
-                raw.append(run(f"{place}.policy", level.policy.network, own))
-                if level.termination is not None:
-                    raw.append(run(f"{place}.termination", level.termination, own))
-            if not discovering:
-                raw.append(run("meta_policy", self.meta_policy.network, read))
-        if reduced or self.device != HOST:
-            raw = [output.float().to(HOST) if reduced else output.to(HOST) for output in raw]
-        return raw, after
+        read = inputs if self.trunk is None else run("trunk", self.trunk, inputs)
+        for number, level in enumerate(self.option_levels()[:discovering]):
+            place = f"levels.{number}"
+            own = read if level.trunk is None else run(f"{place}.trunk", level.trunk, read)
+            raw.append(run(f"{place}.policy", level.policy.network, own))
+            if level.termination is not None:
+                raw.append(run(f"{place}.termination", level.termination, own))
+        if not discovering:
+            raw.append(run("meta_policy", self.meta_policy.network, read))
+        return [output.to(HOST) for output in raw], after
 
     def _outputs(self, raw: RawOutputs, discovering: int | None = None) -> Outputs:
         """The outputs as logits and emissions of each level."""

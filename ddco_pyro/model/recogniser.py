@@ -128,8 +128,8 @@ def observed(inputs: Inputs) -> Tensor:
 def _observed(inputs: Inputs) -> Iterator[Tensor]:
     for part in inputs.chunks(FRAMES_AT_ONCE // inputs.batch[0]):
         loaded = part.loaded()
-        means = [torch.stack([block_means(frames.cpu()) for frames in image]) for image in loaded.images.values()]
-        yield torch.cat([loaded.vector.cpu(), *means], dim=-1).double()
+        means = [torch.stack([block_means(frames) for frames in image]) for image in loaded.images.values()]
+        yield torch.cat([loaded.vector, *means], dim=-1).double()
 
 
 def block_means(frames: Tensor) -> Tensor:

@@ -14,7 +14,6 @@ from ddco_pyro.drawing.figures import style
 from ddco_pyro.drawing.page import Block, Facts, Page, Text, footnote
 from ddco_pyro.drawing.shown import paths_of, pictures, stored_pictures
 from ddco_pyro.evaluation import effort, verdicts
-from ddco_pyro.evaluation.options import durations
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Metrics, Rate
 from ddco_pyro.names import method
@@ -90,7 +89,6 @@ def header(fit: Fit, metrics: Metrics) -> list[Block]:
     facts = {
         **verdicts.leads(metrics),
         **agreement.in_short(fit),
-        **durations(metrics, fit.spec),
         "Demonstrations": verdicts.division(counts),
         "Parameters": str(metrics.parameters),
         "Training": effort.spent(metrics.training),

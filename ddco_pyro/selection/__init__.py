@@ -30,8 +30,8 @@ from ddco_pyro.training import data
 
 __all__ = ["Choice", "Selection", "SelectionFailed", "Workers", "check", "final_spec", "known_demonstrations", "select"]
 
-HERE = Workers()
-"""One process for each core of this machine."""
+ALL_CORES = Workers()
+"""One process for each core."""
 
 
 class SelectionFailed(Failed):
@@ -53,14 +53,13 @@ def known_demonstrations(spec: Spec) -> Demonstrations | None:
     return data.known_demonstrations(grid.wide(spec))
 
 
-def check(spec: Spec, workers: Workers = HERE, demos: Demonstrations | None = None) -> list[Candidate]:
-    """Check every candidate, the folds and the workers, without collecting or training anything.
+def check(spec: Spec, demos: Demonstrations | None = None) -> list[Candidate]:
+    """Check every candidate and the folds, without collecting or training anything.
 
     :param demos: :func:`known_demonstrations`, where they have been read.
     :returns: the candidates.
     :raises SpecError: a candidate is not valid, or the grid is empty.
     :raises FoldError: there are fewer demonstrations than folds.
-    :raises BackendError: the workers cannot be reached.
     """
     wide, own = grid.wide(spec), spec.demonstrations
     demos = data.outline(wide) if demos is None and data.in_file(wide) else demos
@@ -69,7 +68,6 @@ def check(spec: Spec, workers: Workers = HERE, demos: Demonstrations | None = No
         dividing.assign(own.count - len(set(own.exclude)), spec.selection.folds, spec.seed)
     else:
         dividing.divide(demos, spec.selection.folds, spec.seed)
-    workers.check()
     return candidates
 
 
@@ -77,7 +75,7 @@ def select(
     spec: Spec,
     folder: str | Path,
     on_event: OnEvent = ignore,
-    workers: Workers = HERE,
+    workers: Workers = ALL_CORES,
     demos: Demonstrations | None = None,
     resume: bool = True,
 ) -> Selection:

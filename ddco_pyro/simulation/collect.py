@@ -15,7 +15,6 @@ from ddco_pyro.data.hdf5 import Attribute, attributes_of, opened
 from ddco_pyro.data.sources.robomimic import robomimic_file, write_recording
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
-from ddco_pyro.jobs import Workers, processes
 from ddco_pyro.simulation.episodes import run_episodes, summarize
 from ddco_pyro.simulation.task import Task, find_task, package_of, version_of
 from ddco_pyro.spec import DemonstrationsSpec
@@ -95,7 +94,7 @@ def _record(
     at_once = EPISODES_WITH_PICTURES if task.seen_by_cameras(observed) else spec.count
     seeds = range(spec.seed, spec.seed + spec.count)
     attributes: dict[str, Attribute] = {"task": task.name, "policy": spec.supervisor}
-    with processes(Workers().number(at_once)), robomimic_file(path, attributes, {}) as data:
+    with robomimic_file(path, attributes, {}) as data:
         for first in range(0, len(seeds), at_once):
             for episode in run_episodes(task_name, spec.supervisor, seeds[first : first + at_once], observed=observed):
                 write_recording(data, episode.record.recording())

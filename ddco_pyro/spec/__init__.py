@@ -24,7 +24,7 @@ from ddco_pyro.spec.settings import (
     SelectionSpec,
 )
 from ddco_pyro.spec.spec import Spec, parse_spec, with_overrides
-from ddco_pyro.spec.training import DurationSpec, LabelsSpec, OptimizerSpec, RidgeSpec, Start, TrainingSpec
+from ddco_pyro.spec.training import LabelsSpec, OptimizerSpec, RidgeSpec, Start, TrainingSpec
 from ddco_pyro.spec.yaml import dump_spec, load_spec, spec_schema, user_code
 
 __all__ = [
@@ -36,7 +36,6 @@ __all__ = [
     "ControlSpec",
     "ConvolutionLayer",
     "DemonstrationsSpec",
-    "DurationSpec",
     "HierarchySpec",
     "InferenceSpec",
     "Kind",

@@ -101,7 +101,7 @@ class Spec(Model):
         return not any(trunks) and all(n.network in _LINEAR for n in (*networks, self.hierarchy.meta_policy))
 
     def problems(self) -> Problems:
-        checks = (self._choices, self._baselines, self._observed, self._labelled, self._durations, self._segments)
+        checks = (self._choices, self._baselines, self._observed, self._labelled, self._segments)
         return (problem for check in checks for problem in check())
 
     def _choices(self) -> Problems:
@@ -171,15 +171,6 @@ class Spec(Model):
         elif any("options" not in emits for emits in self._emitted[known.index(name) + 1 :]):
             text = f"no policy selects the options of {name!r}; let the policies above emit options"
             yield "training.labels.level", text
-
-    def _durations(self) -> Problems:
-        duration, levels = self.training.duration, len(self._levels)
-        if duration is None:
-            return
-        if not any(level.lasts for level in self._levels):
-            yield "training.duration", "there are no options that last; leave it out"
-        elif isinstance(duration.mean, tuple) and len(duration.mean) != levels:
-            yield "training.duration.mean", f"has {len(duration.mean)} numbers, but the number of levels is {levels}"
 
     def _segments(self) -> Problems:
         if self.training.upper_levels != "segments":
@@ -283,7 +274,7 @@ def edited(data: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]
 
 
 def _set_model(data: dict[str, Any], value: Any) -> None:
-    """Replace the model; labels and durations stay where the new model has options for them."""
+    """Replace the model; labels stay where the new model has options for them."""
     if value == OPTIONS:
         return
     hierarchy = data.get("hierarchy") or {}
@@ -303,12 +294,9 @@ def _set_model(data: dict[str, Any], value: Any) -> None:
             for level in levels:
                 if level.get("name", "option") in named:
                     level["termination"] = "always"
-            gone = ["duration"] if all(level.get("termination") == "always" for level in levels) else []
         else:
             data |= {"hierarchy": None, "baseline": baseline}
-            gone = ["duration", "labels"]
-        for key in gone:
-            (data.get("training") or {}).pop(key, None)
+            (data.get("training") or {}).pop("labels", None)
 
 
 def plain(data: Any) -> Any:

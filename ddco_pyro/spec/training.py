@@ -1,4 +1,4 @@
-"""Settings of training: optimiser, stages, early stopping, labels and durations."""
+"""Settings of training: optimiser, stages, early stopping and labels."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import ConfigDict, Field
 
-from ddco_pyro.spec.base import Count, Fraction, Items, Model, Positive, Problems, Seed, Share, Text, nested
+from ddco_pyro.spec.base import Count, Fraction, Items, Model, Positive, Problems, Seed, Share, Text
 
 
 class RidgeSpec(Model):
@@ -52,12 +52,6 @@ class OptimizerSpec(Model):
             yield "momentum", f"is for name: momentum, and {self.name} does not use it; leave it out"
 
 
-Window = Annotated[
-    Annotated[int, Field(ge=1)] | Annotated[str, Field(pattern=r"^(\d+\.?\d*|\.\d+)s$")],
-    nested((), int, "a number of steps from 1 on, or seconds such as 1s"),
-]
-
-
 class RecogniserSpec(Model):
     """A recogniser of the options of labelled steps, whose evidence places the options of steps without labels."""
 
@@ -65,9 +59,6 @@ class RecogniserSpec(Model):
     """γ: how many times log r(h | window) − log p(h) counts, beside the control's log-density (``control.power``)."""
     ridge: Positive = 50.0
     """Precision of a normal prior on the weights of standardised features."""
-    windows: Annotated[Items[Window], Field(min_length=2, max_length=2)] | None = None
-    """Half widths of both windows around a step, in steps, or in seconds, such as ``[1s, 3s]``. Null: a quarter and
-    three quarters of the median labelled segment."""
     cross_validated: bool = False
     """Whether ``weight``, ``ridge`` and ``control.power`` are chosen by leaving out labelled demonstrations in turn, or
     parts of a single one: the best mean of accuracy and edit score."""
@@ -85,32 +76,8 @@ class LabelsSpec(Model):
     count: Count | None = None
     """Number of demonstrations whose labels are used: training demonstrations in order, then tuning demonstrations.
     Null: all. Labels of held-out demonstrations are never used."""
-    hold: bool = True
-    """Whether labels fix the active option throughout training; false: in initialisation alone."""
     recogniser: RecogniserSpec | None = None
     """A recogniser that the labelled steps train, for steps without labels and for other demonstrations; null: none."""
-
-    def problems(self) -> Problems:
-        if self.recogniser is not None and not self.hold:
-            yield "recogniser", "is for labels that hold throughout training; say hold: true, or leave it out"
-
-
-Duration = Annotated[float, Field(ge=1)]
-Durations = Annotated[Items[Duration], Field(min_length=1)]
-
-
-class DurationSpec(Model):
-    """A prior on option durations: a Beta distribution of each option's termination probability ψ."""
-
-    mean: Annotated[
-        Duration | Durations,
-        nested((list, tuple), Durations, "a number of steps, at least 1, or a list of them"),
-    ]
-    """Mean duration of an option in steps, 1 / E[ψ]; a list has one number for each level, lowest first. Levels above
-    the lowest count terminated options of the level below instead of steps."""
-    weight: float = Field(default=1.0, ge=0, le=1e30)
-    """Strength of the prior against the training demonstrations, however many they are. At 1 its pseudo-selections are
-    as many as the demonstrations would have with these durations; 0 for no prior."""
 
 
 Start = Literal["vq", "vq_controls", "windows", "equal_parts", "mixture", "random"]
@@ -165,29 +132,21 @@ class TrainingSpec(Model):
     single outlier."""
     patience: Count | None = 20
     """Epochs without improvement after which a stage stops; null: never."""
-    workers: int = Field(default=0, ge=0)
-    """Number of processes that prefetch pictures; 0: no prefetching. Results do not depend on the number."""
     device: Literal["cpu", "cuda", "auto"] = "cpu"
     """Device of the networks: ``cpu``, ``cuda`` (a GPU), or ``auto`` (a GPU if there is one)."""
-    precision: Literal["float32", "bfloat16"] = "float32"
-    """Precision of matrix products in gradient steps (torch's autocast)."""
-    clip_gradient: Positive | None = None
-    """Largest norm of a gradient; null: no limit."""
     labels: LabelsSpec | None = None
     """Labels that fix active options in some demonstrations; null: none."""
-    duration: DurationSpec | None = None
-    """A prior on option durations; null: none."""
 
     @property
     def takes_gradient_steps(self) -> bool:
         """Whether the spec names an optimiser, or gives a setting that gradient steps alone have."""
-        given = self.optimizer.model_fields_set - {"ridge"} or {"average", "clip_gradient"} & self.model_fields_set
+        given = self.optimizer.model_fields_set - {"ridge"} or {"average"} & self.model_fields_set
         return bool(given) and self.optimizer.name != "em"
 
     def problems(self) -> Problems:
         if self.optimizer.name == "em":
             steps = self.optimizer
-            unused = {"average": self.average, "clip_gradient": self.clip_gradient, "optimizer.warmup": steps.warmup}
+            unused = {"average": self.average, "optimizer.warmup": steps.warmup}
             for key, value in (unused | {"optimizer.schedule": steps.schedule != "constant"}).items():
                 if value:
                     yield key, "em takes no gradient steps and would not use it; leave it out"
@@ -199,5 +158,3 @@ class TrainingSpec(Model):
             yield "optimizer.schedule", "cosine ends at training.epochs, which is null"
         if self.upper_levels == "segments" and not self.layerwise:
             yield "upper_levels", "segments needs the lowest level discovered first; say layerwise: true"
-        if self.labels is not None and not self.labels.hold and "random" in self.starts:
-            yield "labels.hold", "false uses labels in initialisation alone, and that is random; say vq there"

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor, nn
 
-from ddco_pyro.data.pictures import Readers
 from ddco_pyro.data.tensors import read_tensors, write_tensors
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec
-from ddco_pyro.training.devices import device_of, room
+from ddco_pyro.training.devices import device_of
 from ddco_pyro.training.labels import Labels
 from ddco_pyro.training.networks import Dimensions, build_hierarchy
 from ddco_pyro.training.stages import starts_of
@@ -59,19 +57,6 @@ class TrainingData:
         if state is not None:
             hierarchy.load_state_dict(state)
         return hierarchy.place(device_of(self.spec.training)).eval()
-
-    def read_by(self, readers: Readers) -> TrainingData:
-        """The same data, with pictures in files read by these processes."""
-        return replace(self, train=self.train.read_by(readers), tune=self.tune.read_by(readers))
-
-    def held(self, device: torch.device) -> TrainingData:
-        """The same data, with all pictures on the networks' device where there is room for them.
-
-        :raises DemonstrationsError: a file cannot be read.
-        """
-        if self.train.picture_bytes + self.tune.picture_bytes > room(device):
-            return self
-        return replace(self, train=self.train.held(device), tune=self.tune.held(device))
 
     def seed(self, restart: int, *place: int) -> int:
         """The seed of a restart, of one of its stages, of an epoch of a stage, or of a shard of a minibatch.

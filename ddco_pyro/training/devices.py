@@ -36,11 +36,6 @@ def described(device: torch.device) -> str:
     return f"cuda ({torch.cuda.get_device_name(device)})" if device.type == "cuda" else device.type
 
 
-def room(device: torch.device) -> float:
-    """Bytes that pictures may take on a device: half of a GPU's free memory, none on the host, where they are."""
-    return torch.cuda.mem_get_info(device)[0] / 2 if device.type == "cuda" else 0.0
-
-
 @contextmanager
 def repeatable(device: torch.device) -> Iterator[None]:
     """Inside, a GPU gives the same bits each time, without TF32; nothing changes on the host."""

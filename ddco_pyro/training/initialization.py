@@ -102,7 +102,7 @@ class Clusters:
         for inputs in alone.chunks(FRAMES_AT_ONCE if alone.images else length):
             loaded = inputs.loaded()
             read = loaded.select(self._read) if self._read else loaded
-            pooled = [block_means(image[0].cpu()) for image in read.images.values()]
+            pooled = [block_means(image[0]) for image in read.images.values()]
             seen = torch.cat([read.vector[0], *pooled], dim=-1).double().numpy()
             last = first + len(seen)
             yield joined(seen, batch.actions[row, first:last].double().numpy()) if self._controls else seen

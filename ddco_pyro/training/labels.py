@@ -22,7 +22,6 @@ class Labels:
     """Labels of the options of a level.
 
     :param level: 1 is the lowest.
-    :param hold: whether all of training uses the labels, or the initialisation alone.
     :param values: the labels that the options 1, 2, ... stand for.
     :param demonstrations: the names of the demonstrations whose labels are used.
     :param train: the option of each step of the demonstrations to train with, [N, T]; -1 where it is free.
@@ -32,7 +31,6 @@ class Labels:
     """
 
     level: int
-    hold: bool
     values: tuple[int, ...]
     demonstrations: tuple[str, ...]
     train: Tensor
@@ -65,27 +63,20 @@ class Labels:
             )
         names = tuple(demo.name for demo in used)
         ours, theirs = (choices(part, labels.source, values, names) for part in (train, tune))
-        return cls(number, labels.hold, values, names, ours, theirs)
+        return cls(number, values, names, ours, theirs)
 
     def matter_in(self, stage: Stage) -> bool:
         """Whether a stage of training uses the labels."""
-        seen = stage.discovering is None or self.level <= stage.discovering
-        return seen if self.hold else stage.clamped == self.level or (stage.from_constants and self.level > 1)
+        return stage.discovering is None or self.level <= stage.discovering
 
 
 def used(spec: Spec, demos: Demonstrations) -> Labels | None:
     """The labels that a fit to these demonstrations uses; None where the spec names none.
 
-    :raises SpecError: as :meth:`Labels.of`, or windows of a recogniser are in seconds and the frequency is unknown.
+    :raises SpecError: as :meth:`Labels.of`.
     """
-    if (labels := spec.training.labels) is None:
+    if spec.training.labels is None:
         return None
-    windows = (labels.recogniser and labels.recogniser.windows) or ()
-    if demos.frequency is None and any(isinstance(width, str) for width in windows):
-        raise SpecError(
-            "training.labels.recogniser.windows: are in seconds, and the file does not say its control frequency; give "
-            "numbers of steps"
-        )
     return Labels.of(spec, *tuning_split(spec, Dimensions.of(demos), parts(spec, demos)["train"]))
 
 

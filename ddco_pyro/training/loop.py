@@ -13,17 +13,15 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from ddco_pyro.data.pictures import Readers
 from ddco_pyro.events import EpochEnded, OnEvent, ignore
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
@@ -33,7 +31,7 @@ from ddco_pyro.model.tables import Tables
 from ddco_pyro.training.checkpoint import Restart, State, TrainingData, copy_of
 from ddco_pyro.training.devices import device_of, one_thread, repeatable
 from ddco_pyro.training.em import Expectation
-from ddco_pyro.training.objective import Diverged, Objective, read_ahead
+from ddco_pyro.training.objective import Diverged, Objective
 from ddco_pyro.training.optimizers import (
     QuasiNewton,
     gradient_optimizer,
@@ -67,9 +65,8 @@ def train(
         training. Steps over all demonstrations take seconds: those of a stage are made again after an interruption.
     """
     now, states, spec = restart.progress, restart.states, data.spec.training
-    device, saved = device_of(spec), -math.inf
-    with one_thread(), repeatable(device), Readers(spec.workers) as readers:
-        data = data.read_by(readers).held(device)
+    saved = -math.inf
+    with one_thread(), repeatable(device_of(spec)):
         model = data.hierarchy(now.restart, states.get("model"))
         stages = plan(data.spec, model.depth, now.restart)
         try:
@@ -208,8 +205,6 @@ class StageTraining:
         with seeded(self.data.seed(*place), self.model.device):
             self.model.train()
             minibatches = torch.randperm(len(train)).split(self.spec.batch_size)
-            if train.picture_bytes:
-                read_ahead(self.model, varied, self._pieces(varied, minibatches))
             for number, rows in enumerate(minibatches):
                 total += self.step(varied, rows, number)
             self.model.eval()
@@ -226,8 +221,6 @@ class StageTraining:
             value = backward(self.objective, self.model, batch, rows)
         else:
             value = self._backward_in_shards(batch, rows, number)
-        if self.spec.clip_gradient is not None:
-            nn.utils.clip_grad_norm_(self.parameters, self.spec.clip_gradient)
         self.optimizer.step()
         if self.mean is not None:
             self.mean.update_parameters(self.model)
@@ -259,13 +252,6 @@ class StageTraining:
         seed_generators(seed, self.model.device)
         value = backward(self.objective, self.model, batch, rows, steps)
         return value, [None if p.grad is None else p.grad.cpu().numpy() for p in self.parameters]
-
-    def _pieces(self, batch: Batch, minibatches: tuple[Tensor, ...]) -> Iterator[Batch]:
-        """The pieces that this process computes in an epoch, in order."""
-        for rows in minibatches:
-            for shard in self.ranks.own(self._shards(rows)):
-                for _, piece in batch.select(shard).pieces(self.model.steps_at_once):
-                    yield piece
 
     def states(self) -> dict[str, State]:
         """The state of gradient steps in a checkpoint, beside the best epoch and the objective."""

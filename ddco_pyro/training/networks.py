@@ -183,7 +183,7 @@ def named_baselines(spec: Spec) -> dict[str, BaselineSpec]:
 def baseline_spec(spec: Spec, baseline: BaselineSpec, dimensions: Dimensions) -> Spec:
     """The spec of a baseline: another model, with the optimiser and σ that the baseline names.
 
-    Nothing else differs. A mixture keeps labels and durations; policies without options have neither.
+    Nothing else differs. A mixture keeps labels; policies without options have none.
 
     :raises SpecError: the network of a ``flat_equal`` does not fit the observations.
     """

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 from itertools import chain
 from statistics import median
@@ -10,14 +10,11 @@ from statistics import median
 import torch
 from torch import Tensor
 
-from ddco_pyro.data.pictures import Job
 from ddco_pyro.errors import Failed
 from ddco_pyro.inference.engines import log_likelihood
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.model.networks.inputs import Frames
-from ddco_pyro.model.tables import Tables, always_ends
-from ddco_pyro.spec import DurationSpec
+from ddco_pyro.model.tables import Tables
 from ddco_pyro.training.checkpoint import Progress, State, TrainingData
 from ddco_pyro.training.initialization import WAYS, Given
 from ddco_pyro.training.processes import Ranks
@@ -38,7 +35,7 @@ Known = dict[int, Tensor]
 
 
 class Objective:
-    """The objective of a stage: the log-likelihood given the known choices, plus the log-prior of durations.
+    """The objective of a stage: the log-likelihood given the known choices.
 
     In a stage with ``from_constants`` the expected log-probability of selections and terminations (an M-step) takes the
     place of the log-likelihood. In a stage with ``selecting`` the levels and the meta-policy are trained apart: the
@@ -133,27 +130,19 @@ class Objective:
 
         :param lengths: steps of each demonstration, [N].
         """
-        spec = self.data.spec
-        likelihood = partial(log_likelihood, lengths=lengths, engine=spec.inference.engine)
         if self.constants is not None:
-            values = expected(tables, lengths, self.constants)
-        elif self.stage.selecting:
+            return expected(tables, lengths, self.constants)
+        likelihood = partial(log_likelihood, lengths=lengths, engine=self.data.spec.inference.engine)
+        if self.stage.selecting:
             levels, meta_policy = tables.apart()
-            values = likelihood(levels) + likelihood(meta_policy)
-        else:
-            values = likelihood(tables)
-        if spec.training.duration is None:
-            return values
-        return values + log_duration_prior(tables.termination, lengths, spec.training.duration)
+            return likelihood(levels) + likelihood(meta_policy)
+        return likelihood(tables)
 
     def tune(self, model: Hierarchy) -> float:
         """The objective per step of the tuning demonstrations: the mean, or the median over demonstrations."""
         tune = self.data.tune
-        pieces = list(tune.pieces(model.steps_at_once))
         with torch.no_grad():
-            if tune.picture_bytes:
-                read_ahead(model, tune, (piece for _, piece in self.ranks.own(pieces)))
-            each = self.ranks.each(partial(self._tuned, model, *piece) for piece in pieces)
+            each = self.ranks.each(partial(self._tuned, model, *piece) for piece in tune.pieces(model.steps_at_once))
             values = list(chain.from_iterable(each))
         if self.data.spec.training.tune_by == "median":
             return median(value / steps for value, steps in zip(values, tune.lengths.tolist(), strict=True))
@@ -173,45 +162,3 @@ class Objective:
             f"stage {self.stage.name}, epoch {self.progress.epoch + 1}: the log-likelihood of {where} is not "
             "finite; look at these demonstrations, raise control.std, or lower training.optimizer.lr"
         )
-
-
-def log_duration_prior(termination: Sequence[Tensor], lengths: Tensor, prior: DurationSpec) -> Tensor:
-    """Σ_d Σ_h Σ_t w / (k_d M_d) (log ψ_h(s_t) + (m_d - 1) log(1 - ψ_h(s_t))) of each trajectory, nats, [N] in float64.
-
-    ψ is that of option h of the k_d options of level d, w the prior's weight, m_d its mean, and M_d the product of the
-    means of this level and those below: the steps that an option lasts. The mean over all states is of log-densities of
-    Beta distributions of ψ with mean 1/m_d and as many terminations as all steps have under these means, times w. Each
-    is a density of the logit of ψ, up to a constant. A level whose options end after every step has no such
-    distribution and adds nothing.
-
-    :param termination: (log(1 - ψ), log ψ) of each level, lowest first, [N, T, k, 2].
-    :param lengths: steps of each trajectory, [N].
-    """
-    means = prior.mean if isinstance(prior.mean, tuple) else (prior.mean,) * len(termination)
-    total = lengths.new_zeros(len(lengths), dtype=torch.float64)
-    lasts = 1.0
-    for table, mean in zip(termination, means, strict=False):  # lower levels alone, where those are discovered
-        if always_ends(table):
-            continue
-        lasts *= mean
-        alive = torch.arange(table.shape[1], device=lengths.device) < lengths[:, None]
-        share = prior.weight / (lasts * table.shape[2])
-        counts = share * torch.tensor([mean - 1.0, 1.0], dtype=torch.float64)
-        total = total + torch.where(alive[..., None, None], table.double() * counts, 0.0).sum((1, 2, 3))
-    return total
-
-
-def read_ahead(model: Hierarchy, whole: Batch, pieces: Iterable[Batch]) -> None:
-    """Prefetch the pictures of pieces of a batch, in the order in which the networks will ask for them."""
-    if isinstance(whole.inputs.images, Frames):
-        whole.inputs.images.readers.plan(_jobs(model, pieces))
-
-
-def _jobs(model: Hierarchy, pieces: Iterable[Batch]) -> Iterator[Job]:
-    """Chunk after chunk; where there are several and a gradient is asked for, then once more, the last first."""
-    for piece in pieces:
-        chunks = model.chunks(piece.inputs)
-        again = chunks[::-1] if len(chunks) > 1 and model.training else []
-        for chunk in (*chunks, *again):
-            assert isinstance(chunk.images, Frames)  # it is a part of such a piece
-            yield chunk.images.job

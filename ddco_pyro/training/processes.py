@@ -7,7 +7,7 @@ whichever rank computed them.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
@@ -57,10 +57,6 @@ class Ranks:
         with connected():
             distributed.broadcast_object_list(values, src=0)
         return values[0]
-
-    def own(self, items: Sequence[Item]) -> Sequence[Item]:
-        """The items that this process computes where :meth:`each` is called for all of them."""
-        return items[self.rank :: self.size]
 
     def each(self, calls: Iterable[Callable[[], Result]]) -> Iterator[Result]:
         """The results of calls in order, in each process; the processes take turns in computing them.

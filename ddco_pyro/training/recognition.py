@@ -105,7 +105,7 @@ def recognise(model: Hierarchy, data: TrainingData, demos: Demonstrations) -> tu
     asked = own.recogniser
     batch = encode(demos, model.encoder, model.scaling)
     options = choices(demos, own.source, labels.values, labels.demonstrations)
-    widths = _widths(asked.windows, options, demos.frequency)
+    widths = _widths(options)
     features = {}
     for windows in (recogniser.around, recogniser.past):
         windows.widths.copy_(torch.tensor(widths))
@@ -171,17 +171,12 @@ NARROWEST = 1e-9
 """A feature varies where its standard deviation is a larger part of its largest value."""
 
 
-def _widths(windows: tuple[int | str, ...] | None, options: Tensor, frequency: float | None) -> tuple[int, ...]:
-    """Half widths of windows in steps; by default a quarter and three quarters of the median labelled segment."""
-    if windows is None:
-        edges = [np.flatnonzero(np.diff(own, prepend=-2, append=-2)) for own in options.numpy()]
-        lengths = [np.diff(at)[own[at[:-1]] > 0] for own, at in zip(options.numpy(), edges, strict=True)]
-        typical = float(np.median(np.concatenate(lengths)))
-        return tuple(max(1, round(share * typical)) for share in SHARES)
-    steps = (
-        width if isinstance(width, int) else float(width.removesuffix("s")) * (frequency or 1) for width in windows
-    )
-    return tuple(max(1, round(width)) for width in steps)
+def _widths(options: Tensor) -> tuple[int, ...]:
+    """Half widths of windows in steps: a quarter and three quarters of the median labelled segment."""
+    edges = [np.flatnonzero(np.diff(own, prepend=-2, append=-2)) for own in options.numpy()]
+    lengths = [np.diff(at)[own[at[:-1]] > 0] for own, at in zip(options.numpy(), edges, strict=True)]
+    typical = float(np.median(np.concatenate(lengths)))
+    return tuple(max(1, round(share * typical)) for share in SHARES)
 
 
 def _tried(

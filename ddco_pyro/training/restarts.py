@@ -34,7 +34,7 @@ from ddco_pyro.events import (
 )
 from ddco_pyro.inference.engines import STEPS, TRAJECTORIES, EngineCheck, compare_engines
 from ddco_pyro.inference.paths import segment
-from ddco_pyro.jobs import Workers, processes, run_all
+from ddco_pyro.jobs import Workers, run_all
 from ddco_pyro.model.batch import encode, refuse_unusable
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.seeding import seeded
@@ -190,7 +190,7 @@ class Trainer:
         """
         self.restarts = [self._begun(number) for number in range(len(starts_of(self.spec)))]
         every = range(len(self.restarts))
-        with processes(self.jobs), self._together():
+        with self._together():
             if len(every) > 1:
                 self._train(every, BY_GRADIENT if self._by_gradient else SOUNDING)
                 self._stop(self._behind())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +14,12 @@ import torch
 import yaml
 from command_line import call
 from dots import followed
-from elsewhere import THERE, Device
 from odd_files.hdf5 import spoil
 
 import ddco_pyro
 from ddco_pyro.acting.window import ObservationError, Window
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
-from ddco_pyro.data.pictures import Job, Pictures, Readers, Transform, read, shifted
-from ddco_pyro.errors import Failed
+from ddco_pyro.data.pictures import Pictures, Transform, shifted
 from ddco_pyro.fitting.digest import digest
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.encoder import ObservationEncoder
@@ -170,26 +167,6 @@ def test_a_trajectory_is_shifted_as_one_and_anew_in_each_epoch() -> None:
     assert (other != shifts).any()
 
 
-@pytest.mark.parametrize("stored", [False, True], ids=["in memory", "in a file"])
-def test_pictures_that_a_device_holds_are_those_that_are_read(kept: Path, stored: bool) -> None:
-    """Moved, cut, and behind those before them; of some trajectories, from a later step on, and past their ends."""
-    encoder = ObservationEncoder(
-        parse_spec(spec_of(kept, {**RAW, "augment": {"shift": 3}})).observations, demonstrations().observation_shapes
-    )
-    demos = Demonstrations.read(kept) if stored else demonstrations()
-    inputs = encoder.inputs(demo.observations for demo in demos)
-    whole = Batch(inputs, torch.zeros(8, 40, 2), torch.tensor(demos.lengths))
-    assert whole.picture_bytes == sum(demos.lengths) * 5 * 4 * 2 * 3
-    for rows, steps in (([5, 2], slice(0, 40)), ([2, 0, 7], slice(7, 13)), ([1], slice(3, 4))):
-        with Device():
-            expected, held = (
-                batch.varied(encoder.shifts, 1).select(torch.tensor(rows)).inputs.part(slice(None), steps).loaded()
-                for batch in (whole, whole.held(THERE))
-            )
-            assert held.images["camera"].device == THERE
-            np.testing.assert_array_equal(held.images["camera"].cpu(), expected.images["camera"])
-
-
 @pytest.mark.parametrize(
     ("observation", "message"),
     [
@@ -216,8 +193,8 @@ def test_what_cannot_be_cut_is_refused(kept: Path, observation: dict[str, Any], 
 @pytest.mark.parametrize("chunks", [False, True])
 def test_a_streamed_fit_is_that_in_memory(kept: Path, chunks: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Bit for bit, weights and numbers, in chunks of time too, with cut and shifted pictures."""
-    initialize = "vq_controls" if chunks else "vq"
-    spec = parse_spec(spec_of(kept, {**RAW, "augment": {"shift": 1}}, initialize=initialize))
+    starts = ["vq_controls" if chunks else "vq"]
+    spec = parse_spec(spec_of(kept, {**RAW, "augment": {"shift": 1}}, starts=starts))
     if chunks:
         step_bytes = build_hierarchy(spec, Dimensions.of(demonstrations())).step_bytes
         monkeypatch.setattr("ddco_pyro.model.hierarchy.BYTES_AT_ONCE", 17 * step_bytes)
@@ -246,55 +223,6 @@ def test_a_controller_sees_what_networks_were_trained_on(kept: Path) -> None:
                 torch.testing.assert_close(one[0, 0], whole[0, step])
     with pytest.raises(ObservationError, match=r"shape \(5, 4, 1\), the demonstrations had \(12, 10, 3\)"):
         fit.controller().act(seen[0] | {"camera": np.zeros((5, 4, 1), np.uint8)})
-
-
-def test_what_is_read_ahead_is_what_is_asked_for(kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A plan that is off would be slow, not wrong: so the order is compared, and every reading is a planned one."""
-    monkeypatch.setattr("ddco_pyro.model.hierarchy.BYTES_AT_ONCE", 1)
-    planned: list[object] = []
-    taken: list[object] = []
-    plan, take = Readers.plan, Readers.take
-
-    def planning(readers: Readers, jobs: Iterable[Job]) -> None:
-        jobs = list(jobs)
-        planned.extend(job.key for job in jobs)
-        plan(readers, jobs)
-
-    def taking(readers: Readers, job: Job) -> dict[str, np.ndarray]:
-        if readers in trained:
-            taken.append(job.key)
-        return take(readers, job)
-
-    trained: list[Readers] = []
-    monkeypatch.setattr(Readers, "plan", planning)
-    monkeypatch.setattr(Readers, "take", taking)
-    monkeypatch.setattr(Readers, "__enter__", lambda readers: trained.append(readers) or readers)
-    data = spec_of(kept, "camera", epochs=2, starts=["random"], layerwise=False)
-    ddco_pyro.fit(parse_spec(data | {"compare_with": []}))
-    assert len(taken) > 4
-    assert planned == taken
-
-
-def test_workers_read_the_same(kept: Path) -> None:
-    data = spec_of(kept, {**RAW, "augment": {"shift": 1}}, starts=["random"], layerwise=False)
-    alone, beside = (
-        ddco_pyro.fit(parse_spec({**data, "training": data["training"] | {"workers": workers}})) for workers in (0, 2)
-    )
-    assert bits(alone) == bits(beside)
-
-
-def test_a_worker_that_dies_is_one_line(kept: Path) -> None:
-    encoder = ObservationEncoder([ObservationSpec(key="camera")], {"camera": (HEIGHT, WIDTH, 3)})
-    frames = encoder.inputs(demo.observations for demo in Demonstrations.read(kept)).images
-    jobs = [frames.part(torch.tensor([row]), slice(0, 5)).job for row in range(8)]
-    with Readers(1) as readers:
-        readers.plan(jobs)
-        np.testing.assert_array_equal(readers.take(jobs[0])["camera"], read(jobs[0])["camera"])
-        for process in readers._pool._processes.values():
-            process.kill()
-            process.join()
-        with pytest.raises(Failed, match=r"a process that read pictures was ended from outside .* training\.workers"):
-            list(map(readers.take, jobs[1:]))
 
 
 def test_a_damaged_picture_is_one_line(kept: Path, tmp_path: Path) -> None:

@@ -53,7 +53,7 @@ def test_options_are_recovered_from_features(tmp_path, out):
     drawn = [Demonstration(demo.name, {"camera": dots(demo.observations["state"])}, demo.actions) for demo in demos]
     Demonstrations(tuple(drawn)).write(tmp_path / "planted.hdf5")
     encoded(tmp_path / "planted.hdf5", out, PLACES, size=8, name="state")
-    spec = make_spec((3,), epochs=300, restarts=1, initialize="vq_controls")
+    spec = make_spec((3,), epochs=300, starts=["vq_controls"])
     found = make_trainer(spec, Demonstrations.read(out), tmp_path / "fit").run()
     batch = prepare(Demonstrations.read(out), found.encoder, found.scaling)
     segments = segment(found.tabulate(batch), batch.lengths)[0]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 
 import torch
 from torch import Tensor, nn
@@ -90,9 +90,9 @@ class StackedLstm(nn.Module):
         if batch[1] == 1:
             return self._step(values, h.transpose(0, 1), c.transpose(0, 1))
         sequences = values.unflatten(1, batch).expand(self.size[0], -1, -1, -1)
-        with _for_loop(values.device):
+        with _without_warning():
             each = [
-                torch.lstm(sequence.to(self.recurrent.dtype), own, weights, True, 1, 0.0, self.training, False, True)
+                torch.lstm(sequence, own, weights, True, 1, 0.0, self.training, False, True)
                 for sequence, own, weights in zip(sequences, self._states(h, c), self._weights(), strict=True)
             ]
         outputs, h, c = (torch.stack(parts) for parts in zip(*each, strict=True))
@@ -146,16 +146,9 @@ def _in_windows(
     return torch.cat(parts, dim=2).flatten(1, 2), h, c
 
 
-def _for_loop(device: torch.device) -> AbstractContextManager[None]:
-    """The context of torch's loop: float32 on CPUs, not all of which support it in bfloat16.
-
-    On GPUs a warning about scattered weights is suppressed.
-    """
-    return torch.autocast("cpu", enabled=False) if device.type == "cpu" else _without_warning()
-
-
 @contextmanager
 def _without_warning() -> Iterator[None]:
+    """Suppresses torch's warning about scattered weights on GPUs."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "RNN module weights are not part of single contiguous chunk", UserWarning)
         yield

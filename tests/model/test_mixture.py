@@ -20,7 +20,7 @@ from ddco_pyro.inference.engines import compare_engines
 from ddco_pyro.metrics import Worth
 from ddco_pyro.model.tables import always_ends
 from ddco_pyro.selection.grid import candidates
-from ddco_pyro.spec import DurationSpec, SpecError, parse_spec, with_overrides
+from ddco_pyro.spec import SpecError, parse_spec, with_overrides
 from ddco_pyro.training.networks import (
     Dimensions,
     baseline_spec,
@@ -29,7 +29,6 @@ from ddco_pyro.training.networks import (
     named_baselines,
     parameters,
 )
-from ddco_pyro.training.objective import log_duration_prior
 from ddco_pyro.training.upper import Constants, fitted
 
 # --- the likelihood ---------------------------------------------------------------------------------------------------
@@ -133,15 +132,6 @@ def test_levels_above_start_from_segments_without_memory_too():
     assert isinstance(constants, Constants)
     assert constants.termination[0].tolist() == [1.0, 1.0]
     assert all(bool(torch.isfinite(table).all()) for table in constants.selection)
-
-
-def test_a_prior_on_durations_says_nothing_of_them():
-    tables = [make_hierarchy((2, 2), memoryless=levels).tabulate(make_batch()).termination for levels in ([], [1])]
-    prior = DurationSpec.model_validate({"mean": 3.0})
-    whole, lasting = (log_duration_prior(each, make_batch().lengths, prior).sum().item() for each in tables)
-    above = log_duration_prior(tables[1][1:], make_batch().lengths, prior).sum().item()
-    assert lasting == pytest.approx(above)
-    assert lasting != pytest.approx(whole)
 
 
 @pytest.fixture(scope="module")

@@ -142,34 +142,6 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(toy_run, toy_spec, tmp_pat
     assert not list(folder.rglob("*.tmp"))
 
 
-def test_seconds_are_those_of_all_processes(toy_spec, tmp_path, monkeypatch):
-    """An epoch takes 100 seconds of this clock; nothing else takes time."""
-    now = [0.0]
-    monkeypatch.setattr("ddco_pyro.fitting.run.time.perf_counter", lambda: now[0])
-
-    class Slow(Interrupting):
-        epochs = own = 0
-
-        def __call__(self, event):
-            if isinstance(event, EpochEnded):
-                now[0] += 100
-                self.epochs, self.own = self.epochs + 1, self.own + (event.stage != "policy")
-            super().__call__(event)
-
-    spec = with_overrides(toy_spec, {"compare_with": [{"kind": "flat", "policy": {"network": "linear"}}]})
-    told = [Slow(3), Slow(23), Slow(-1)]  # the second is interrupted in the baseline
-    for each in told[:2]:
-        with pytest.raises(KeyboardInterrupt):
-            fit(spec, out=tmp_path / "run", on_event=each)
-    seconds = fit(spec, out=tmp_path / "run", on_event=told[2]).metrics.seconds
-    assert (seconds["demonstrations"], seconds["evaluation"]) == (0, 0)
-    assert seconds["training"] + seconds["baselines"] == now[0] == sum(100 * each.epochs for each in told)
-    assert seconds["training"] == sum(100 * each.own for each in told)
-    own = json.loads((tmp_path / "run" / "baselines" / "flat" / "metrics.json").read_text())["seconds"]
-    assert own["training"] == seconds["baselines"]
-    assert not list(tmp_path.rglob("seconds.json"))
-
-
 def test_the_engines_are_compared_on_a_model_that_the_seed_decides(toy_spec, demos):
     """With dropout, and whatever was drawn before; nothing is drawn from the global generator."""
     spec = with_overrides(toy_spec, {"training.epochs": 1, "hierarchy.levels.0.policy.dropout": 0.5})

@@ -27,7 +27,7 @@ from ddco_pyro.data.files import only_one
 from ddco_pyro.errors import Failed
 from ddco_pyro.events import DemonstrationsDone, SeedFitted
 from ddco_pyro.fitting.fit import fit
-from ddco_pyro.jobs import Workers, processes, run_all
+from ddco_pyro.jobs import Workers, run_all
 from ddco_pyro.spec import dump_spec
 from ddco_pyro.training import restarts as restarting
 from ddco_pyro.training.checkpoint import Progress, Restart
@@ -211,8 +211,8 @@ def test_after_another_process_is_killed_one_process_goes_on_to_the_same_bits(wh
     assert_same_run(tmp_path / "run", run)
 
 
-LABELS = {"level": "level-1", "from": "phase", "count": 3, "recogniser": {"cross_validated": True, "windows": [1, 2]}}
-MOMENTUM = {"optimizer": {"name": "momentum"}, "clip_gradient": 0.1, "average": 0.9, "duration": {"mean": 4}}
+LABELS = {"level": "level-1", "from": "phase", "count": 3, "recogniser": {"cross_validated": True}}
+MOMENTUM = {"optimizer": {"name": "momentum"}, "average": 0.9}
 
 
 @pytest.mark.slow  # the two processes above stand for torchrun's
@@ -244,35 +244,26 @@ def test_more_processes_than_shards_are_refused(whole, tmp_path):
 
 
 def places(number, calls, **how):
-    """The processes that make so many calls, by call; how many are left."""
+    """The processes that make so many calls, by call."""
     with run_all(dict.fromkeys(range(calls), os.getpid), Workers(number), "worked", **how) as results:
-        found = dict(results)
-    assert not any(alive(process) for process in found.values() if process != os.getpid())
-    return found
+        return dict(results)
 
 
-def test_calls_are_made_here_or_in_other_processes_that_end_with_them() -> None:
+def test_calls_are_made_here_or_in_other_processes() -> None:
     here = os.getpid()
-    assert set(places(1, 3).values()) == {here}
-    assert places(4, 0) == places(4, 0, beside=1) == {}
-    assert set(places(4, 1).values()) == {here}
-    assert here not in places(2, 3).values()
-    assert [call for call, process in places(2, 5, beside=1).items() if process == here] == [1, 3]
-    assert [call for call, process in places(2, 5, beside=0).items() if process == here] == [1, 3]
+    assert set(places(1, 3).values()) == set(places(4, 1).values()) == set(places(1, 3, beside=True).values()) == {here}
+    assert places(4, 0) == places(4, 0, beside=True) == {}
+    assert here not in {*places(2, 3).values(), *places(2, 1, beside=True).values()}
     assert list(places(3, 9, ordered=True)) == list(range(9))
 
 
-@pytest.mark.parametrize("modules", [(), ("json",)])
-def test_processes_that_are_there_make_the_calls_of_a_block(modules) -> None:
-    with processes(2, *modules):
-        with run_all(dict.fromkeys(range(9), os.getpid), Workers(2), "worked") as results:
-            there = {process for _, process in results}
-        with run_all({0: os.getpid}, Workers(2), "worked", beside=1) as results:
-            there |= {process for _, process in results}  # the second one may have begun late
-        assert len(there) <= 2
-        assert all(alive(process) for process in there)
-        assert not {*places(3, 9).values()} & there  # too few of them are there
-    assert not any(alive(process) for process in there)
+def test_a_call_in_another_process_makes_its_own_calls_there() -> None:
+    with run_all(dict.fromkeys(range(2), partial(places_and_own, 3)), Workers(2), "worked") as results:
+        assert all(found == {own} for _, (found, own) in results)
+
+
+def places_and_own(calls):
+    return {*places(2, calls).values()}, os.getpid()
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
@@ -282,72 +273,59 @@ def test_events_come_call_after_call_and_the_wait_is_announced_once(jobs) -> Non
         on_event(DemonstrationsDone(number, 3))
 
     told, calls = [], {n: partial(tell, n) for n in range(3)}
-    waiting = {n: SeedFitted(n) for n in calls}
-    with run_all(calls, Workers(jobs), "worked", told.append, beside=1, waiting=waiting) as results:
+    how = {"ordered": True, "beside": True, "waiting": {n: SeedFitted(n) for n in calls}}
+    with run_all(calls, Workers(jobs), "worked", told.append, **how) as results:
         order = [number for number, _ in results]
-    assert order == ([0, 1, 2] if jobs == 1 else [1, 0, 2])
+    assert order == [0, 1, 2]
     assert told == [event for n in order for event in (SeedFitted(n), DemonstrationsDone(n, 3))]
 
 
-@pytest.mark.parametrize("modules", [(), ("json",)])
-def test_a_process_that_is_killed_is_one_line(modules) -> None:
+def test_a_process_that_is_killed_is_one_line(capfd) -> None:
     kill = partial(signal.raise_signal, signal.SIGKILL)
     with (
-        processes(1, *modules),
         pytest.raises(Failed, match=r"^a process that worked was ended from outside"),
-        run_all({"kill": kill}, Workers(2), "worked", beside=1) as results,
+        run_all({"kill": kill}, Workers(2), "worked", beside=True) as results,
     ):
         next(results)
+    assert capfd.readouterr().err == ""
 
 
-def test_so_is_one_that_is_killed_before_there_is_work() -> None:
-    with processes(1, "json"):
-        (process,) = places_of_one()
-        os.kill(process, signal.SIGKILL)
-        while alive(process):
+def test_an_error_ends_what_is_not_done(tmp_path, capfd) -> None:
+    def hangs() -> None:
+        (tmp_path / str(os.getpid())).touch()
+        time.sleep(60)
+
+    with pytest.raises(ValueError), run_all({0: hangs}, Workers(2), "worked", beside=True):  # noqa: PT011, PT012
+        while not (begun := [*tmp_path.iterdir()]):
             time.sleep(0.01)
-        with pytest.raises(Failed, match=r"^a process that worked was ended from outside"):
-            places_of_one()
-
-
-def places_of_one():
-    with run_all({0: os.getpid}, Workers(2), "worked", beside=1) as results:
-        return [process for _, process in results]
-
-
-def test_an_error_ends_what_is_not_done() -> None:
-    began = time.monotonic()
-    with pytest.raises(ValueError), run_all({0: partial(time.sleep, 60)}, Workers(2), "worked", beside=1):  # noqa: PT011
         raise ValueError
-    assert time.monotonic() - began < 30
+    assert_ends(int(begun[0].name), 10)
+    assert capfd.readouterr().err == ""
 
 
 def test_a_process_ends_at_sigterm_whatever_this_one_does() -> None:
     before = signal.signal(signal.SIGTERM, signal.getsignal)
     try:
-        with (
-            processes(1, "json"),
-            run_all({0: partial(signal.getsignal, signal.SIGTERM)}, Workers(2), "", beside=1) as r,
-        ):
-            assert dict(r) == {0: signal.SIG_DFL}
+        with run_all({0: partial(signal.getsignal, signal.SIGTERM)}, Workers(2), "", beside=True) as results:
+            assert dict(results) == {0: signal.SIG_DFL}
     finally:
         signal.signal(signal.SIGTERM, before)
 
 
 KILLED = """
 import os, signal
-from ddco_pyro.jobs import Workers, processes, run_all
-with {before}run_all(dict.fromkeys(range(9), os.getpid), Workers(2), "worked"{how}) as results:
-    process = next(process for _, process in results if process != os.getpid())
+from ddco_pyro.jobs import Workers, run_all
+with run_all(dict.fromkeys(range(9), os.getpid), Workers(2), "worked"{how}) as results:
+    process = next(process for _, process in results)
     os.kill(process, 0)
     print(process, flush=True)
     os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
-@pytest.mark.parametrize(("before", "how"), [("processes(2, 'json'), ", ""), ("", ""), ("", ", beside=1")])
-def test_a_process_ends_with_the_one_that_is_killed_while_it_waits_for_work(tmp_path, before, how) -> None:
+@pytest.mark.parametrize("how", ["", ", beside=True"])
+def test_a_process_ends_with_the_one_that_is_killed_while_it_waits_for_work(tmp_path, how) -> None:
     with open(tmp_path / "process", "w") as file:
-        killed = subprocess.run([sys.executable, "-c", KILLED.format(before=before, how=how)], stdout=file)
+        killed = subprocess.run([sys.executable, "-c", KILLED.format(how=how)], stdout=file)
     assert killed.returncode == -signal.SIGKILL
     assert_ends(int((tmp_path / "process").read_text()), 10)

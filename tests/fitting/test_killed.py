@@ -163,7 +163,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory, toy_run) -> Path:
 
 
 def write_pictures(folder: Path) -> None:
-    """A spec whose pictures are read ahead, in two processes, by a worker of each."""
+    """A spec whose pictures are read in two processes."""
     random = np.random.default_rng(0)
     pictures = ({"camera": random.integers(0, 256, (9, 12, 10, 3), dtype=np.uint8)} for _ in range(10))
     numbered((seen, random.normal(size=(9, 2))) for seen in pictures).write(folder / "pictures.hdf5")
@@ -172,7 +172,7 @@ def write_pictures(folder: Path) -> None:
         "demonstrations": {"path": str(folder / "pictures.hdf5")},
         "observations": [{"key": "camera", "augment": {"shift": 1}}],
         "baseline": {"kind": "flat", "policy": policy},
-        "training": {"epochs": 60, "patience": None, "shards": 2, "batch_size": 4, "workers": 1},
+        "training": {"epochs": 60, "patience": None, "shards": 2, "batch_size": 4},
     }
     (folder / "pictures.yaml").write_text(yaml.safe_dump(data))
 

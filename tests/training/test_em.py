@@ -445,7 +445,7 @@ def test_a_flat_policy_for_each_time_step_is_least_squares_at_that_step():
 
 
 def test_a_spec_that_em_would_not_follow_is_refused():
-    for key, value in (("training.average", 0.9), ("training.clip_gradient", 1.0), ("training.optimizer.warmup", 2)):
+    for key, value in (("training.average", 0.9), ("training.optimizer.warmup", 2)):
         with pytest.raises(SpecError, match=f"{key}: em"):
             with_overrides(em_spec(), {key: value})
 
@@ -460,7 +460,7 @@ def test_linear_networks_are_trained_by_em_unless_the_spec_asks_for_gradient_ste
     constant = own | {"meta_policy": CONSTANT, "levels": [level | {"termination": CONSTANT}]}
     assert chosen(hierarchy=constant) == "em"
     assert chosen() == chosen(()) == chosen(training={"optimizer": {"ridge": {"policy": 2}}}) == "em"
-    for asked in ({"optimizer": {"lr": 0.1}}, {"optimizer": {"name": "adam"}}, {"average": 0.9}, {"clip_gradient": 1}):
+    for asked in ({"optimizer": {"lr": 0.1}}, {"optimizer": {"name": "adam"}}, {"average": 0.9}):
         assert chosen(training=asked) == "adam"
     for changed in (
         {"meta_policy": mlp},

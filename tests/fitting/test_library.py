@@ -299,7 +299,7 @@ def test_another_process_fits_a_baseline_whose_restarts_are_short(in_memory: ddc
         one, two = (ddco_pyro.fit(spec, two_skills(), jobs=jobs) for jobs in (1, 2))
         assert numbers(one) == numbers(two)
         assert numbers(one.baselines["flat"]) == numbers(two.baselines["flat"])
-        assert asked == 2 * beside  # this process, too, makes a share of them
+        assert asked == 2 * beside
         asked.clear()
 
 
@@ -463,7 +463,7 @@ MOST_BUILDS = 4
 @pytest.mark.parametrize("baselines", [(), ("flat", "mixture")])
 def test_a_model_is_built_a_few_times(in_memory: ddco_pyro.Fit, monkeypatch, baselines) -> None:
     builds, init = [], Hierarchy.__init__
-    short = {"training.epochs": 1, "training.layerwise": False, "training.initialize": "random"}
+    short = {"training.epochs": 1, "training.layerwise": False, "training.starts": ["random"]}
     spec = with_overrides(in_memory.spec, {**short, "compare_with": list(baselines)})
 
     def counted(self, *arguments, **named):

@@ -24,7 +24,7 @@ from ddco_pyro.evaluation.inferred import infer
 from ddco_pyro.inference import log_likelihood, segment
 from ddco_pyro.model.batch import encode
 from ddco_pyro.report import write_report
-from ddco_pyro.spec import SpecError, parse_spec
+from ddco_pyro.spec import SpecError
 from ddco_pyro.training.checkpoint import Progress
 from ddco_pyro.training.initialization import Clusters
 from ddco_pyro.training.labels import Labels
@@ -106,14 +106,10 @@ def test_it_is_the_likelihood_of_the_paths_that_have_the_labels(counts, level):
     [
         (1, {}, ["vq-1", "level-1", "vq-2", "level-2", "meta-policy", "joint"]),
         (2, {}, ["vq-2", "level-2", "meta-policy", "joint"]),
-        (1, {"hold": False}, ["vq-1"]),
-        (2, {"hold": False}, ["vq-2"]),
-        (1, {"training": {"upper_levels": "segments"}, "hold": False}, ["vq-1"]),
-        (2, {"training": {"upper_levels": "segments"}, "hold": False}, ["segments"]),
         (2, {"training": {"upper_levels": "segments"}}, ["segments", "upper", "joint"]),
     ],
 )
-def test_labels_matter_in_every_stage_that_has_their_level_or_in_its_initialisation(level, own, stages):
+def test_labels_matter_in_every_stage_that_has_their_level(level, own, stages):
     material = make(labelled(level, (2, 2), **own), random_demonstrations())
     assert [stage.name for stage in plan(material.spec, 2) if material.labels.matter_in(stage)] == stages
 
@@ -222,7 +218,9 @@ def clustered(states, count, labels):
 
 # --- a recogniser of labelled steps -----------------------------------------------------------------------------------
 
-RECOGNISER = {"weight": 0.7, "ridge": 3.0, "windows": [1, 2]}
+RECOGNISER = {"weight": 0.7, "ridge": 3.0}
+WIDTHS = 1, 2
+"""Of its windows: most labelled segments have two steps."""
 
 
 def window(rows, width, past=False):
@@ -234,7 +232,7 @@ def features(demo, past=False):
     """Those of a demonstration whose observation and control are neither standardised nor of other dimensions."""
     actions = np.concatenate([np.zeros((1, 2)), demo.actions[:-1]]) if past else demo.actions
     rows = np.concatenate([demo.observations["state"], actions], axis=1)
-    return np.concatenate([rows, *(window(rows, width, past) for width in RECOGNISER["windows"])], axis=1)
+    return np.concatenate([rows, *(window(rows, width, past) for width in WIDTHS)], axis=1)
 
 
 @pytest.fixture(scope="module")
@@ -391,7 +389,7 @@ def test_a_recogniser_reads_pictures():
     for demo, rows, options in zip(demos, features.numpy(), found.numpy(), strict=True):
         brightness = demo.observations["camera"].reshape(len(demo), 8, 8, 2).mean(-1).reshape(len(demo), 64) / 255
         np.testing.assert_allclose(rows[: len(demo), 2:66], brightness, atol=1e-6)
-        np.testing.assert_allclose(rows[: len(demo), 70:134], window(brightness, 1), atol=1e-6)
+        np.testing.assert_allclose(rows[: len(demo), 70:134], window(brightness, 2), atol=1e-6)
         assert (options[: len(demo)] == demo.labels["truth"] + 1).mean() > 0.9
 
 
@@ -405,12 +403,8 @@ def test_the_pair_is_chosen_by_its_mean_over_ridges():
     assert best_of(tried) == (1.0, 0.0, 15)
 
 
-@pytest.mark.parametrize(
-    ("windows", "hertz", "widths"), [([4, 9], None, (4, 9)), (["1s", 2], 10.0, (10, 2)), (None, None, (1, 2))]
-)
-def test_windows_are_in_steps_or_seconds_or_follow_from_labelled_segments(windows, hertz, widths):
-    options = torch.tensor([[1, 1, 1, -1, 2, 2, 2], [-1, 1, 1, 1, 2, -1, -1]])
-    assert _widths(windows, options, hertz) == widths
+def test_windows_follow_from_labelled_segments():
+    assert _widths(torch.tensor([[1, 1, 1, -1, 2, 2, 2], [-1, 1, 1, 1, 2, -1, -1]])) == (1, 2)
 
 
 def test_demonstrations_are_left_out_whole_and_a_single_one_by_parts():
@@ -459,7 +453,7 @@ demonstrations: {{path: {tmp_path / "demos.hdf5"}}}
 observations: [state]
 hierarchy: {{levels: [{{name: skill, count: 3, policy: {{network: linear}}}}], meta_policy: {{network: linear}}}}
 compare_with: [{{kind: flat, policy: {{network: linear}}}}]
-training: {{epochs: 3, labels: {{level: skill, from: phase, count: 2}}, duration: {{mean: 3}}}}
+training: {{epochs: 3, labels: {{level: skill, from: phase, count: 2}}}}
 """
     )
     return tmp_path
@@ -535,20 +529,3 @@ def test_each_level_is_measured_with_its_own_labels(tmp_path, monkeypatch, label
     assert call("segment", "run", "demos.hdf5", "--html", "page.html").status == 0
     shown = (tmp_path / "page.html").read_text()
     assert [shown.count(f"Agreement with the label “{name}”") for name in names] == [names.count(one) for one in names]
-
-
-@pytest.mark.parametrize(
-    ("windows", "says"),
-    [(["1s", 3], "does not say its control frequency"), (["1x", 3], "or seconds such as 1s, got '1x'")],
-)
-def test_windows_that_are_no_lengths_are_refused_before_anything_is_written(windows, says, tmp_path):
-    demos = numbered(
-        ({"state": np.zeros((6, 2))}, np.arange(6.0)[:, None], {"skill": np.arange(6) // 3}) for _ in range(4)
-    )
-    labels = {"level": "option", "from": "skill", "recogniser": {"windows": windows}}
-    levels = [{"name": "option", "count": 2, "policy": {"network": "linear"}, "termination": {"network": "linear"}}]
-    hierarchy = {"levels": levels, "meta_policy": {"network": "linear"}}
-    given = {"demonstrations": {"path": "no.hdf5"}, "observations": ["state"], "hierarchy": hierarchy}
-    with pytest.raises(SpecError, match=says):
-        ddco_pyro.fit(parse_spec({**given, "training": {"labels": labels}}), demos, tmp_path / "run")
-    assert not (tmp_path / "run").exists()

@@ -67,12 +67,11 @@ def test_a_meta_policy_that_nothing_trains_before_all_are_begins_with_its_option
     assert [stage.discovering for stage in plan(acts, 1)] == [1, None]
 
 
-@pytest.mark.parametrize("duration", [None, {"mean": 4, "weight": 2}])
-def test_beside_the_levels_under_a_uniform_meta_policy_the_meta_policy_learns_of_the_same_choices(duration):
+def test_beside_the_levels_under_a_uniform_meta_policy_the_meta_policy_learns_of_the_same_choices():
     """Gradients against those of each by itself: the levels' do not change, and the meta-policy's are those of the
     clamped likelihood of the whole hierarchy.
     """
-    material = lines(duration=duration)
+    material = lines()
     stage, rows = plan(material.spec, 1)[0], torch.arange(len(material.train))
     alone = replace(stage, discovering=1, selecting=False)
     model = material.hierarchy(0)
