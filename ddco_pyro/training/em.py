@@ -21,6 +21,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 
+import numba
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
@@ -50,10 +52,8 @@ TOLERANCE = 1e-5
 """EM has converged where a step gains less, in nats per step of the demonstrations."""
 ROUGHLY = 1e-3
 """The same in a stage whose end is a start alone."""
-BLOCK = 2**16
-"""The most features that are weighted at once: they stay in the cache."""
-NEGLIGIBLE = 1e-6
-"""A step whose weight is at most this part of the mean, as of an option far from it or in padding, adds nothing."""
+BLOCK = 512
+"""Steps whose features are multiplied at once: the products stay in the cache."""
 BIAS = 1e-6
 """Ridge of biases, and the least of weights: an option that is never active keeps its own."""
 
@@ -82,16 +82,27 @@ class Features:
 
     def moments(self, weights: Tensor) -> Tensor:
         """Σ_t h_t x_t x_t^T for each column of weights [N·T, W], none below 0: [W, F, F]."""
-        from scipy.linalg.blas import dsyrk  # half of a product that is symmetric
+        features = self.x.shape[-1]
+        pairs = np.empty((BLOCK, features * (features + 1) // 2))
+        found = torch.zeros(weights.shape[1], pairs.shape[1], dtype=torch.float64)
+        for rows, own in zip(self.x.flatten(0, 1).split(BLOCK), weights.split(BLOCK), strict=True):
+            products(rows.numpy(), pairs)
+            found.addmm_(own.T, torch.from_numpy(pairs[: len(rows)]))
+        lower = torch.tril_indices(features, features)
+        whole = found.new_empty(weights.shape[1], features, features)
+        whole[:, *lower] = whole[:, *lower.flip(0)] = found
+        return whole
 
-        every, features = self.x.flatten(0, 1), self.x.shape[-1]
-        found = every.new_zeros(weights.shape[1], features, features)
-        counted = weights > NEGLIGIBLE * weights.mean(0).clamp(min=0)
-        for total, own, which in zip(found.numpy(), weights.T, counted.T, strict=True):
-            for some in which.nonzero().squeeze(1).split(max(1, BLOCK // features)):
-                rows = every[some] * own[some].sqrt().unsqueeze(1)
-                dsyrk(1.0, rows.numpy().T, beta=1.0, c=total.T, overwrite_c=True)
-        return found.tril() + found.tril(-1).mT
+
+@numba.njit(error_model="numpy", nogil=True, cache=True)
+def products(x: np.ndarray, pairs: np.ndarray) -> None:  # pragma: no cover - compiled
+    """The products of each two features of x [B, F] into the rows of ``pairs``: the lower triangle, row by row."""
+    for t in range(len(x)):
+        place = 0
+        for i in range(x.shape[1]):
+            for j in range(i + 1):
+                pairs[t, place + j] = x[t, i] * x[t, j]
+            place += i + 1
 
 
 @dataclass
