@@ -259,20 +259,24 @@ WORLD = World()
 """
 
 
-def test_the_frozen_test_is_fresh():
-    """Its tasks and seeds are no other study's, and no other page names one of the tasks."""
-    frozen = Study.load(ROOT / "studies" / "frozen.yaml")
-    pages = [path.read_text() for path in (ROOT / "docs").rglob("*.md") if path.stem != "frozen"]
-    tasks = {*frozen.declared.tasks}
-    assert len(tasks) == 27
+@pytest.mark.parametrize(("study", "count"), [("frozen", 27), ("frozen_again", 26)])
+def test_a_frozen_test_is_fresh(study, count):
+    """Its tasks and seeds are no other study's, and no other page names one of the tasks.
+
+    Drawer-open is of development since the first test.
+    """
+    frozen = Study.load(ROOT / "studies" / f"{study}.yaml")
+    pages = [path.read_text() for path in (ROOT / "docs").rglob("*.md") if not path.stem.startswith("frozen")]
+    assert len(frozen.declared.tasks) == count
+    tasks = {*frozen.declared.tasks} - {"drawer-open-v3"}
     names = [task.removesuffix("-v3") for task in tasks]
     names = [name if "-" in name else f"{name}-v3" for name in names]  # "push" and "reach" are words, too
     named = re.compile(rf"(?<![\w-])({'|'.join(names)})(-v3)?(?![\w-])")
     assert not [found for page in pages for found in named.findall(page)]
     for path in (ROOT / "studies").glob("*.yaml"):
         other = Study.load(path)
-        if not path.stem.startswith("frozen"):
-            assert not tasks & {*other.declared.tasks}
+        if path.stem != study:
+            assert path.stem.startswith("frozen") or not tasks & {*other.declared.tasks}
             for key in ("seeds", "demonstrations", "starts"):
                 ranges = [one.declared.ranges(key) for one in (frozen, other) if getattr(one.declared, key)]
                 ours, *theirs = ({n for numbers in one.values() for n in numbers} for one in ranges)
