@@ -23,7 +23,7 @@ TRAINED = ("checkpoints", "model.safetensors", "folds.json")
 """Files that a run or a selection has as soon as training begins."""
 
 
-FORMAT = 3
+FORMAT = 4
 """The version of the run folder's format."""
 
 
