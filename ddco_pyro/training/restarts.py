@@ -6,7 +6,7 @@ others train until patience or budget end them. The objective that decides is of
 log-likelihood (``control.power``) with the log-prior of the ridges. A restart whose log-likelihood becomes NaN or
 infinite ends there and ranks last. Neither the number of processes nor an interruption changes the result.
 
-A hierarchy contains its memoryless mixture (ψ = 1), and should be no less likely in training (:meth:`Trainer.go_on`).
+A hierarchy contains its memoryless mixture (ψ = 1), and should be no less likely in training (:meth:`Trainer.contain`).
 """
 
 from __future__ import annotations
@@ -183,7 +183,7 @@ class Trainer:
     def run(self) -> Hierarchy:
         """Train, and return the best restart's hierarchy in evaluation mode.
 
-        Where all restarts that were left have diverged, the best of the stopped ones is trained to the end instead.
+        Where all restarts that were left have diverged, the stopped ones are trained to the end instead.
 
         :raises OtherDevice: a restart was begun on another kind of device than it is to be continued on.
         :raises TrainingError: every restart has diverged.
@@ -200,12 +200,6 @@ class Trainer:
                 self._train(again, None)
         if (why := self.restarts[self.best].progress.diverged) is not None:
             raise TrainingError(why)
-        if len(self.restarts) > 1 and self.hierarchy.depth:
-            from sklearn.metrics import normalized_mutual_info_score
-
-            found = {n: self._segments(n) for n, restart in enumerate(self.restarts) if "best" in restart.states}
-            own = found.pop(self.best)
-            self.agreement = {n: float(normalized_mutual_info_score(own, other)) for n, other in found.items()}
         return self._keep_best()
 
     def contain(self, mixture: Hierarchy, objective: float) -> Hierarchy:
@@ -218,7 +212,7 @@ class Trainer:
         :param objective: of the mixture, nats per step of the same demonstrations.
         :returns: the best restart's hierarchy.
         """
-        self._least = objective - ROUNDING
+        self._least = max(self._least, objective - ROUNDING)
         for logit in (SELDOM, ALMOST_ALWAYS):
             if self.objective >= self._least:
                 break
@@ -238,6 +232,12 @@ class Trainer:
             self._train([number], None)
 
     def _keep_best(self) -> Hierarchy:
+        if len(self.restarts) > 1 and self.hierarchy.depth:
+            from sklearn.metrics import normalized_mutual_info_score
+
+            found = {n: self._segments(n) for n, restart in enumerate(self.restarts) if "best" in restart.states}
+            own = found.pop(self.best)
+            self.agreement = {n: float(normalized_mutual_info_score(own, other)) for n, other in found.items()}
         self.hierarchy.load_state_dict(self.restarts[self.best].states["best"])
         return self.hierarchy.place(device_of(self.spec.training)).eval()
 
