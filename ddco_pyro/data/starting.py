@@ -25,7 +25,7 @@ TEMPLATE = Path(__file__).with_suffix(".yaml.j2")
 STARTS = ("vq_controls", "vq", "mixture", "equal_parts")
 """Ways to begin, of which the likeliest in training is kept."""
 
-MARGIN = 0.1
+MARGIN = 0.5
 """Nats per step by which another way has to be likelier than the first."""
 
 MANY = 100
