@@ -27,7 +27,7 @@ from ddco_pyro.data.sources.robomimic import Robomimic, open_robomimic, robomimi
 from ddco_pyro.errors import BadInput, nearest
 from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
 from ddco_pyro.spec.base import Count, Items, Model
-from ddco_pyro.training.devices import one_thread
+from ddco_pyro.training.processes import one_thread
 
 __all__ = ["Encoder", "encode", "load"]
 

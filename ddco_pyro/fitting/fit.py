@@ -42,11 +42,10 @@ from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec, load_spec, with_overrides
 from ddco_pyro.training.data import demonstrations as read_demonstrations
 from ddco_pyro.training.data import dimensions, known_demonstrations, parts, refuse_unfit, seen
-from ddco_pyro.training.devices import device_of, repeatable
 from ddco_pyro.training.labels import used
 from ddco_pyro.training.networks import Dimensions, check_models, model_name, parameters
 from ddco_pyro.training.optimizers import optimizer_of
-from ddco_pyro.training.processes import Ranks
+from ddco_pyro.training.processes import Ranks, device_of, repeatable
 from ddco_pyro.training.restarts import train_model, training_began
 
 ALONE = Workers(1)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -12,12 +12,17 @@ from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.sources import Source
+from ddco_pyro.data.sources.recording import label_names
+from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.inferred import Inferred, runs
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.inference import posterior
-from ddco_pyro.labelling.document import FREE
+from ddco_pyro.labelling.document import FREE, Document
 from ddco_pyro.model.recogniser import Windows
 from ddco_pyro.model.tables import NEVER
+from ddco_pyro.names import choice_names
+from ddco_pyro.segmenting import LevelLabels, Segmented, Segments, segments
 from ddco_pyro.training.recognition import SHARES, learn
 
 RIDGE = 50.0
@@ -203,3 +208,37 @@ class Proposals:
         rows = self.features[piece][row, start:stop]
         centre: np.ndarray = ((rows - self.middle) / self.spread).mean(0).numpy()
         return centre
+
+
+# --- segments to write ------------------------------------------------------------------------------------------------
+
+
+def said_segments(document: Document, level: str, source: Source, frequency: float | None) -> Segmented:
+    """The labels of a level alone, -1 where nothing is said."""
+    each, count = [], len(document.names)
+    for name in document.lengths:
+        labels = document.in_file(name)
+        starts = np.diff(labels, prepend=-9) != 0
+        starts[[*document.cuts[name]]] = True
+        each.append(Segments(name, {level: LevelLabels(labels, starts, np.ones(len(labels)))}, 0.0, False))
+    names: dict[str, Sequence[str]] = {level: choice_names(count, document.names)}
+    return Segmented(tuple(each), {level: count}, frequency, {}, names, label_names(source.attributes))
+
+
+def shown_segments(
+    fit: Fit, source: Source, level: str, proposed: Mapping[str, Shown], names: Sequence[str]
+) -> Segmented:
+    """All levels of a model, one of them as it is shown.
+
+    :param names: of that level's options.
+    :raises BadInput: the model lacks an option.
+    """
+    if len(names) + 1 != len(fit.names[level]):
+        raise BadInput("an option is new; refit before you write segments")
+    model = segments(fit, source)
+    each = []
+    for demo in model.segments:
+        own = proposed[demo.name]
+        labels = LevelLabels(own.options, np.diff(own.options, prepend=-1) != 0, own.probability)
+        each.append(replace(demo, levels={**demo.levels, level: labels}))
+    return replace(model, segments=tuple(each), names={**model.names, level: choice_names(len(names), names)})

@@ -248,7 +248,7 @@ def _answers(session: Session) -> list[Route]:
         "refit": lambda asked: session.refit(),
         "cancel": lambda asked: session.cancel(),
         "ask": lambda asked: session.ask(),
-        "choose": lambda asked: session.choose(asked.get("proposal")),
+        "choose": lambda asked: session.choose(asked.get("proposal", "")),
         "save": lambda asked: {"message": session.save()},
     }
     return [

@@ -16,8 +16,8 @@ from ddco_pyro.errors import BadInput, Failed, reason
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Record, read_record
 from ddco_pyro.selection.grid import Candidate
-from ddco_pyro.training.devices import one_thread
 from ddco_pyro.training.networks import Dimensions
+from ddco_pyro.training.processes import one_thread
 from ddco_pyro.training.restarts import train_model
 
 

@@ -41,13 +41,12 @@ from ddco_pyro.model.seeding import seeded
 from ddco_pyro.spec import Spec, with_overrides
 from ddco_pyro.training.checkpoint import Progress, Restart, TrainingData, copy_of
 from ddco_pyro.training.data import tuning_split
-from ddco_pyro.training.devices import described, device_of, one_thread
 from ddco_pyro.training.labels import Labels
 from ddco_pyro.training.loop import train
 from ddco_pyro.training.networks import Dimensions, build_hierarchy, model_name
 from ddco_pyro.training.objective import TrainingError
 from ddco_pyro.training.optimizers import optimizer_of
-from ddco_pyro.training.processes import Ranks
+from ddco_pyro.training.processes import Ranks, described, device_of, one_thread
 from ddco_pyro.training.recognition import Recognition, recognise
 from ddco_pyro.training.ridge import cross_validated
 from ddco_pyro.training.stages import StageEnd, plan, starts_of
