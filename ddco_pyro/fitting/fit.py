@@ -18,7 +18,6 @@ from ddco_pyro.data.controls import measure
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import leftovers
 from ddco_pyro.data.hdf5 import natural
-from ddco_pyro.data.memory import allowed
 from ddco_pyro.data.sources.recording import label_names
 from ddco_pyro.errors import path_of
 from ddco_pyro.events import OnEvent, ignore
@@ -100,7 +99,6 @@ def fit(
     workers = Workers(jobs)
     if _check_shards(spec.training.shards) > 1:
         workers = ALONE  # which trains with the others of torchrun
-    allowed()  # or $DDCO_PYRO_MEMORY is wrong
     clock, given = Clock(), None
     with clock("demonstrations"):
         if isinstance(demonstrations, Iterable) and not isinstance(demonstrations, str | Demonstrations):
