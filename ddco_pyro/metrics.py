@@ -253,7 +253,7 @@ class Against(Record):
 
 
 class Parts(Record, Generic[T]):
-    """The parts of the hierarchy's advantage (:mod:`ddco_pyro.evaluation.worth`), and the flat baseline's name."""
+    """The parts of the hierarchy's advantage (:mod:`ddco_pyro.statistics`), and the flat baseline's name."""
 
     memory: T
     experts: LeftOut[T | None] = None

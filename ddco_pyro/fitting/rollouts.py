@@ -13,7 +13,6 @@ from pydantic import BeforeValidator, model_validator
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.files import json_text, write_text
 from ddco_pyro.errors import command
-from ddco_pyro.evaluation.worth import success_worth
 from ddco_pyro.events import EpisodeEnded, OnEvent, ignore
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.fitting.run import RunError
@@ -22,7 +21,7 @@ from ddco_pyro.simulation.episodes import run_episodes, summarize
 from ddco_pyro.simulation.film import write_film
 from ddco_pyro.simulation.task import SUCCESS, Policy, Task, find_task
 from ddco_pyro.spec.base import invalid
-from ddco_pyro.statistics import paired_difference
+from ddco_pyro.statistics import paired_difference, success_worth
 
 OrNaN = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
 """A number; NaN, null in the file, for a measure that does not apply."""

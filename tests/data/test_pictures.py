@@ -17,7 +17,7 @@ from dots import followed
 from odd_files.hdf5 import spoil
 
 import ddco_pyro
-from ddco_pyro.acting.window import ObservationError, Window
+from ddco_pyro.acting.controller import ObservationError, Window
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
 from ddco_pyro.data.pictures import Pictures, Transform, shifted
 from ddco_pyro.fitting.digest import digest
