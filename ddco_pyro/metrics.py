@@ -175,6 +175,11 @@ class Candidate(Record):
     accuracy: Finite
     edit: Finite
 
+    @property
+    def score(self) -> float:
+        """The mean of both scores."""
+        return (self.accuracy + self.edit) / 2
+
 
 class Recogniser(Record):
     """How much the controls' density (``power``) and the recogniser's evidence (``weight``) count; widths in steps."""

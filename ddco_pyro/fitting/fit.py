@@ -258,7 +258,7 @@ def _shares_recogniser(baseline: Spec) -> bool:
 def _with_recogniser(baseline: Spec, chosen: Mapping[str, Any]) -> Spec:
     """A baseline's spec with the model's recogniser, which leaves the policies and what lasts to differ.
 
-    :param chosen: of :meth:`~ddco_pyro.training.recognition.Recognition.as_data`.
+    :param chosen: of :class:`~ddco_pyro.metrics.Recogniser`.
     """
     recogniser = {"weight": chosen["weight"], "ridge": chosen["ridge"], "cross_validated": False}
     values = {f"training.labels.recogniser.{key}": value for key, value in recogniser.items()}
