@@ -70,8 +70,8 @@ def rollout(
 ) -> None:
     """Roll the model, its baselines and the spec's scripted policies out from the same initial states.
 
-    An unfinished rollout of as many episodes is continued. The repetitions of fit --seeds are rolled
-    out, too. With --best one model alone is rolled out, beside the scripted policies.
+    The repetitions of fit --seeds are rolled out, too. With --best one model alone is rolled out, beside the scripted
+    policies.
     """
     from ddco_pyro.cli import console
     from ddco_pyro.fitting.fitted import load

@@ -23,7 +23,6 @@ from ddco_pyro.jobs import from_outside
 from ddco_pyro.model.seeding import HOST
 from ddco_pyro.spec import SpecError, TrainingSpec
 
-Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 

@@ -204,19 +204,6 @@ def test_a_damaged_history(run: Path) -> None:
         refused(run, COMMANDS["report"], run / "history.csv", "")
 
 
-def test_damaged_unfinished_rollouts(run: Path) -> None:
-    outcomes = {"supervisor": [{"success": 1.0}, {"success": 0.0}]}
-    whole = json.dumps({"models": "0", "seeds": [1000, 1001], "outcomes": outcomes})
-    path = run / "rollouts.unfinished.json"
-    another = json.dumps(json.loads(whole) | {"seeds": [1000, 1001, 1002]})
-    for content, what in ((whole[:-20], "is no JSON"), (another, "outcomes: supervisor has 2, but there are 3 seeds")):
-        path.write_text(content)
-        refused(run, COMMANDS["rollout"], path, what)
-    path.write_text(whole)  # of other models: not taken, and put away at the end
-    roll_out(ddco_pyro.load(run), 1, jobs=1)
-    assert not path.exists()
-
-
 # --- tensors ----------------------------------------------------------------------------------------------------------
 
 
