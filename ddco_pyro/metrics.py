@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from operator import not_
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Generic, TypeVar
 
@@ -29,13 +30,9 @@ from ddco_pyro.spec.base import invalid, lines
 T = TypeVar("T")
 
 
-def _empty(value: Any) -> bool:
-    return not value
-
-
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 AtLeastOne = Annotated[int, Field(ge=1)]
-LeftOut = Annotated[T, Field(exclude_if=_empty)]
+LeftOut = Annotated[T, Field(exclude_if=not_)]
 """A field that is left out of the file where it is empty."""
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +62,7 @@ def roll_out(
     played = policies(fit, best)
     held = fit.metrics.rollouts
     whole = held and (held.seed, held.episodes, {*held.methods}) == (seeds.start, episodes, {*played})
-    if held and whole and resume and all(_filmed(fit, name, seeds[:film]) for name in played):
+    if held and whole and resume and all(_film(fit, name, seed).exists() for name in played for seed in seeds[:film]):
         return held
     by_method: dict[str, list[dict[str, float]]] = {}
     for name, policy in played.items():
@@ -70,7 +70,8 @@ def roll_out(
         for episode in run_episodes(str(fit.spec.task), policy, seeds, film, jobs, fit.spec.observed, ()):
             by_method[name].append(episode.outcome)
             if episode.frames:
-                write_film(_film(fit, name, episode.seed), episode, _names(policy))
+                names = [*policy.names.values()] if isinstance(policy, Controller) else []  # lowest level first
+                write_film(_film(fit, name, episode.seed), episode, names)
             on_event(EpisodeEnded(name, len(played) * episodes))
     task = find_task(str(fit.spec.task))
     rows = [
@@ -94,17 +95,8 @@ def roll_out(
     return fit.metrics.rollouts
 
 
-def _names(policy: Policy | str) -> list[Sequence[str]]:
-    """The names of a controller's choices, lowest level first."""
-    return list(policy.names.values()) if isinstance(policy, Controller) else []
-
-
 def _film(fit: Fit, name: str, seed: int) -> Path:
     return fit.run_folder / "videos" / f"{name}-{seed}.mp4"
-
-
-def _filmed(fit: Fit, name: str, seeds: Sequence[int]) -> bool:
-    return all(_film(fit, name, seed).exists() for seed in seeds)
 
 
 def _method(

@@ -97,7 +97,8 @@ class LeRobot:
         named = {LABEL_NAMES: json.dumps({"subtask": subtasks})} if subtasks else {}
         about = {"robot_type": robot} if isinstance(robot, str) else {}
         self.attributes: Mapping[str, Attribute] = {**about, **named}
-        self.data_files = self._data_files()
+        named_files = {self.data_file(index) for index in self._episodes}  # some may be missing
+        self.data_files = tuple(sorted(path.relative_to(folder) for path in named_files))
         self._check_frames()
         meta = sorted((folder / "meta").rglob("*.parquet"))
         more = (folder / path for path in (ANNOTATIONS, *self.data_files))
@@ -134,11 +135,6 @@ class LeRobot:
         except (*_DAMAGE, AttributeError, OverflowError, RecursionError) as error:
             raise damaged(path, "", error) from error
         return {episode: subtasks for episode, subtasks in found.items() if subtasks}, list(names)
-
-    def _data_files(self) -> tuple[Path, ...]:
-        """The files of the episodes' rows, relative to the folder; some may be missing."""
-        named = {self.data_file(index) for index in self._episodes}
-        return tuple(sorted(path.relative_to(self.folder) for path in named))
 
     def _check_frames(self) -> None:
         """Refuse a dataset if neither its rows nor its episodes' lengths add up to ``total_frames``.
