@@ -21,9 +21,17 @@ from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.labelling.background import Away, Background
 from ddco_pyro.labelling.commands import Segment, View, whole
 from ddco_pyro.labelling.document import FREE, SUFFIX, Document, Journal, digest, version
-from ddco_pyro.labelling.expectation import excess, expected_wrong, ranking, unforeseen
 from ddco_pyro.labelling.following import Following
-from ddco_pyro.labelling.proposals import Proposals, Shown, said_segments, shown_segments
+from ddco_pyro.labelling.proposals import (
+    Proposals,
+    Shown,
+    excess,
+    expected_wrong,
+    ranking,
+    said_segments,
+    shown_segments,
+    unforeseen,
+)
 from ddco_pyro.labelling.refitting import Ways, labelled, refit
 from ddco_pyro.names import option_name
 from ddco_pyro.segmenting import Segmented
