@@ -23,8 +23,8 @@ from ddco_pyro.inference import log_likelihood
 from ddco_pyro.model import hierarchy as networks
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.spec import parse_spec
-from ddco_pyro.training.devices import one_thread
 from ddco_pyro.training.networks import Dimensions
+from ddco_pyro.training.processes import one_thread
 from ddco_pyro.training.restarts import Trainer
 
 AIMS = {"epoch of pictures in a file / pictures in memory": ("≤", 1.15)}

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from ddco_pyro.comparison import compare as compare
     from ddco_pyro.data.demonstrations import Demonstration as Demonstration
     from ddco_pyro.data.demonstrations import Demonstrations as Demonstrations
-    from ddco_pyro.estimator import OptionSegmenter as OptionSegmenter
     from ddco_pyro.exporting import export as export
+    from ddco_pyro.fitting.estimator import OptionSegmenter as OptionSegmenter
     from ddco_pyro.fitting.fit import fit as fit
     from ddco_pyro.fitting.fitted import Fit as Fit
     from ddco_pyro.fitting.fitted import load as load
@@ -32,7 +32,7 @@ _PLACES = {
     "EliminatedAHMM": "inference.marginal",
     "Fit": "fitting.fitted",
     "Monitor": "acting.monitor",
-    "OptionSegmenter": "estimator",
+    "OptionSegmenter": "fitting.estimator",
     "Progress": "cli.console",
     "Spec": "spec",
     "compare": "comparison",

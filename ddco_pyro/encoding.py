@@ -20,14 +20,13 @@ from torch.nn.functional import interpolate
 
 from ddco_pyro.data.checks import check, check_alike, problems_of_masks
 from ddco_pyro.data.hdf5 import DemonstrationsError, opened
-from ddco_pyro.data.memory import refuse_too_much
 from ddco_pyro.data.sources import Column, Recording, refuse_foreign
 from ddco_pyro.data.sources.recording import of_array
 from ddco_pyro.data.sources.robomimic import Robomimic, open_robomimic, robomimic_file, write_recording
 from ddco_pyro.errors import BadInput, nearest
 from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
 from ddco_pyro.spec.base import Count, Items, Model
-from ddco_pyro.training.devices import one_thread
+from ddco_pyro.training.processes import one_thread
 
 __all__ = ["Encoder", "encode", "load"]
 
@@ -291,8 +290,7 @@ def encode(
     :param size: number of principal components. By default at most :data:`SIZE`, without those that are noise
         (:data:`NOISE`); fewer features are not projected.
     :param name: the new observation's key; ``<observation>_features`` by default.
-    :raises DemonstrationsError: the demonstrations cannot be used, the observation is missing or no picture, or there
-        is too little memory.
+    :raises DemonstrationsError: the demonstrations cannot be used, or the observation is missing or no picture.
     :raises BadInput: ``out`` is there already; the encoder cannot be used, or gives fewer features than ``size``.
     """
     path, out, key = Path(path), Path(out), name or f"{observation}_features"
@@ -312,9 +310,6 @@ def encode(
             raise BadInput(f"--size {size}: encoder {encoder!r} gives {number} features; take at most as many")
         if size is not None and size > steps:
             raise BadInput(f"--size {size}: there are {steps} training pictures; take at most as many")
-        every = sum(column.shape[0] for column in pictures.values())
-        what = f"{number} features of {every} pictures"
-        refuse_too_much(4 * number * every + 4 * 8 * number**2, what, "take an encoder that gives fewer")
         features = dict[str, np.ndarray]()
         for own, column in pictures.items():
             features[own] = np.concatenate([backbone(batch) for batch in _batches(column)])

@@ -1,9 +1,21 @@
-"""Progress events passed to ``on_event``."""
+"""Progress events passed to ``on_event``, and their numbers in TensorBoard or Weights & Biases.
+
+>>> import ddco_pyro
+>>> from ddco_pyro.events import Log
+>>> with Log("tensorboard", "runs/mine", {}) as log:
+...     fit = ddco_pyro.fit("mine.yaml", out="runs/mine", on_event=log)
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Self
+
+from ddco_pyro.errors import BadInput, nearest
 
 
 class Event:
@@ -122,3 +134,104 @@ OnEvent = Callable[[Event], None]
 
 def ignore(event: Event) -> None:
     """Discard an event."""
+
+
+# --- logs -------------------------------------------------------------------------------------------------------------
+
+
+class TensorBoard:
+    """An event file in ``tensorboard`` of the run folder."""
+
+    def __init__(self, folder: Path, spec: Mapping[str, Any]) -> None:
+        from torch.utils.tensorboard import SummaryWriter
+
+        self._writer: Any = SummaryWriter(str(folder / "tensorboard"))
+        self._writer.add_text("spec", f"```\n{spec}\n```")
+
+    def add(self, values: Mapping[str, float], step: int) -> None:
+        for name, value in values.items():
+            self._writer.add_scalar(name, value, step)
+
+    def close(self) -> None:
+        self._writer.close()
+
+
+class WandbOffline:
+    """A run in ``wandb`` of the run folder, which ``wandb sync`` uploads; nothing is sent before."""
+
+    def __init__(self, folder: Path, spec: Mapping[str, Any]) -> None:
+        import wandb
+
+        self._run: Any = wandb.init(project="ddco-pyro", name=folder.name, dir=str(folder), mode="offline", config=spec)
+
+    def add(self, values: Mapping[str, float], step: int) -> None:
+        self._run.log({**values, "epoch": step})
+
+    def close(self) -> None:
+        self._run.finish()
+
+
+LOGS: dict[str, tuple[type[TensorBoard | WandbOffline], str]] = {
+    "tensorboard": (TensorBoard, "tensorboard"),
+    "wandb-offline": (WandbOffline, "wandb"),
+}
+"""The logs by name, each with the package that it needs, which is also its extra."""
+
+
+class Log:
+    """The log-likelihoods of each epoch in another program, in nats per step.
+
+    ``<model>/<stage>/train`` and ``tune`` have a value for each epoch of a stage; restarts after the first are
+    ``<model>/<stage>/restart <n>/train``. Where the program fails, the fit goes on without the log.
+
+    :param name: one of :data:`LOGS`.
+    :param folder: the run folder; nothing is written there before training begins.
+    :param spec: its spec as plain data.
+    :param say: gets a warning where the program fails.
+    :raises BadInput: there is no such log, or its package is not installed.
+    """
+
+    def __init__(
+        self, name: str, folder: str | Path, spec: Mapping[str, Any], say: Callable[[str], None] = print
+    ) -> None:
+        if name not in LOGS:
+            raise BadInput(f"--log: there is no log {name!r}{nearest(name, LOGS)}; there is: {', '.join(LOGS)}")
+        self._make, package = LOGS[name]
+        if find_spec(package) is None:
+            raise BadInput(f"--log {name}: needs {package}; install it with: pip install 'ddco-pyro[{package}]'")
+        self._name, self._of, self._say = name, (Path(folder), spec), say
+        self._program: TensorBoard | WandbOffline | None = None
+        self._model, self._failed = "", False
+
+    def __call__(self, event: Event) -> None:
+        """Log an event."""
+        if isinstance(event, TrainingBegan):
+            self._model = event.model
+        if isinstance(event, EpochEnded):
+            restart = f"/restart {event.restart}" if event.restart else ""
+            place = f"{self._model}/{event.stage}{restart}"
+            self.add({f"{place}/train": event.train, f"{place}/tune": event.tune}, event.epoch)
+
+    def add(self, values: Mapping[str, float], step: int = 0) -> None:
+        """Log the finite ones of these numbers."""
+        finite = {name: value for name, value in values.items() if math.isfinite(value)}
+        self._tried(lambda program: program.add(finite, step))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._program is not None:
+            self._tried(lambda program: program.close())
+
+    def _tried(self, call: Callable[[TensorBoard | WandbOffline], None]) -> None:
+        """Call the program, which is made first; after an error it is left alone."""
+        if self._failed:
+            return
+        try:
+            self._program = self._program or self._make(*self._of)
+            call(self._program)
+        except Exception as error:  # whatever the other program raises
+            self._failed = True
+            why = " ".join(str(error).split()) or type(error).__name__
+            self._say(f"warning: --log {self._name}: {why}; the fit goes on without this log")

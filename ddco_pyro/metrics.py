@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from operator import not_
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Generic, TypeVar
 
@@ -29,13 +30,9 @@ from ddco_pyro.spec.base import invalid, lines
 T = TypeVar("T")
 
 
-def _empty(value: Any) -> bool:
-    return not value
-
-
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 AtLeastOne = Annotated[int, Field(ge=1)]
-LeftOut = Annotated[T, Field(exclude_if=_empty)]
+LeftOut = Annotated[T, Field(exclude_if=not_)]
 """A field that is left out of the file where it is empty."""
 
 
@@ -175,6 +172,11 @@ class Candidate(Record):
     accuracy: Finite
     edit: Finite
 
+    @property
+    def score(self) -> float:
+        """The mean of both scores."""
+        return (self.accuracy + self.edit) / 2
+
 
 class Recogniser(Record):
     """How much the controls' density (``power``) and the recogniser's evidence (``weight``) count; widths in steps."""
@@ -253,7 +255,7 @@ class Against(Record):
 
 
 class Parts(Record, Generic[T]):
-    """The parts of the hierarchy's advantage (:mod:`ddco_pyro.evaluation.worth`), and the flat baseline's name."""
+    """The parts of the hierarchy's advantage (:mod:`ddco_pyro.statistics`), and the flat baseline's name."""
 
     memory: T
     experts: LeftOut[T | None] = None

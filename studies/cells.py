@@ -37,8 +37,8 @@ from ddco_pyro.metrics import Record, read_record
 from ddco_pyro.spec import Spec, parse_spec, with_overrides
 from ddco_pyro.spec.yaml import read_yaml
 from ddco_pyro.training import data
-from ddco_pyro.training.devices import one_thread
 from ddco_pyro.training.networks import Dimensions, baseline_spec, named_baselines
+from ddco_pyro.training.processes import one_thread
 from studies.declaration import NATS, PARTS, Study
 from studies.statistics import CELL, COLUMNS, ORIGIN, earlier
 

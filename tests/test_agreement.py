@@ -19,8 +19,7 @@ from sklearn.metrics import adjusted_rand_score, cohen_kappa_score, confusion_ma
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation import agreement as measures
-from ddco_pyro.evaluation.agreement import MATCHED, UNKNOWN, UNMATCHED, boundary_distances
-from ddco_pyro.evaluation.annotators import compare_annotators
+from ddco_pyro.evaluation.agreement import MATCHED, UNKNOWN, UNMATCHED, boundary_distances, compare_annotators
 
 WAYS = ("matched_globally", "matched_per_demonstration")
 

@@ -13,7 +13,6 @@ from random_demonstrations import numbered
 from scipy import stats
 
 from ddco_pyro.evaluation.options import Finding, diagnose, divergences, option_use, segments_of
-from ddco_pyro.evaluation.worth import paired
 from ddco_pyro.inference import Posterior, posterior
 from ddco_pyro.inference.posteriors import decompose
 from ddco_pyro.metrics import Alike, Segments, Use
@@ -22,6 +21,7 @@ from ddco_pyro.model.emissions import Gaussian
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
 from ddco_pyro.spec import TrainingSpec, parse_spec
+from ddco_pyro.statistics import paired
 from ddco_pyro.training.networks import Dimensions
 
 

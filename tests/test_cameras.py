@@ -20,7 +20,7 @@ from ddco_pyro.encoding import About, Backbone, Encoder, Projection
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.simulation import collect as collecting
 from ddco_pyro.simulation.cameras import Encoded
-from ddco_pyro.simulation.episodes import play, run_episode
+from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.spec import DemonstrationsSpec, RolloutSpec, parse_spec
 from ddco_pyro.training.data import dimensions
 from ddco_pyro.training.networks import Dimensions, build_hierarchy
@@ -82,7 +82,7 @@ def test_an_encoder_stands_in_for_the_pictures():
     size = Dimensions({"colour": (3,)}, seen.actions.shape[1], len(seen))
     hierarchy = build_hierarchy(policy, size)
     controller = Controller.from_spec(hierarchy, policy.rollout)
-    (played,) = play(coded, controller, [3], hierarchy.encoder.shapes, keep=["colour"])
+    played = run_episode(coded, controller, 3, observed=hierarchy.encoder.shapes, keep=["colour"])
     np.testing.assert_array_equal(played.record.observations["colour"][0], brightness(seen.observations["camera"][0]))
 
 
@@ -130,7 +130,6 @@ def test_a_spec_with_a_camera_is_checked_fitted_and_rolled_out(tmp_path):
     measured = roll_out(fit, 2, film=1, jobs=1).methods["flat"].measures["success"]
     assert DRAWN
     assert list(frames(fit.folder / "videos" / "flat-1000.mp4"))
-    alone = play(
-        watched, Controller.from_spec(fit.hierarchy, RolloutSpec()), range(1000, 1002), fit.hierarchy.encoder.shapes
-    )
+    controller, seen = Controller.from_spec(fit.hierarchy, RolloutSpec()), fit.hierarchy.encoder.shapes
+    alone = [run_episode(watched, controller, seed, observed=seen, keep=()) for seed in range(1000, 1002)]
     assert [one.outcome["success"] for one in alone].count(1.0) == measured.successes

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from ddco_pyro.labelling.expectation import USUAL, excess, expected_wrong, first_wrong, ranking, unforeseen
-from ddco_pyro.labelling.proposals import Shown
+from ddco_pyro.labelling.proposals import USUAL, Shown, excess, expected_wrong, first_wrong, ranking, unforeseen
 
 
 def proposed(generator, steps, sure):

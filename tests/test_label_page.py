@@ -20,9 +20,9 @@ from ddco_pyro.data.planted import pick_and_place
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.labelling.background import Background
 from ddco_pyro.labelling.document import FREE, OPEN
+from ddco_pyro.labelling.refitting import Ways
 from ddco_pyro.labelling.server import Listening, running
 from ddco_pyro.labelling.session import Session
-from ddco_pyro.labelling.ways import Ways
 from ddco_pyro.spec import parse_spec
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")

@@ -28,11 +28,9 @@ from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.fitted import load
 from ddco_pyro.labelling.background import Background
 from ddco_pyro.labelling.document import FREE, OPEN
-from ddco_pyro.labelling.expectation import USUAL
-from ddco_pyro.labelling.proposals import Proposals, Shown
-from ddco_pyro.labelling.refitting import labelled, refit_spec
+from ddco_pyro.labelling.proposals import USUAL, Proposals, Shown
+from ddco_pyro.labelling.refitting import Ways, labelled, refit_spec
 from ddco_pyro.labelling.session import Session
-from ddco_pyro.labelling.ways import Ways
 from ddco_pyro.spec import parse_spec, with_overrides
 from ddco_pyro.training.labels import used
 

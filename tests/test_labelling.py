@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import Damaged
 from ddco_pyro.errors import BadInput
-from ddco_pyro.labelling.document import FREE, OPEN, Document
-from ddco_pyro.labelling.journal import Journal, digest
+from ddco_pyro.labelling.document import FREE, OPEN, Document, Journal, digest
 
 LENGTHS, NAMES = {"demo_0": 6, "demo_1": 3}, ("reach", "grasp")
 QUICK = settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
@@ -168,7 +167,7 @@ WRITER = """
 import sys
 from pathlib import Path
 from ddco_pyro.labelling.document import Document
-from ddco_pyro.labelling.journal import Journal
+from ddco_pyro.labelling.document import Journal
 journal = Journal(Path(sys.argv[1]), Document({"demo_0": 6, "demo_1": 3}, ("reach", "grasp")), "option")
 journal.at("http://127.0.0.1:8000/")
 for number in range(10**6):

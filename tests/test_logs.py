@@ -13,8 +13,7 @@ from command_line import call
 from random_demonstrations import demonstrations
 
 import ddco_pyro
-from ddco_pyro.events import DemonstrationsDone, EpochEnded, TrainingBegan
-from ddco_pyro.logs import LOGS, Log
+from ddco_pyro.events import LOGS, DemonstrationsDone, EpochEnded, Log, TrainingBegan
 
 SPEC = {
     "observations": ["pose"],

@@ -12,8 +12,8 @@ from planted import make_spec, make_trainer
 from random_demonstrations import of_states
 
 import ddco_pyro
+from ddco_pyro.acting.controller import ObservationError, Window
 from ddco_pyro.acting.monitor import Monitor, run_lengths
-from ddco_pyro.acting.window import ObservationError, Window
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.inference import log_likelihood, posterior
 from ddco_pyro.model.batch import encode

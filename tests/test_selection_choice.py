@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from dataclasses import replace
@@ -14,8 +13,9 @@ from hypothesis import strategies as st
 from selecting import DATA, candidate, score, spec_at, two_skills
 
 from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.files import Damaged
 from ddco_pyro.selection.choice import as_data, choose, markdown, table
-from ddco_pyro.selection.folds import FoldError, assign, divide, keep_folds
+from ddco_pyro.selection.folds import FoldError, Score, assign, divide, keep_score, kept_score
 from ddco_pyro.selection.grid import candidates, wide
 from ddco_pyro.spec import SpecError, parse_spec, with_overrides
 from ddco_pyro.training.networks import Dimensions
@@ -247,13 +247,10 @@ def test_what_its_author_set_apart_is_in_no_fold():
     assert sorted(name for names in folds.held_out for name in names) == sorted({*demos.names} - {"demo_3", "demo_7"})
 
 
-def test_other_folds_are_refused(tmp_path):
-    path = tmp_path / "folds.json"
-    folds = divide(two_skills(6), 3, 0)
-    keep_folds(folds, path)
-    before = path.read_bytes()
-    assert json.loads(before)["folds"] == [list(names) for names in folds.held_out]
-    keep_folds(folds, path)
-    with pytest.raises(FoldError, match=r"folds\.json: another version divided these .*; choose another --out"):
-        keep_folds(divide(two_skills(6), 3, 1), path)
-    assert path.read_bytes() == before
+def test_a_score_of_other_folds_is_refused(tmp_path):
+    folds, others = (divide(two_skills(6), 3, seed) for seed in (0, 1))
+    names = folds.held_out[0]
+    keep_score(tmp_path, Score(0, 0, names, (10,) * len(names), failed="for example"))
+    assert kept_score(tmp_path, folds, 0, 0).names == names
+    with pytest.raises(Damaged, match="is not the score of this candidate and fold; remove it"):
+        kept_score(tmp_path, others, 0, 0)

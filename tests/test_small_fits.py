@@ -15,7 +15,7 @@ import ddco_pyro
 from ddco_pyro.acting.monitor import run_lengths
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.options import segments_of
-from ddco_pyro.labelling.ways import Ways
+from ddco_pyro.labelling.refitting import Ways
 from ddco_pyro.metrics import Segments
 from ddco_pyro.selection.small import Lasting, asked, heavy_tails, in_steps, lasting, overrides, unasked
 from ddco_pyro.spec import load_spec, parse_spec, with_overrides

@@ -10,8 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ddco_pyro.acting.controller import fitted
-from ddco_pyro.acting.window import ObservationError, Window, numbers, refuse_large
+from ddco_pyro.acting.controller import ObservationError, Window, fitted, numbers, refuse_large
 from ddco_pyro.errors import BadInput, nearest
 from ddco_pyro.inference.filtering import Belief, Filter
 from ddco_pyro.model.hierarchy import Hierarchy

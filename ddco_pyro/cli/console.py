@@ -39,7 +39,7 @@ from ddco_pyro.names import label_name, method, option_name
 
 if TYPE_CHECKING:
     from ddco_pyro.data.inspection import Field, Inspection
-    from ddco_pyro.evaluation.annotators import Annotators
+    from ddco_pyro.evaluation.agreement import Annotators
     from ddco_pyro.fitting.fitted import Fit
     from ddco_pyro.metrics import Metrics
     from ddco_pyro.model.hierarchy import Hierarchy
@@ -201,7 +201,7 @@ def control(size: Dimensions, hierarchy: Hierarchy) -> None:
 
 def device(spec: Spec) -> None:
     """The device of the networks, unless the spec says ``cpu``."""
-    from ddco_pyro.training.devices import described, device_of
+    from ddco_pyro.training.processes import described, device_of
 
     if spec.training.device != "cpu":
         say(f"networks: on {described(device_of(spec.training))}")

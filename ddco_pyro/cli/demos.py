@@ -92,7 +92,7 @@ def inspect(
 
 def _compare_annotators(first: Path, second: Path, tolerance: int, as_json: bool) -> None:
     from ddco_pyro.cli import console
-    from ddco_pyro.evaluation.annotators import compare_annotators
+    from ddco_pyro.evaluation.agreement import compare_annotators
 
     found = compare_annotators(first, second, tolerance)
     if as_json:

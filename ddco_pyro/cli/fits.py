@@ -15,9 +15,8 @@ import typer
 from ddco_pyro.cli import AllowCode, Overrides, SpecPath, hint, out_folder, written
 from ddco_pyro.data.files import Output, check_outputs
 from ddco_pyro.errors import BadInput, Failed, command
-from ddco_pyro.events import Event
+from ddco_pyro.events import Event, Log
 from ddco_pyro.jobs import Workers
-from ddco_pyro.logs import Log
 from ddco_pyro.spec import Spec, SpecError, dump_spec, load_spec, spec_schema, user_code
 
 if TYPE_CHECKING:

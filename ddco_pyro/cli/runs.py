@@ -70,8 +70,8 @@ def rollout(
 ) -> None:
     """Roll the model, its baselines and the spec's scripted policies out from the same initial states.
 
-    An unfinished rollout of as many episodes is continued. The repetitions of fit --seeds are rolled
-    out, too. With --best one model alone is rolled out, beside the scripted policies.
+    The repetitions of fit --seeds are rolled out, too. With --best one model alone is rolled out, beside the scripted
+    policies.
     """
     from ddco_pyro.cli import console
     from ddco_pyro.fitting.fitted import load
@@ -128,7 +128,7 @@ class Format(NamedTuple):
 
 
 FORMATS = {
-    "--html": Format("stream", "html:Page", "A page with the timeline of every demonstration."),
+    "--html": Format("stream", "tables:Page", "A page with the timeline of every demonstration."),
     "--csv": Format("stream", "tables:CSV", "A table with a row for each step."),
     "--parquet": Format("stream", "tables:Parquet", "The same table as Parquet."),
     "--out": Format("file", "labels:Labels", "A copy of the HDF5 file with labels for each step.", "robomimic"),
@@ -138,9 +138,9 @@ FORMATS = {
         "file", "mimicgen:MimicGen", "A copy of a prepared file with MimicGen's signals.", "robomimic"
     ),
     "--isaac": Format("file", "mimicgen:Isaac", "The same for Isaac Lab Mimic.", "robomimic"),
-    "--label-studio": Format("folder", "label_studio:LabelStudio", "Predictions for Label Studio."),
-    "--elan": Format("folder", "elan:ELAN", "ELAN's .eaf of each demonstration."),
-    "--rerun": Format("folder", "rerun:Rerun", "Rerun's .rrd of each demonstration."),
+    "--label-studio": Format("folder", "annotations:LabelStudio", "Predictions for Label Studio."),
+    "--elan": Format("folder", "annotations:ELAN", "ELAN's .eaf of each demonstration."),
+    "--rerun": Format("folder", "annotations:Rerun", "Rerun's .rrd of each demonstration."),
 }
 """Every format, by its option of ``segment``. A new one is a :class:`Writer`, a row here and a parameter there."""
 
@@ -327,7 +327,7 @@ def export(
     fit = load(run, allow_code)
     fit = fit.best if best else fit
     if lerobot:
-        from ddco_pyro.exporting.lerobot import export_policy
+        from ddco_pyro.exporting import export_policy
 
         _say_exported(export_policy(fit, lerobot))
         print(f"{lerobot}: use it with: lerobot-eval --policy.path={lerobot} --env.type=...")

@@ -18,10 +18,9 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.pictures import same
 from ddco_pyro.errors import BadInput, path_of
 from ddco_pyro.evaluation.agreement import UNMATCHED
-from ddco_pyro.evaluation.worth import paired
 from ddco_pyro.fitting.fitted import Fit, load
 from ddco_pyro.metrics import Training, read_successes
-from ddco_pyro.statistics import paired_difference, rate
+from ddco_pyro.statistics import paired, paired_difference, rate
 from ddco_pyro.training.data import parts
 
 __all__ = ["CompareError", "Comparison", "Row", "compare"]
@@ -35,7 +34,7 @@ class CompareError(BadInput):
 class Row:
     """One run, in nats over all held-out trajectories.
 
-    Errors are :func:`ddco_pyro.evaluation.worth.paired` times the steps: the variation over held-out demonstrations
+    Errors are :func:`ddco_pyro.statistics.paired` times the steps: the variation over held-out demonstrations
     for one fit of each run.
 
     :param total: Σ log p(ξ_n), and its standard error ``se``; None for a single trajectory.

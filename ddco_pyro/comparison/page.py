@@ -17,11 +17,11 @@ from ddco_pyro.drawing.figures import Interval, Panel, interval_plot, save, styl
 from ddco_pyro.drawing.page import Block, Cell, Page, Picture, Section, Table, Text, note
 from ddco_pyro.evaluation import effort, verdicts
 from ddco_pyro.evaluation.agreement import UNMATCHED, measure_names
-from ddco_pyro.evaluation.worth import paired, worth
 from ddco_pyro.metrics import Difference, PerStep, Rate
 from ddco_pyro.names import FLAT, HIERARCHY, MIXTURE, method
 from ddco_pyro.report.likelihood import SHOWN
 from ddco_pyro.segmenting.page import anchor
+from ddco_pyro.statistics import paired, worth
 
 FILES = ("compare.png", "compare.json", "compare.md", "compare.html")
 """The files of a comparison."""

@@ -120,20 +120,21 @@ def _segments(table: pd.DataFrame, columns: Mapping[str, str]) -> Said:
     for name in columns.values():
         if name not in table:
             raise BadInput(f"has no column {name!r}{nearest(name, table)}; there is: {', '.join(table)}")
-    for mark, (tool, usual, read) in TOOLS.items():
-        if mark in table and columns.keys() <= {"demonstration"}:
-            demonstration = columns.get("demonstration", usual)
-            if demonstration not in table:
-                raise BadInput(f"{tool}'s table has no column {usual!r}; say --columns demonstration=COLUMN")
-            table["demonstration"] = table.pop(demonstration)
-            try:
-                return read(table)
-            except (KeyError, TypeError, json.JSONDecodeError) as error:
-                raise BadInput(f"is no table as {tool} exports it, or is damaged: {error}") from None
+    mark = next((mark for mark in TOOLS if mark in table), "") if columns.keys() <= {"demonstration"} else ""
+    needed = ROLES[:1] if mark else ROLES
     columns = {**{role: role for role in ROLES if role in table}, **columns}
-    if missing := ",".join(f"{role}=COLUMN" for role in ROLES if role not in columns):
+    if mark and TOOLS[mark][0] in table:
+        columns.setdefault("demonstration", TOOLS[mark][0])
+    if missing := ",".join(f"{role}=COLUMN" for role in needed if role not in columns):
         raise BadInput(f"its columns are {', '.join(table)}; say what they are with --columns {missing}")
-    rows = pd.DataFrame({role: table[columns[role]] for role in ROLES})
+    rows = pd.DataFrame({role: table[columns[role]] for role in needed})
+    if mark:
+        try:
+            return TOOLS[mark][1](rows.join(table.drop(columns=columns["demonstration"])))
+        except BadInput:
+            raise
+        except (KeyError, TypeError, ValueError) as error:
+            raise BadInput(f"is no table as its tool exports it, or is damaged: {error}") from None
     words = {word for side in ("start", "stop") for word in re.split(r"[^a-z]+", columns[side].lower())}
     units = [unit for unit, its_words in UNITS.items() if its_words & words]
     return rows.assign(labels=columns["label"], last=False), units[0] if len(units) == 1 else None, []
@@ -145,8 +146,7 @@ def _elan(table: pd.DataFrame) -> Said:
     table = table.rename(columns={f"Begin Time - {form}": "start", f"End Time - {form}": "stop"})
     fixed, others = ["demonstration", "start", "stop"], ("File Path", "Begin Time - ", "End Time - ", "Duration - ")
     tiers = [name for name in table if name not in fixed and not name.startswith(others)]
-    rows = [table[fixed].assign(labels=tier, label=table[tier], last=False) for tier in tiers]
-    return pd.concat(rows, ignore_index=True), unit, []
+    return table.melt(fixed, tiers, "labels", "label").assign(last=False), unit, []
 
 
 def _boris(table: pd.DataFrame) -> Said:
@@ -154,36 +154,23 @@ def _boris(table: pd.DataFrame) -> Said:
     table = table.rename(columns={"Behavior": "label", "Start (s)": "start", "Stop (s)": "stop", "Time": "start"})
     points = table["Behavior type"] == "POINT"
     notes = [f"left out {points.sum()} point events, which last no step"] if points.any() else []
-    table, modifiers = table[~points], [name for name in table if name.startswith("Modifier")]
+    modifiers = [name for name in table if name.startswith("Modifier")]
+    table = table[~points].assign(labels=table["Subject"].replace(["", "No focal subject"], "behavior"), last=False)
     if modified := int((table[modifiers] != "").any(axis=1).sum()):
         notes.append(f"left out the modifiers of {modified} rows: a label is a behavior alone")
-    if "stop" not in table:
-        table, orphans = _paired(table, ["demonstration", "Subject", "label", *modifiers])
-        notes += orphans
+    if "stop" not in table:  # a row for each START and each STOP
+        table = table.assign(start=_numbers(table, "start")).sort_values("start", kind="stable")
+        states = table.groupby(["demonstration", "labels", "label", *modifiers])
+        begins, after = table["Behavior type"] == "START", states["Behavior type"].shift(-1)
+        paired = begins & (after == "STOP")
+        for row in table[np.where(begins, ~paired, states["Behavior type"].shift() != "START")].to_dict("records"):
+            kind, other = ("START", "STOP") if row["Behavior type"] == "START" else ("STOP", "START")
+            what = f"{row['label']} in {row['demonstration']}, a {kind} at {row['start']:g} s"
+            notes.append(f"left out {what} without its {other}")
+        table = table.assign(stop=states["start"].shift(-1))[paired]
     before = _numbers(table, "Time offset (s)") if "Time offset (s)" in table else 0
-    start, stop = (_numbers(table, side) - before for side in ("start", "stop"))
-    subject = table["Subject"].replace(["", "No focal subject"], "behavior")
-    return table.assign(labels=subject, start=start, stop=stop, last=False), "seconds", notes
-
-
-def _paired(events: pd.DataFrame, key: list[str]) -> tuple[pd.DataFrame, list[str]]:
-    """Each START with the STOP after it, and a line for each event without the other."""
-    events = events.assign(start=_numbers(events, "start"), stop=None).sort_values("start", kind="stable")
-    rows, orphans, going = list[dict](), list[dict](), dict[tuple, dict]()
-    for row in events.to_dict("records"):
-        begun = going.pop(place := tuple(row[name] for name in key), None)
-        if row["Behavior type"] == "START":
-            going[place] = row
-        elif begun:
-            rows.append({**begun, "stop": row["start"]})
-            continue
-        orphans += [begun] if begun else [row] if place not in going else []
-    lines = [
-        f"left out {row['label']} in {row['demonstration']}, a {row['Behavior type']} at {row['start']:g} s without "
-        f"its {'STOP' if row['Behavior type'] == 'START' else 'START'}"
-        for row in [*orphans, *going.values()]
-    ]
-    return pd.DataFrame(rows, columns=events.columns), lines
+    ends = {side: _numbers(table, side) - before for side in ("start", "stop")}
+    return table.assign(**ends), "seconds", notes
 
 
 def _label_studio(table: pd.DataFrame) -> Said:
@@ -202,12 +189,13 @@ def _label_studio(table: pd.DataFrame) -> Said:
 
 
 TOOLS = {
-    "Begin Time - msec": ("ELAN", "File Name", _elan),
-    "Begin Time - ss.msec": ("ELAN", "File Name", _elan),
-    "Behavior type": ("BORIS", "Observation id", _boris),
-    "annotation_id": ("Label Studio", "demonstration", _label_studio),
+    "Begin Time - msec": ("File Name", _elan),
+    "Begin Time - ss.msec": ("File Name", _elan),
+    "Behavior type": ("Observation id", _boris),
+    "annotation_id": ("demonstration", _label_studio),
 }
-"""By a column that other tables do not have: the tool, the column of its demonstrations, its reader."""
+"""What ELAN, BORIS and Label Studio export, by a column that other tables do not have: the column of demonstrations,
+and the reader."""
 
 # --- segments ---------------------------------------------------------------------------------------------------------
 

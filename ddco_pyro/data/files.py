@@ -82,7 +82,9 @@ def check_outputs(outputs: Sequence[Output], inputs: Sequence[Path] = ()) -> Non
     :raises NoSpace: the disk is full.
     """
     for number, output in enumerate(outputs):
-        _check_name(output)
+        name = str(output.path)
+        if any(unicodedata.category(character) in ("Cc", "Cs") for character in name):
+            raise NotWritable(f"{output.option} {name!r}: is no name for a file; leave control characters out")
         with _explained(output.path):
             _check_kind(output)
             _check_writable(output)
@@ -107,12 +109,6 @@ def _same(one: Path, other: Path) -> bool:
     if one.exists() and other.exists():
         return one.samefile(other)
     return os.path.realpath(one) == os.path.realpath(other)
-
-
-def _check_name(output: Output) -> None:
-    name = str(output.path)
-    if any(unicodedata.category(character) in ("Cc", "Cs") for character in name):
-        raise NotWritable(f"{output.option} {name!r}: is no name for a file; leave control characters out")
 
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"
@@ -147,7 +143,8 @@ def _check_writable(output: Output) -> None:
     if place.is_file() and not os.access(place, os.W_OK):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
     there = next(path for path in (place, *place.parents) if path.is_dir())
-    names = (*place.relative_to(there).parts, _temporary_name(place))
+    temporary = f"{_prefix(place)}{os.getpid()}-{'x' * 8}{_REPLACED}"  # of the greatest length
+    names = (*place.relative_to(there).parts, temporary)
     if max(len(os.fsencode(name)) for name in names) > os.pathconf(there, "PC_NAME_MAX"):
         raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG))
     try:
@@ -251,11 +248,6 @@ def _prepared(place: Path) -> str:
 
 def _prefix(place: Path) -> str:
     return f".{place.name}-{platform.node()}-"
-
-
-def _temporary_name(place: Path) -> str:
-    """A temporary name of the greatest length."""
-    return f"{_prefix(place)}{os.getpid()}-{'x' * 8}{_REPLACED}"
 
 
 def leftovers(folder: Path) -> list[Path]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from ddco_pyro.data.annotations import Labelled, LabelTable
 from ddco_pyro.data.checks import NUMBERS, check, check_alike, check_values, reading
-from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError
+from ddco_pyro.data.hdf5 import DemonstrationsError
 from ddco_pyro.data.pictures import resized
 from ddco_pyro.data.sources import Column, Recording, Source, open_source
 from ddco_pyro.data.sources.metadata import FREQUENCY
@@ -85,13 +85,19 @@ def import_demonstrations(
         labelled = Labelled(whole, choice.labels) if choice.labels else None
         chosen = labelled or whole
         masks: dict[str, tuple[str, ...]] = {}
-        with robomimic_file(out, _attributes(chosen, source, choice), masks) as data:
+        rate = choice.hz or chosen.frequency
+        about = {**chosen.attributes, **({FREQUENCY: rate} if rate else {})}
+        about |= {"source": Path(source).name, "source_format": chosen.format}
+        with robomimic_file(out, about, masks) as data:
             left_out, unread = _write(chosen, choice, data, on_recording)
             if not len(data):
                 why = next(iter(left_out.values()))
                 raise DemonstrationsError(f"{source}: none of its demonstrations can be used: {why}")
             names = tuple(name for name in chosen.names if name in data)
-            masks |= _masks(chosen, names)
+            present = set(names)
+            for mask, members in chosen.masks.items():
+                if imported := tuple(name for name in members if name in present):
+                    masks[mask] = imported
     if labelled is None:
         return Imported(out, names, left_out, unread)
     return Imported(out, names, left_out, (*unread, *labelled.notes), labelled.counts)
@@ -170,18 +176,6 @@ def _names(source: Source, choice: Choice) -> tuple[str, ...]:
         )
     members = set(source.masks[choice.mask])
     return tuple(name for name in source.names if name in members)
-
-
-def _masks(source: Source, names: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    present = set(names)
-    imported = {mask: tuple(name for name in members if name in present) for mask, members in source.masks.items()}
-    return {mask: members for mask, members in imported.items() if members}
-
-
-def _attributes(source: Source, path: str | Path, choice: Choice) -> dict[str, Attribute]:
-    rate = choice.hz or source.frequency
-    frequency = {FREQUENCY: rate} if rate else {}
-    return {**source.attributes, **frequency, "source": Path(path).name, "source_format": source.format}
 
 
 def _chosen(recording: Recording, choice: Choice, frequency: float | None) -> Recording:

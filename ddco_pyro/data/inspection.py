@@ -42,7 +42,6 @@ from ddco_pyro.data.controls import (
 from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError
 from ddco_pyro.data.pictures import blocks
 from ddco_pyro.data.sources import Column, Source, open_source
-from ddco_pyro.data.sources.metadata import rate
 from ddco_pyro.data.sources.recording import UNKNOWN, label_names
 from ddco_pyro.spec import ControlSpec
 
@@ -347,7 +346,6 @@ class _Inspector:
         self.controls: dict[str, np.ndarray] = {}
         self.coincidences = _Coincidences()
         self.turns: dict[str, _Turns] = {}
-        self.periods: dict[str, dict[str, float]] = {}  # of a step, by what says so and by demonstration
 
     def inspection(self, path: Path) -> Inspection:
         """Read everything."""
@@ -383,7 +381,7 @@ class _Inspector:
             frequency=source.frequency,
             problems=[*kinds, *_problems_of_division(source, names, masks), *_problems(fields, self.lengths)],
             control=dimensions,
-            coincidences=(*self.coincidences.notes(masks, varying), *self._jumps(), *self._other_rates()),
+            coincidences=(*self.coincidences.notes(masks, varying), *self._jumps()),
             turns={place: self._turning(place) for place in self.turns if any(self._turning(place))},
             leaks=tuple(p for p, array in fields.items() if self.coincidences.leaks(p, varying, array.constant)),
             excluded=exclude,
@@ -436,17 +434,6 @@ class _Inspector:
                     f"quaternion, {where}: {remedy if seen else 'give all rotations one sign'}"
                 )
 
-    def _other_rates(self) -> Iterator[str]:
-        """A line for the demonstrations that were recorded at another rate than most."""
-        for place, periods in self.periods.items():
-            usual = float(np.median(list(periods.values())))
-            others = [name for name, period in periods.items() if not 1 / SAME_RATE < period / usual < SAME_RATE]
-            if others:
-                yield (
-                    f"{few(others)}: recorded at another rate than most; by {place} a step takes "
-                    f"{periods[others[0]]:.4g}, and {usual:.4g} in the median demonstration: exclude or resample"
-                )
-
     def _name_labels(self) -> None:
         try:
             for name, names in label_names(self.source.attributes).items():
@@ -461,8 +448,6 @@ class _Inspector:
         steps = self.lengths[name] = recording.actions.shape[0] if recording.actions.shape else 0
         self.attributes[name] = recording.attributes
         self.coincidences.digests[name] = hashlib.sha256()
-        if frequency := rate(recording.attributes):
-            self.periods.setdefault("its attributes", {})[name] = 1 / frequency
         for place, column in recording.columns():
             try:
                 check_steps(name, place, column, steps)
@@ -504,10 +489,6 @@ class _Inspector:
             self.coincidences.compare(place, values, self.controls[name].reshape(len(self.controls[name]), -1))
         if array.dtype.kind == "f" and values.shape[1] <= MOST_DIMENSIONS:
             self.turns.setdefault(place, _Turns.of(values.shape[1])).add(values, name)
-        if step > 1 and values.shape[1] == 1 and TIME.search(place):
-            period = (float(values[-1, 0]) - float(values[0, 0])) / (step - 1)
-            if 0 < period < math.inf:
-                self.periods.setdefault(place, {})[name] = period
 
     def _problem(self, kind: str, message: str, about: str) -> None:
         self.problems.setdefault((kind, about), []).append(message)
@@ -555,12 +536,6 @@ NEARLY = 0.85
 
 UNIT = 0.02
 """The squared length of a unit quaternion is within this distance of 1."""
-
-TIME = re.compile(r"^obs/(.*[/_.])?(time|times|time_?stamps?|t)$")
-"""Places of observations that are the time."""
-
-SAME_RATE = 1.2
-"""Two steps take equally long if their times differ by less than this factor."""
 
 SHIFTS = {0: "at the same step", 1: "of the next step", -1: "of the step before"}
 """Steps by which a control follows the observation that equals it."""

@@ -1,7 +1,4 @@
-"""Memory: the bytes that may be used, against the size of arrays as their headers give it.
-
-Free memory decides what is refused, and no number of a result: chunks are cut for a fixed size, see :func:`share`.
-"""
+"""Memory: what is free, against the size of arrays as their headers give it. No number of a result depends on it."""
 
 from __future__ import annotations
 
@@ -10,15 +7,11 @@ import os
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 
 from ddco_pyro.data.hdf5 import DemonstrationsError
-from ddco_pyro.errors import BadInput
-
-VARIABLE = "DDCO_PYRO_MEMORY"
-UNITS = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
 
 PROGRAM = 680e6
 """Bytes of a fit to next to nothing: mostly torch, Pyro and compiled code."""
@@ -29,25 +22,16 @@ COPIES = 4.0 + 16.0
 INFERENCE = 5e3
 """Bytes of inference per step of trajectories that are processed together."""
 
-
-class Array(Protocol):
-    """An array, in memory or in a file."""
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """[T, ...]."""
-
-    @property
-    def dtype(self) -> np.dtype:
-        """The type of its numbers."""
+SMALL = 1e6
+"""Bytes that are taken without asking how many are free."""
 
 
-def needed(demonstrations: Iterable[Mapping[str, Array]], copies: float = COPIES) -> float:
+def needed(demonstrations: Iterable[Mapping[str, Any]], copies: float = COPIES) -> float:
     """Bytes for demonstrations, by their headers: the arrays as read, and copies padded to the longest demonstration.
 
     Pictures that stay in their file count for nothing.
 
-    :param demonstrations: arrays by place (``actions``, ``obs/<key>``, ``labels/<name>``).
+    :param demonstrations: arrays [T, ...] or columns by place (``actions``, ``obs/<key>``, ``labels/<name>``).
     :param copies: bytes of a number beyond the array as read.
     """
     number, longest, size, features = 0, 0, 0, 0
@@ -64,19 +48,7 @@ def needed(demonstrations: Iterable[Mapping[str, Array]], copies: float = COPIES
     return PROGRAM + size + copies * features * number * longest
 
 
-SMALL = 1e6
-"""Bytes that are taken without asking how many are free."""
-
-
-def allowed() -> float:
-    """Bytes that may be used: ``$DDCO_PYRO_MEMORY`` if set, else the free memory.
-
-    :raises BadInput: ``$DDCO_PYRO_MEMORY`` is not a positive number with an optional unit.
-    """
-    return _configured() or _free()
-
-
-def _free(root: Path = Path("/")) -> float:
+def free(root: Path = Path("/")) -> float:
     """Free bytes of the machine, at most the limits of this process's control groups.
 
     :param root: the folder that holds ``proc`` and ``sys``.
@@ -94,36 +66,12 @@ def _free(root: Path = Path("/")) -> float:
     return min(found)
 
 
-def _configured() -> float | None:
-    text = os.environ.get(VARIABLE)
-    if text is None:
-        return None
-    parsed = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([KMGT]?B)?\s*", text, re.IGNORECASE)
-    number = float(parsed[1]) * UNITS[(parsed[2] or "GB").upper()] if parsed else 0.0
-    if not number > 0:
-        raise BadInput(f"{VARIABLE}={text}: has to be a number of GB, or one with a unit, such as 2GB or 500MB")
-    return number
-
-
-def share() -> float:
-    """Bytes for the networks' activations: a fixed part of ``$DDCO_PYRO_MEMORY`` or 2 GB, beyond the program.
-
-    The size of chunks affects the last digits of results, so free memory does not enter.
-    """
-    return max(1.0, ((_configured() or 2e9) - PROGRAM - 100e6) / 4.75)  # the rest: files, clusters, inference
-
-
 def refuse_too_much(needed: float, what: str, remedy: str) -> None:
-    """Refuse work that needs more memory than is allowed.
+    """Refuse work that needs more memory than is :func:`free`.
 
     :param what: subject of the error's sentence.
-    :raises DemonstrationsError: ``needed`` bytes are more than :func:`allowed`.
+    :raises DemonstrationsError: it does.
     """
-    if needed < SMALL and not _configured():
-        return
-    if needed > allowed():
-        more = math.ceil(needed / 1e8) / 10
-        raise DemonstrationsError(
-            f"{what} takes about {more:g} GB of memory, and {allowed() / 1e9:.4g} are allowed; {remedy}, "
-            f"or allow more with {VARIABLE}={more:g}GB"
-        )
+    if needed >= SMALL and needed > (there := free()):
+        size = math.ceil(needed / 1e8) / 10
+        raise DemonstrationsError(f"{what} takes about {size:g} GB of memory, and {there / 1e9:.4g} are free; {remedy}")

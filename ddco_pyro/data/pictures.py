@@ -237,10 +237,3 @@ def shift_into(target: np.ndarray, frames: np.ndarray, down: int, right: int) ->
     target[:, top:bottom, end:] = target[:, top:bottom, end - 1 : end]
     target[:, :top] = target[:, top : top + 1]
     target[:, bottom:] = target[:, bottom - 1 : bottom]
-
-
-def shifted(frames: np.ndarray, down: int, right: int) -> np.ndarray:
-    """Pictures [T, H, W, C] shifted by whole pixels; the edge is repeated."""
-    moved = np.empty_like(frames)
-    shift_into(moved, frames, down, right)
-    return moved

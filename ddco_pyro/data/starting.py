@@ -177,7 +177,8 @@ def _filled(
     lengths, masks = list(inspection.lengths.values()), [] if decided["by"] else list(inspection.masks)
     vectors, images = ([field for field in used if field.image is image] for image in (False, True))
     recipe = VECTORS if vectors else PICTURES
-    batch = _batch(np.array(lengths), recipe)
+    batch = int(np.clip(round(recipe.batch_steps / np.mean(lengths)), 1, max(1, len(lengths) // 2)))
+    epochs = round(recipe.gradient_steps / np.ceil(len(lengths) / batch), -1)
     em = bool(vectors) and not images
     unusable_labels = [(field.key, why) for field in inspection.labels if (why := _unusable(inspection, field))]
     return environment.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
@@ -202,7 +203,7 @@ def _filled(
         margin=MARGIN,
         em=em,
         few=em and len(lengths) < FEW and not {"train", "valid"} & set(masks) and not decided["by"],
-        epochs=max(_epochs(np.array(lengths), batch, recipe), EXACT_EPOCHS if em else 0),
+        epochs=max(int(np.clip(epochs, recipe.epochs, MOST_EPOCHS)), EXACT_EPOCHS if em else 0),
         **decided,
     )
 
@@ -234,16 +235,6 @@ def _seen(shape: Sequence[int]) -> tuple[list[int] | None, int]:
 def _valid_fraction(number: int) -> float:
     least = (1.5 if number > LEAST else 1) / number  # one demonstration
     return float(f"{max(0.2 if number < MANY else 0.1, least):.2g}")
-
-
-def _batch(lengths: np.ndarray, recipe: Recipe) -> int:
-    """Demonstrations in a minibatch, so that an epoch has at least two minibatches."""
-    return int(np.clip(round(recipe.batch_steps / lengths.mean()), 1, max(1, len(lengths) // 2)))
-
-
-def _epochs(lengths: np.ndarray, batch: int, recipe: Recipe) -> int:
-    wanted = recipe.gradient_steps / np.ceil(len(lengths) / batch)
-    return int(np.clip(round(wanted, -1), recipe.epochs, MOST_EPOCHS))
 
 
 def _few_affected(inspection: Inspection) -> list[str]:

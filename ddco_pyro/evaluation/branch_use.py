@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterable
+from functools import partial
 from typing import Any
 
 import torch
@@ -79,12 +79,13 @@ def _rows(sums: dict[tuple[int, int], Tensor], level: int, branches: int, what: 
 def _sums(hierarchy: Hierarchy, piece: Inferred, level: int, branch: nn.Module) -> Tensor:
     """Weighted sums of activation, loss and weight over the steps, [K, 3]."""
     weight = _weight(hierarchy, piece, level)
-    with torch.no_grad(), ExitStack() as hooks:
-        seen = hooks.enter_context(_watched(branch))
-        hierarchy(piece.batch.inputs)
+    seen: list[Tensor] = []  # [N, T, K, F] for each chunk of time
+    with torch.no_grad():
+        with branch.register_forward_hook(lambda _, __, output: seen.append(output[0].cpu())):
+            hierarchy(piece.batch.inputs)
         activation = torch.cat(seen, dim=1).double().abs().mean(-1)
-        hooks.enter_context(_replaced(branch, piece.batch.lengths))
-        loss = _score(hierarchy, piece, level, weight) - _score(hierarchy, piece, level, weight, replaced=True)
+        with branch.register_forward_pre_hook(partial(_shuffled, piece.batch.lengths)):
+            loss = _score(hierarchy, piece, level, weight) - _score(hierarchy, piece, level, weight, replaced=True)
     return torch.stack([(weight * activation).sum((0, 1)), loss, weight.sum((0, 1))], dim=-1)
 
 
@@ -108,40 +109,16 @@ def _score(hierarchy: Hierarchy, piece: Inferred, level: int, weight: Tensor, re
     return torch.where(weight > 0, weight * density, 0.0).sum((0, 1))
 
 
-@contextmanager
-def _watched(branch: nn.Module) -> Iterator[list[Tensor]]:
-    """Inside, the list collects the outputs of a branch, [N, T, K, F] for each chunk of time."""
-    given: list[Tensor] = []
+def _shuffled(lengths: Tensor, branch: nn.Module, arguments: tuple[Any, ...]) -> tuple[Any, ...]:
+    """The arguments of a branch, with the observations of a chunk of time in a random order."""
+    inputs: Inputs = arguments[0]
+    device = inputs.time.device
+    alive = inputs.time < lengths[:, None].to(device)
+    order = torch.randperm(int(alive.sum()), generator=torch.Generator().manual_seed(SEED)).to(device)
 
-    def keep(_: nn.Module, __: Any, output: Any) -> None:
-        given.append(output[0].cpu())
+    def shuffled(array: Tensor) -> Tensor:
+        changed = array.clone()
+        changed[alive] = array[alive][order]
+        return changed
 
-    handle = branch.register_forward_hook(keep)
-    try:
-        yield given
-    finally:
-        handle.remove()
-
-
-@contextmanager
-def _replaced(branch: nn.Module, lengths: Tensor) -> Iterator[None]:
-    """Inside, a branch reads the observations of a chunk of time in a random order."""
-
-    def replace(_: nn.Module, arguments: tuple[Any, ...]) -> tuple[Any, ...]:
-        inputs: Inputs = arguments[0]
-        device = inputs.time.device
-        alive = inputs.time < lengths[:, None].to(device)
-        order = torch.randperm(int(alive.sum()), generator=torch.Generator().manual_seed(SEED)).to(device)
-
-        def shuffled(array: Tensor) -> Tensor:
-            changed = array.clone()
-            changed[alive] = array[alive][order]
-            return changed
-
-        return (inputs.map(shuffled, inputs.time), *arguments[1:])
-
-    handle = branch.register_forward_pre_hook(replace)
-    try:
-        yield
-    finally:
-        handle.remove()
+    return (inputs.map(shuffled, inputs.time), *arguments[1:])

@@ -16,7 +16,6 @@ from ddco_pyro.evaluation.agreement import agreement, confusion, of_equal_length
 from ddco_pyro.evaluation.branch_use import branch_use
 from ddco_pyro.evaluation.inferred import Inferred, infer
 from ddco_pyro.evaluation.options import divergences, option_use, segments_of
-from ddco_pyro.evaluation.worth import mean_run, paired, worth
 from ddco_pyro.events import OnEvent, ignore
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.inference import Posterior
@@ -41,6 +40,7 @@ from ddco_pyro.metrics import (
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.outputs import Outputs
 from ddco_pyro.names import MIXTURE
+from ddco_pyro.statistics import mean_run, paired, worth
 from ddco_pyro.training.labels import choices, used
 
 

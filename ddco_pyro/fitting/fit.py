@@ -18,7 +18,6 @@ from ddco_pyro.data.controls import measure
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import leftovers
 from ddco_pyro.data.hdf5 import natural
-from ddco_pyro.data.memory import allowed
 from ddco_pyro.data.sources.recording import label_names
 from ddco_pyro.errors import path_of
 from ddco_pyro.events import OnEvent, ignore
@@ -42,11 +41,10 @@ from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec, load_spec, with_overrides
 from ddco_pyro.training.data import demonstrations as read_demonstrations
 from ddco_pyro.training.data import dimensions, known_demonstrations, parts, refuse_unfit, seen
-from ddco_pyro.training.devices import device_of, repeatable
 from ddco_pyro.training.labels import used
 from ddco_pyro.training.networks import Dimensions, check_models, model_name, parameters
 from ddco_pyro.training.optimizers import optimizer_of
-from ddco_pyro.training.processes import Ranks
+from ddco_pyro.training.processes import Ranks, device_of, repeatable
 from ddco_pyro.training.restarts import train_model, training_began
 
 ALONE = Workers(1)
@@ -101,7 +99,6 @@ def fit(
     workers = Workers(jobs)
     if _check_shards(spec.training.shards) > 1:
         workers = ALONE  # which trains with the others of torchrun
-    allowed()  # or $DDCO_PYRO_MEMORY is wrong
     clock, given = Clock(), None
     with clock("demonstrations"):
         if isinstance(demonstrations, Iterable) and not isinstance(demonstrations, str | Demonstrations):
@@ -261,7 +258,7 @@ def _shares_recogniser(baseline: Spec) -> bool:
 def _with_recogniser(baseline: Spec, chosen: Mapping[str, Any]) -> Spec:
     """A baseline's spec with the model's recogniser, which leaves the policies and what lasts to differ.
 
-    :param chosen: of :meth:`~ddco_pyro.training.recognition.Recognition.as_data`.
+    :param chosen: of :class:`~ddco_pyro.metrics.Recogniser`.
     """
     recogniser = {"weight": chosen["weight"], "ridge": chosen["ridge"], "cross_validated": False}
     values = {f"training.labels.recogniser.{key}": value for key, value in recogniser.items()}

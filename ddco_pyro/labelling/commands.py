@@ -11,8 +11,7 @@ import numpy as np
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.inferred import runs
 from ddco_pyro.labelling.document import FREE, OPEN, Change, Document
-from ddco_pyro.labelling.expectation import first_wrong
-from ddco_pyro.labelling.proposals import Shown
+from ddco_pyro.labelling.proposals import Shown, first_wrong
 
 LONGEST = 80
 """Characters of a name."""

@@ -1,16 +1,28 @@
-"""What a person has said of the options of one level, with undo and redo without end.
+"""What a person has said of the options of one level, with undo and redo without end, and the file that keeps it.
 
 A document knows no model. Every edit is a list of changes that undo each other, so a list of edits is the document.
+Each edit is on disk before it is acknowledged.
 """
 
 from __future__ import annotations
 
+import errno
+import fcntl
+import getpass
+import hashlib
+import json
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.files import Damaged
+from ddco_pyro.errors import BadInput
 
 FREE, OPEN = -1, -2
 """Steps of which nothing is said, and steps that are left open on purpose; both are -1 in files."""
@@ -92,3 +104,155 @@ class Document:
         if of[1]:
             self.accepted[name] = (of[2], of[3])
         return [("accept", name, known is not None, *(known or (0.0, 0)))]
+
+
+# --- the file of edits ------------------------------------------------------------------------------------------------
+
+SUFFIX = ".journal"
+"""Of the file of edits, beside the file of labels."""
+
+UNDO, REDO = "undo", "redo"
+
+HEADER = b'{"labels":'
+"""What a journal begins with."""
+
+
+def version(path: Path) -> list[int]:
+    """Size and time of change of a file."""
+    stat = path.stat()
+    return [stat.st_size, stat.st_mtime_ns]
+
+
+def digest(demos: Demonstrations, level: str) -> str:
+    """What labels are for: the demonstrations by name, with their controls, and the level."""
+    found = hashlib.sha256(json.dumps([level, [(demo.name, demo.actions.shape) for demo in demos]]).encode())
+    for demo in demos:
+        found.update(demo.actions.tobytes())
+    return found.hexdigest()
+
+
+class Journal:
+    """A file of edits that one process has open.
+
+    :param path: of the file; it is made where it is missing.
+    :param document: gets the edits of the file.
+    :param labels: what the labels are for, as :func:`digest` gives it.
+    :raises BadInput: another process has the file, or it is of other demonstrations.
+    :raises Damaged: a line is none of a journal, which stays as it is.
+    """
+
+    def __init__(self, path: Path, document: Document, labels: str) -> None:
+        self.path, self.document = path, document
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self.file = open(path, "a+b", buffering=0)  # noqa: SIM115  (open as long as this object)
+        try:
+            fcntl.flock(self.file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            self.file.close()
+            raise BadInput(f"{path}: is open in {self._holder()}; end it, or give another --out") from None
+        header = {"labels": labels, "names": list(document.names)}
+        try:
+            whole = self._read(header)
+        except BadInput:
+            self.close()
+            raise
+        self.file.truncate(whole)  # a torn last line was never acknowledged
+        if not whole:
+            self._append(header)
+        self._held_by(f"a process of {getpass.getuser()}, {os.getpid()}")
+
+    def _read(self, header: Mapping[str, Any]) -> int:
+        """Make the edits of the file.
+
+        :returns: the bytes of whole lines.
+        """
+        self.file.seek(0)
+        content = self.file.read()
+        *lines, _ = content.split(b"\n")
+        number = 1
+        try:
+            if not HEADER.startswith(content[: len(HEADER)]):
+                raise ValueError
+            if lines:
+                known = json.loads(lines[0])
+                if known["labels"] != header["labels"]:
+                    raise BadInput(
+                        f"{self.path}: has edits of other demonstrations or of another level; give another --out"
+                    )
+                self.document.names = tuple(known["names"])
+            for line in lines[1:]:
+                number += 1
+                self._apply(json.loads(line))
+        except BadInput:
+            raise
+        except (ValueError, TypeError, LookupError):
+            remedy = "move it away to begin anew, or give another --out"
+            raise Damaged(self.path, f"line {number} is none of a journal of labels", remedy) from None
+        return sum(len(line) + 1 for line in lines)
+
+    def edit(self, changes: Sequence[Change]) -> None:
+        """Make an edit of the document, once it is on disk."""
+        self._write([list(change) for change in changes])
+
+    def undo(self) -> None:
+        """Take the last edit back.
+
+        :raises BadInput: there is none.
+        """
+        if not self.document.done:
+            raise BadInput("nothing to undo")
+        self._write(UNDO)
+
+    def redo(self) -> None:
+        """Make the edit again that was taken back last.
+
+        :raises BadInput: there is none.
+        """
+        if not self.document.undone:
+            raise BadInput("nothing to redo")
+        self._write(REDO)
+
+    def at(self, address: str) -> None:
+        """Say where the document can be edited, for processes that are refused."""
+        self._held_by(f"a process of {getpass.getuser()}, {os.getpid()}, at {address}")
+
+    def close(self) -> None:
+        """Leave the file to other processes."""
+        self.file.close()
+        self._lock.unlink(missing_ok=True)
+
+    def _write(self, entry: Any) -> None:
+        self._append(entry)
+        self._apply(entry)
+
+    def _append(self, entry: Any) -> None:
+        line = json.dumps(entry, separators=(",", ":")).encode() + b"\n"
+        before = os.fstat(self.file.fileno()).st_size
+        try:
+            if self.file.write(line) < len(line):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.path))
+            os.fsync(self.file.fileno())
+        except OSError:
+            self.file.truncate(before)  # no part of an edit that is not made
+            raise
+
+    def _apply(self, entry: Any) -> None:
+        if entry == UNDO:
+            self.document.undo()
+        elif entry == REDO:
+            self.document.redo()
+        else:
+            self.document.edit([tuple(change) for change in entry])
+
+    @property
+    def _lock(self) -> Path:
+        return self.path.with_name(self.path.name + ".lock")
+
+    def _held_by(self, text: str) -> None:
+        self._lock.write_text(text)
+
+    def _holder(self) -> str:
+        try:
+            return self._lock.read_text()
+        except OSError:
+            return "another process"

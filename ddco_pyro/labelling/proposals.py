@@ -1,9 +1,9 @@
-"""What a model makes of all demonstrations, given what a person has said of some steps."""
+"""What a model makes of demonstrations, given what a person has said of some steps, and what is expected wrong."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -12,12 +12,18 @@ from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.sources import Source
+from ddco_pyro.data.sources.recording import label_names
+from ddco_pyro.errors import BadInput
+from ddco_pyro.evaluation.agreement import agreement
 from ddco_pyro.evaluation.inferred import Inferred, runs
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.inference import posterior
-from ddco_pyro.labelling.document import FREE
+from ddco_pyro.labelling.document import FREE, Document
 from ddco_pyro.model.recogniser import Windows
 from ddco_pyro.model.tables import NEVER
+from ddco_pyro.names import choice_names
+from ddco_pyro.segmenting import LevelLabels, Segmented, Segments, segments
 from ddco_pyro.training.recognition import SHARES, learn
 
 RIDGE = 50.0
@@ -203,3 +209,112 @@ class Proposals:
         rows = self.features[piece][row, start:stop]
         centre: np.ndarray = ((rows - self.middle) / self.spread).mean(0).numpy()
         return centre
+
+
+# --- segments to write ------------------------------------------------------------------------------------------------
+
+
+def said_segments(document: Document, level: str, source: Source, frequency: float | None) -> Segmented:
+    """The labels of a level alone, -1 where nothing is said."""
+    each, count = [], len(document.names)
+    for name in document.lengths:
+        labels = document.in_file(name)
+        starts = np.diff(labels, prepend=-9) != 0
+        starts[[*document.cuts[name]]] = True
+        each.append(Segments(name, {level: LevelLabels(labels, starts, np.ones(len(labels)))}, 0.0, False))
+    names: dict[str, Sequence[str]] = {level: choice_names(count, document.names)}
+    return Segmented(tuple(each), {level: count}, frequency, {}, names, label_names(source.attributes))
+
+
+def shown_segments(
+    fit: Fit, source: Source, level: str, proposed: Mapping[str, Shown], names: Sequence[str]
+) -> Segmented:
+    """All levels of a model, one of them as it is shown.
+
+    :param names: of that level's options.
+    :raises BadInput: the model lacks an option.
+    """
+    if len(names) + 1 != len(fit.names[level]):
+        raise BadInput("an option is new; refit before you write segments")
+    model = segments(fit, source)
+    each = []
+    for demo in model.segments:
+        own = proposed[demo.name]
+        labels = LevelLabels(own.options, np.diff(own.options, prepend=-1) != 0, own.probability)
+        each.append(replace(demo, levels={**demo.levels, level: labels}))
+    return replace(model, segments=tuple(each), names={**model.names, level: choice_names(len(names), names)})
+
+
+# --- what is expected wrong -------------------------------------------------------------------------------------------
+
+USUAL = 0.1
+"""ε before anything is accepted: demonstrations that the posterior is sure of count, too."""
+
+
+def first_wrong(first: Shown, accepted: Shown) -> tuple[float, int]:
+    """The steps of a demonstration whose first proposal was expected to be wrong, and those in which it was.
+
+    Other numbers of the same segments are not wrong: a person gives options their numbers.
+    """
+    found = agreement([first.options], [accepted.options])
+    assert found is not None  # there are steps
+    return float((1 - first.probability).sum()), round((1 - found.matched_globally.accuracy) * len(first.options))
+
+
+def excess(proposed: Shown, labels: np.ndarray) -> float:
+    """The share of named steps that are wrong in a proposal, less the share that the posterior expects.
+
+    :param labels: an option of each step, [T]; below 1 where none is named.
+    """
+    said = labels > 0
+    return float(((proposed.options != labels) - (1 - proposed.probability))[said].mean()) if said.any() else 0.0
+
+
+def unforeseen(first: Sequence[float], held_out: Sequence[float]) -> float:
+    """ε, the share of steps that are wrong although the posterior is sure of them.
+
+    It is the mean of what was in excess in demonstrations that were held out. The mean of all first proposals counts
+    as one more of these: it alone is known of a single demonstration.
+
+    :param first: of each accepted demonstration, :func:`excess` of what was shown before anything was said of it.
+    :param held_out: the same of what the model says without its labels.
+    """
+    if not first:
+        return USUAL
+    return max(0.0, (float(np.mean(first)) + sum(held_out)) / (1 + len(held_out)))
+
+
+def expected_wrong(shown: Shown, labels: np.ndarray, sure: float) -> float:
+    """The expected number of wrong steps of a demonstration, Σ (1 - p) + ε p over those of which nothing is said.
+
+    :param sure: ε, as :func:`unforeseen` gives it.
+    """
+    p = shown.probability[labels == FREE]
+    return float((1 - p + sure * p).sum())
+
+
+def ranking(
+    wrong: np.ndarray, edits: np.ndarray, centres: np.ndarray, accepted: np.ndarray
+) -> tuple[list[int], int | None]:
+    """Demonstrations that are not accepted, the one most worth labelling first, then the others; and the least like
+    accepted ones, None where there are none.
+
+    Worth is the expected number of wrong steps for an edit, times the mean likeness to those that are not accepted,
+    times one minus the likeness to the nearest accepted one. Likeness is exp(-d²/2h²), of the distance d between mean
+    features, and h is the median of d.
+
+    :param wrong: the expected number of wrong steps, [N].
+    :param edits: the expected number of edits, [N].
+    :param centres: mean features, [N, F].
+    :param accepted: whether a person is done with each, [N].
+    """
+    away = np.linalg.norm(centres[:, None] - centres, axis=-1)
+    usual = float(np.median(away[np.triu_indices(len(away), 1)])) if len(away) > 1 else 0.0
+    like = np.exp(-((away / (usual or 1.0)) ** 2) / 2)
+    worth = wrong / edits
+    if not accepted.all():
+        worth = worth * like[:, ~accepted].mean(1)
+    if accepted.any():
+        worth = worth * (1 - like[:, accepted].max(1))
+    ranked = sorted(range(len(worth)), key=lambda place: (accepted[place], -worth[place]))
+    return ranked, int(away[:, accepted].min(1).argmax()) if accepted.any() else None

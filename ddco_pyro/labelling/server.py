@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
 from threading import Thread
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import uvicorn
 from starlette.applications import Starlette
@@ -32,6 +32,9 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from ddco_pyro.errors import BadInput, Failed, reason
+
+if TYPE_CHECKING:
+    from ddco_pyro.labelling.session import Session
 
 LOOPBACK = "127.0.0.1"
 
@@ -65,46 +68,6 @@ HEADERS = {
 
 POLLED = ("revision", "refit", "warnings", "dirty")
 """What a page that knows the revision is told of the state."""
-
-
-class Served(Protocol):
-    """What the server asks of a session; everything returned can be JSON unless it says otherwise."""
-
-    def state(self) -> dict[str, Any]:
-        """Everything but the demonstrations."""
-
-    def demo(self, index: int) -> dict[str, Any]:
-        """One demonstration, as it is shown."""
-
-    def nearest(self, index: int, step: int) -> list[dict[str, Any]]:
-        """Segments elsewhere that are like the one at a step."""
-
-    def picture(self, index: int, step: int) -> bytes:
-        """The picture at a step, a JPEG file."""
-
-    def edit(self, command: dict[str, Any]) -> dict[str, Any]:
-        """Do what a person said, and keep it before the answer."""
-
-    def refit(self) -> None:
-        """Fit again in the background."""
-
-    def cancel(self) -> None:
-        """End what runs in the background."""
-
-    def ask(self) -> None:
-        """Look for other ways to cut in the background."""
-
-    def choose(self, proposal: Any) -> None:
-        """Answer the question which way to cut is meant."""
-
-    def save(self) -> str:
-        """Write the labels; a line that says where."""
-
-    def export(self, format: str, folder: Path) -> Path:
-        """Write one file or folder of a format into a folder."""
-
-    def close(self) -> None:
-        """Leave the labels to other processes."""
 
 
 @dataclass(frozen=True)
@@ -142,7 +105,7 @@ class Listening:
 
 
 @contextmanager
-def running(session: Served, listening: Listening) -> Iterator[Thread]:
+def running(session: Session, listening: Listening) -> Iterator[Thread]:
     """Serve a session in a thread while the context lasts."""
     settings = uvicorn.Config(
         application(session, listening.token, listening.port),
@@ -160,7 +123,7 @@ def running(session: Served, listening: Listening) -> Iterator[Thread]:
         listening.socket.close()
 
 
-def serve(session: Served, listening: Listening, ready: Callable[[], None] = lambda: None) -> str:
+def serve(session: Session, listening: Listening, ready: Callable[[], None] = lambda: None) -> str:
     """Serve a session until an interrupt; then save it and close it.
 
     :param ready: called when the page can be asked for.
@@ -175,7 +138,7 @@ def serve(session: Served, listening: Listening, ready: Callable[[], None] = lam
         session.close()
 
 
-def application(session: Served, token: str, port: int) -> Starlette:
+def application(session: Session, token: str, port: int) -> Starlette:
     """The web application of a session, for requests to ``127.0.0.1:port/token/``."""
     routes = [*_page(), *_answers(session)]
     guard = Middleware(Guard, token=token, hosts=frozenset(f"{host}:{port}" for host in (LOOPBACK, "localhost")))
@@ -227,7 +190,7 @@ def _page() -> list[Route]:
     return [route(path, name, kind) for path, (name, kind) in PAGE.items()]
 
 
-def _answers(session: Served) -> list[Route]:
+def _answers(session: Session) -> list[Route]:
     """The routes of the session's methods, each of which runs in a thread."""
 
     def state(request: Request) -> dict[str, Any]:
@@ -285,7 +248,7 @@ def _answers(session: Served) -> list[Route]:
         "refit": lambda asked: session.refit(),
         "cancel": lambda asked: session.cancel(),
         "ask": lambda asked: session.ask(),
-        "choose": lambda asked: session.choose(asked.get("proposal")),
+        "choose": lambda asked: session.choose(asked.get("proposal", "")),
         "save": lambda asked: {"message": session.save()},
     }
     return [

@@ -18,16 +18,21 @@ from ddco_pyro.drawing.timeline import text
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.inferred import within
 from ddco_pyro.fitting.fitted import Fit
-from ddco_pyro.labelling import writing
 from ddco_pyro.labelling.background import Away, Background
 from ddco_pyro.labelling.commands import Segment, View, whole
-from ddco_pyro.labelling.document import FREE, Document
-from ddco_pyro.labelling.expectation import excess, expected_wrong, ranking, unforeseen
+from ddco_pyro.labelling.document import FREE, SUFFIX, Document, Journal, digest, version
 from ddco_pyro.labelling.following import Following
-from ddco_pyro.labelling.journal import SUFFIX, Journal, digest, version
-from ddco_pyro.labelling.proposals import Proposals, Shown
-from ddco_pyro.labelling.refitting import labelled, refit
-from ddco_pyro.labelling.ways import Ways
+from ddco_pyro.labelling.proposals import (
+    Proposals,
+    Shown,
+    excess,
+    expected_wrong,
+    ranking,
+    said_segments,
+    shown_segments,
+    unforeseen,
+)
+from ddco_pyro.labelling.refitting import Ways, labelled, refit
 from ddco_pyro.names import option_name
 from ddco_pyro.segmenting import Segmented
 from ddco_pyro.segmenting.formats.labels import check_copy, check_labels, write_labels
@@ -445,7 +450,7 @@ class Session:
             if not self._unchanged():
                 raise BadInput(self.warnings()[0])
             with open_source(self.path) as source:
-                labels = writing.said(self.document, self.level, source, self.frequency)
+                labels = said_segments(self.document, self.level, source, self.frequency)
             write_labels(self.path, self.out, labels)
             if self.out.exists() and self.out.samefile(self.path):
                 self.version = version(self.path)
@@ -463,7 +468,7 @@ class Session:
             raise BadInput(f"there is no format {form!r}; there is: {', '.join(self.exporters)}")
         with self.lock, open_source(self.path) as source:
             named = replace(self.fit, named={**self.fit.named, self.level: self.document.names})
-            segmented = writing.shown(self.fit, source, self.level, self.shown, self.document.names)
+            segmented = shown_segments(self.fit, source, self.level, self.shown, self.document.names)
         return self.exporters[form](segmented, named, folder, self.level)
 
     def close(self) -> None:

@@ -15,7 +15,6 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from ddco_pyro.data.controls import ControlPart, all_gaussian
-from ddco_pyro.data.memory import share
 from ddco_pyro.model.batch import STEPS_AT_ONCE, Batch
 from ddco_pyro.model.controls import ControlScaling, ControlStd
 from ddco_pyro.model.encoder import ObservationEncoder, Shapes
@@ -30,8 +29,7 @@ from ddco_pyro.spec.networks import Network as AnyNetworkSpec
 from ddco_pyro.spec.networks import PerTimestepSpec
 
 BYTES_AT_ONCE = 256 * 10**6
-"""Most bytes that networks take for the steps that go through them together, at least one step. Less where less memory
-is allowed (:func:`ddco_pyro.data.memory.share`)."""
+"""Most bytes that networks take for the steps that go through them together, at least one step."""
 
 PART_OF_A_GPU = 0.1
 """Share of a GPU's whole memory that networks take in place of that, so that GPUs of one kind cut alike."""
@@ -315,7 +313,7 @@ class Hierarchy(nn.Module):
 def _bytes_at_once(device: torch.device) -> float:
     if device.type == "cuda":
         return PART_OF_A_GPU * torch.cuda.get_device_properties(device).total_memory
-    return min(BYTES_AT_ONCE, share())
+    return BYTES_AT_ONCE
 
 
 def _meta_policy(spec: Spec) -> tuple[NetworkSpec, tuple[Emits, ...]]:

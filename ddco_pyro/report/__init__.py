@@ -18,7 +18,7 @@ from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Metrics, Rate
 from ddco_pyro.names import method
 from ddco_pyro.report import agreement, inputs, likelihood, options, rollouts, skills, training
-from ddco_pyro.report.activity import activity
+from ddco_pyro.report.trajectories import activity
 from ddco_pyro.segmenting.page import followed, timelines
 
 

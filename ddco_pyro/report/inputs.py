@@ -6,11 +6,9 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.drawing.figures import FAINT, blank, save
 from ddco_pyro.drawing.page import Section, Table, note
 from ddco_pyro.drawing.words import number, percent
 from ddco_pyro.fitting.fitted import Fit
@@ -20,9 +18,6 @@ from ddco_pyro.names import name_in_level
 
 GRADIENT_DEMONSTRATIONS, GRADIENT_STEPS = 8, 1000
 """Demonstrations and steps, padding included, over which gradients with respect to observations are averaged."""
-
-SHADES = ("#1f3b73", "#6f8fc9", "#c9a227", "#8c4a32", "#5b8c5a", "#7d6b91")
-"""One for each branch, in turn."""
 
 
 def deciding(fit: Fit, demos: Demonstrations) -> dict[str, dict[str, dict[int, str]]]:
@@ -104,18 +99,13 @@ def branches(fit: Fit) -> Section | None:
         else ["meta-policy" if levels else "policy"]
         for use in uses
     ]
-    caption = (
-        "Left: mean size of each branch's output to the joint layer while the option is active. Right: loss in nats "
-        "per step when the branch reads the observation of another step."
-    )
     explained = (
-        "Held-out demonstrations, or all where none is held out, weighted by the posterior of the options. Activations "
-        "can be compared between the options of a branch, not between branches. Nats lost can be compared everywhere."
+        "Mean activation: size of a branch's output to the joint layer while the option is active. Nats lost: when the "
+        "branch reads the observation of another step. Held-out demonstrations, or all where none is held out, "
+        "weighted by the posterior of the options. Activations can be compared between the options of a branch, not "
+        "between branches. Nats lost can be compared everywhere."
     )
-    picture = save(draw_branches(uses, names), fit.run_folder / "figures" / "branches.png", "Branches", caption)
-    return Section(
-        "branches", "Which inputs matter", [picture, branch_table(uses, names), note(explained)], folded=True
-    )
+    return Section("branches", "Which inputs matter", [branch_table(uses, names), note(explained)], folded=True)
 
 
 def branch_table(uses: Sequence[BranchUse], names: Sequence[Sequence[str]]) -> Table:
@@ -130,21 +120,3 @@ def branch_table(uses: Sequence[BranchUse], names: Sequence[Sequence[str]]) -> T
         for column, branch in enumerate(use.branches)
     ]
     return Table(["Option", "Branch", "Mean activation", "Nats per step lost"], rows, {0, 1})
-
-
-def draw_branches(uses: Sequence[BranchUse], names: Sequence[Sequence[str]]) -> Figure:
-    """The numbers of :func:`branch_table` as bars: a row of panels for each level."""
-    figure = blank(2.6 * len(uses))
-    axes = figure.subplots(len(uses), 2, squeeze=False)
-    for row, (use, options) in enumerate(zip(uses, names, strict=True)):
-        width, places = 0.8 / len(use.branches), np.arange(len(options))
-        shown = {"mean activation": use.activation, "nats per step lost": use.loss}
-        for panel, (title, table) in zip(axes[row], shown.items(), strict=True):
-            for place, branch in enumerate(use.branches):
-                heights = [np.nan if value[place] is None else value[place] for value in table]
-                panel.bar(places + place * width, heights, width, label=branch, color=SHADES[place % len(SHADES)])
-            panel.set_xticks(places + 0.4 - width / 2, options)
-            panel.set_ylabel(title)
-            panel.axhline(0, color=FAINT, linewidth=0.6)
-        axes[row, 0].legend(fontsize="small")
-    return figure

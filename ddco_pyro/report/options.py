@@ -24,7 +24,7 @@ from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import NamedByLabel
 from ddco_pyro.names import label_name, numbered_name
 from ddco_pyro.report import trajectories
-from ddco_pyro.report.activity import Activity
+from ddco_pyro.report.trajectories import Activity
 from ddco_pyro.segmenting.page import HOW
 from ddco_pyro.spec import PathSpec
 

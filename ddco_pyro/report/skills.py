@@ -32,9 +32,9 @@ from ddco_pyro.evaluation.options import diagnose
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Use
 from ddco_pyro.names import numbered_name
-from ddco_pyro.report.activity import Activity
 from ddco_pyro.report.inputs import deciding
 from ddco_pyro.report.options import agreeing
+from ddco_pyro.report.trajectories import Activity
 from ddco_pyro.segmenting import Segmented
 from ddco_pyro.simulation.film import encoded
 from ddco_pyro.spec import PathSpec

@@ -102,7 +102,7 @@ def select(
         demos = demos or data.demonstrations(grid.wide(spec), on_event)
         record(folder, demos)
         folds = dividing.divide(demos, spec.selection.folds, spec.seed)
-        dividing.keep_folds(folds, folder / "folds.json")
+        write_text(folder / "folds.json", json_text({"folds": folds.held_out}))
         candidates = grid.candidates(spec, folds.dimensions)
         scores = _score_all(folder, folds, candidates, on_event, workers)
         choice = choosing.choose(candidates, scores, len(folds.held_out))
@@ -118,7 +118,7 @@ def _score_all(
 ) -> list[Score]:
     """The scores of all candidates in all folds, in their order."""
     pairs = [(candidate.number, fold) for fold in range(len(folds.held_out)) for candidate in candidates]
-    kept = {pair: dividing.kept_score(folder, *pair) for pair in pairs}
+    kept = {pair: dividing.kept_score(folder, folds, *pair) for pair in pairs}
     done = {pair: score for pair, score in kept.items() if score is not None}
     on_event(CellsBegan("cross-validation", len(pairs), len(done)))
     calls = {pair: partial(dividing.score, folds, candidates[pair[0]], pair[1]) for pair in pairs if pair not in done}

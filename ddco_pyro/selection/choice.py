@@ -16,10 +16,10 @@ import numpy as np
 
 from ddco_pyro.drawing.page import Page, Table, Text
 from ddco_pyro.drawing.words import NAT, number, with_error
-from ddco_pyro.evaluation.worth import paired
 from ddco_pyro.metrics import Difference
 from ddco_pyro.selection.folds import Score
 from ddco_pyro.selection.grid import Candidate, point_name
+from ddco_pyro.statistics import paired
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from dataclasses import asdict, dataclass, replace
@@ -14,15 +13,15 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import Damaged, json_text, write_text
 from ddco_pyro.errors import BadInput, Failed, reason
 from ddco_pyro.fitting.fitted import Fit
-from ddco_pyro.metrics import Record, read_record
+from ddco_pyro.metrics import read_record
 from ddco_pyro.selection.grid import Candidate
-from ddco_pyro.training.devices import one_thread
 from ddco_pyro.training.networks import Dimensions
+from ddco_pyro.training.processes import one_thread
 from ddco_pyro.training.restarts import train_model
 
 
 class FoldError(BadInput):
-    """Demonstrations that cannot be divided into so many folds, or a folder that holds other folds."""
+    """Demonstrations that cannot be divided into so many folds."""
 
 
 @dataclass(frozen=True)
@@ -66,24 +65,6 @@ def assign(count: int, folds: int, seed: int) -> list[list[int]]:
         raise FoldError(f"selection.folds: {folds} folds of {count} demonstrations leave less than 2 to train with")
     shuffled = KFold(folds, shuffle=True, random_state=seed).split(np.zeros(count))
     return [sorted(int(row) for row in held_out) for _, held_out in shuffled]
-
-
-class _FoldsFile(Record):
-    folds: list[list[str]]
-
-
-def keep_folds(folds: Folds, path: Path) -> None:
-    """Write the folds, or check that the file holds the same ones.
-
-    :raises Damaged: the file cannot be read.
-    :raises FoldError: the file holds other folds.
-    """
-    text = json.dumps({"folds": folds.held_out}, indent=1) + "\n"
-    if path.exists() and path.read_bytes() != text.encode():
-        read_record(path, _FoldsFile, "remove it and do the same again")
-        raise FoldError(f"{path}: another version divided these demonstrations otherwise; choose another --out")
-    if not path.exists():
-        write_text(path, text)
 
 
 @dataclass(frozen=True)
@@ -149,7 +130,7 @@ def keep_score(folder: Path, score: Score) -> None:
         write_text(score_path(folder, score.candidate, score.fold), json_text(asdict(score)))
 
 
-def kept_score(folder: Path, candidate: int, fold: int) -> Score | None:
+def kept_score(folder: Path, folds: Folds, candidate: int, fold: int) -> Score | None:
     """The score in the folder, if there is one.
 
     :raises Damaged: the file cannot be read.
@@ -160,6 +141,7 @@ def kept_score(folder: Path, candidate: int, fold: int) -> Score | None:
     remedy = "remove it and do the same again: this fold alone is trained anew"
     score = read_record(path, Score, remedy)
     lengths = (len(score.steps), len(score.names) if score.failed else len(score.log_likelihood))
-    if (score.candidate, score.fold) != (candidate, fold) or {*lengths} != {len(score.names)} or 0 in score.steps:
+    known = (score.candidate, score.fold, score.names) == (candidate, fold, folds.held_out[fold])
+    if not known or {*lengths} != {len(score.names)} or 0 in score.steps:
         raise Damaged(path, "is not the score of this candidate and fold", remedy)
     return score

@@ -86,12 +86,16 @@ def candidates(spec: Spec, dimensions: Dimensions) -> list[Candidate]:
         raise SpecError(
             *(f"selection.grid.{path}: candidates are compared on the same data; remove it" for path in shared)
         )
+    alone: dict[str, Any] = {"selection.grid": {}, "compare_with": []}  # baselines are compared, not selected
     valid, problems = [], []
     for number, values in enumerate(product(*grid.values())):
         try:
-            valid.append(_candidate(number, dict(zip(grid, values, strict=True)), spec, dimensions))
+            point = dict(zip(grid, values, strict=True))
+            own = with_overrides(spec, alone | point)
+            valid.append(Candidate(number, point, own, parameters(check_networks(own, dimensions))))
         except SpecError as error:
-            problems += [f"selection.grid: {_where(grid, values)}: {problem}" for problem in error.problems]
+            where = ", ".join(f"{path}={show(value)}" for path, value in zip(grid, values, strict=True))
+            problems += [f"selection.grid: {where}: {problem}" for problem in error.problems]
     if problems:
         raise SpecError(*problems)
     _refuse_other_measures(valid, dimensions)
@@ -110,13 +114,3 @@ def _refuse_other_measures(candidates: Sequence[Candidate], dimensions: Dimensio
                 f"selection.grid: {candidates[0].name} and {candidate.name} measure different things: {different}; "
                 "densities and probabilities cannot be ranked, so give all candidates the same control.kind"
             )
-
-
-def _where(grid: Mapping[str, Any], values: tuple[Any, ...]) -> str:
-    return ", ".join(f"{path}={show(value)}" for path, value in zip(grid, values, strict=True))
-
-
-def _candidate(number: int, values: dict[str, Any], spec: Spec, dimensions: Dimensions) -> Candidate:
-    alone: dict[str, Any] = {"selection.grid": {}, "compare_with": []}  # baselines are compared, not selected
-    own = with_overrides(spec, alone | values)
-    return Candidate(number, values, own, parameters(check_networks(own, dimensions)))

@@ -15,9 +15,9 @@ from ddco_pyro.data.tensors import read_tensors, write_tensors
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec
-from ddco_pyro.training.devices import device_of
 from ddco_pyro.training.labels import Labels
 from ddco_pyro.training.networks import Dimensions, build_hierarchy
+from ddco_pyro.training.processes import device_of
 from ddco_pyro.training.stages import starts_of
 
 State = dict[str, Tensor]

@@ -20,7 +20,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ddco_pyro.data.memory import share
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import BYTES_AT_ONCE
 from ddco_pyro.model.recogniser import FRAMES_AT_ONCE, block_means, window_means
@@ -131,7 +130,7 @@ def _together(blocks: Iterable[np.ndarray], rows: int) -> Iterator[np.ndarray]:
 
 def most_rows(numbers: int) -> int:
     """The most steps, with so many numbers each, that are clustered together: memory bounds them."""
-    return max(1, int(min(BYTES_AT_ONCE, share())) // (8 * max(1, numbers)))
+    return max(1, BYTES_AT_ONCE // (8 * max(1, numbers)))
 
 
 def joined(seen: np.ndarray, actions: np.ndarray) -> np.ndarray:

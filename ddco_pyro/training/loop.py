@@ -29,7 +29,6 @@ from ddco_pyro.model.seeding import seed as seed_generators
 from ddco_pyro.model.seeding import seeded
 from ddco_pyro.model.tables import Tables
 from ddco_pyro.training.checkpoint import Restart, State, TrainingData, copy_of
-from ddco_pyro.training.devices import device_of, one_thread, repeatable
 from ddco_pyro.training.em import Expectation
 from ddco_pyro.training.objective import Diverged, Objective
 from ddco_pyro.training.optimizers import (
@@ -40,7 +39,7 @@ from ddco_pyro.training.optimizers import (
     optimizer_state,
     restore_optimizer,
 )
-from ddco_pyro.training.processes import Ranks
+from ddco_pyro.training.processes import Ranks, device_of, one_thread, repeatable
 from ddco_pyro.training.stages import EVERYTHING, Stage, StageEnd, plan, share
 
 SAVE_EVERY = 5.0

@@ -25,7 +25,7 @@ from ddco_pyro.model.networks import ShapeError
 from ddco_pyro.model.seeding import seeded
 from ddco_pyro.names import HIERARCHY, MIXTURE
 from ddco_pyro.spec import BaselineSpec, Spec, SpecError, user_code, with_overrides
-from ddco_pyro.training.devices import device_of
+from ddco_pyro.training.processes import device_of
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -13,13 +12,14 @@ from torch import Tensor
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.events import EpochEnded, OnEvent, ignore
 from ddco_pyro.inference.paths import most_likely_path
+from ddco_pyro.metrics import Candidate, Recogniser
 from ddco_pyro.model.batch import Batch, encode
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.recogniser import Windows
 from ddco_pyro.model.tables import Tables
 from ddco_pyro.spec import with_overrides
 from ddco_pyro.statistics import edit_score
-from ddco_pyro.training.checkpoint import Progress, Restart, State, TrainingData
+from ddco_pyro.training.checkpoint import Progress, Restart, TrainingData
 from ddco_pyro.training.em import Expectation
 from ddco_pyro.training.labels import Labels, choices
 from ddco_pyro.training.loop import train
@@ -50,52 +50,13 @@ SHARES = (0.25, 0.75)
 """The half widths of windows, as parts of a labelled segment."""
 
 
-@dataclass(frozen=True)
-class Candidate:
-    """What is tried, and the mean accuracy and edit score of labelled demonstrations that are left out."""
-
-    power: float
-    weight: float
-    ridge: float
-    accuracy: float
-    edit: float
-
-    @property
-    def score(self) -> float:
-        """The mean of both scores."""
-        return (self.accuracy + self.edit) / 2
-
-
-@dataclass(frozen=True)
-class Recognition:
-    """A learned recogniser, and how much it counts.
-
-    :param state: of ``Hierarchy.recogniser``.
-    :param power: β, of the log-density of controls.
-    :param weight: γ, of the evidence.
-    :param ridge: of the regressions.
-    :param widths: half widths of the windows, in steps.
-    :param tried: every candidate, where cross-validation has chosen.
-    """
-
-    state: State
-    power: float
-    weight: float
-    ridge: float
-    widths: tuple[int, ...]
-    tried: tuple[Candidate, ...]
-
-    def as_data(self) -> dict[str, Any]:
-        """What ``metrics.json`` has of it."""
-        return {name: value for name, value in asdict(self).items() if name != "state"}
-
-
-def recognise(model: Hierarchy, data: TrainingData, demos: Demonstrations) -> tuple[TrainingData, Recognition]:
+def recognise(model: Hierarchy, data: TrainingData, demos: Demonstrations) -> tuple[TrainingData, Recogniser]:
     """Teach a hierarchy's recogniser the labelled steps, and say what it makes of the others.
 
     :param model: the hierarchy, with fitted encoder and scaling.
     :param demos: those to train and to tune with.
-    :returns: the data with the power β of the control, and with starts and evidence of steps without labels.
+    :returns: the data with the power β of the control, and with starts and evidence of steps without labels; and how
+        much the recogniser counts.
     """
     labels, own, recogniser = data.labels, data.spec.training.labels, model.recogniser
     assert labels is not None
@@ -110,9 +71,9 @@ def recognise(model: Hierarchy, data: TrainingData, demos: Demonstrations) -> tu
     for windows in (recogniser.around, recogniser.past):
         windows.widths.copy_(torch.tensor(widths))
         features[windows] = windows.features(batch.inputs, batch.actions, batch.lengths)
-    power, weight, ridge, tried = data.spec.control.power, asked.weight, asked.ridge, tuple[Candidate, ...]()
+    power, weight, ridge, tried = data.spec.control.power, asked.weight, asked.ridge, list[Candidate]()
     if asked.cross_validated:
-        tried = tuple(_tried(data, recogniser.around, features[recogniser.around], batch, options, demos.names))
+        tried = _tried(data, recogniser.around, features[recogniser.around], batch, options, demos.names)
         power, weight, ridge = chosen(tried)
     for windows, rows in features.items():
         learn(windows, rows[options > 0], options[options > 0], ridge)
@@ -126,7 +87,7 @@ def recognise(model: Hierarchy, data: TrainingData, demos: Demonstrations) -> tu
     taught = replace(labels, evidence=(evidence, tuning), starts=starts)
     state = {name: value.clone() for name, value in recogniser.state_dict().items()}
     spec = with_overrides(data.spec, {"control.power": power})
-    found = Recognition(state, power, weight, ridge, widths, tried)
+    found = Recogniser(power=power, weight=weight, ridge=ridge, widths=list(widths), tried=tried)
     return replace(data, spec=spec, labels=taught, recogniser=state), found
 
 
@@ -211,7 +172,11 @@ def _tried(
                 for found, true in zip(path.numpy(), truth[:, : tables.steps].numpy(), strict=True):
                     ours, theirs = found[true > 0], true[true > 0]
                     own.append((float((ours == theirs).mean()), edit_score(ours, theirs)))
-    return [Candidate(*key, *np.mean(own, axis=0).tolist()) for key, own in scores.items()]
+    means = {key: np.mean(own, axis=0).tolist() for key, own in scores.items()}
+    return [
+        Candidate(power=power, weight=weight, ridge=ridge, accuracy=accuracy, edit=edit)
+        for (power, weight, ridge), (accuracy, edit) in means.items()
+    ]
 
 
 def _left_out(options: Tensor, lengths: Tensor) -> Iterator[Tensor]:

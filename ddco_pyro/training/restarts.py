@@ -35,20 +35,20 @@ from ddco_pyro.events import (
 from ddco_pyro.inference.engines import STEPS, TRAJECTORIES, EngineCheck, compare_engines
 from ddco_pyro.inference.paths import segment
 from ddco_pyro.jobs import Workers, run_all
+from ddco_pyro.metrics import Recogniser
 from ddco_pyro.model.batch import encode, refuse_unusable
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.seeding import seeded
 from ddco_pyro.spec import Spec, with_overrides
 from ddco_pyro.training.checkpoint import Progress, Restart, TrainingData, copy_of
 from ddco_pyro.training.data import tuning_split
-from ddco_pyro.training.devices import described, device_of, one_thread
 from ddco_pyro.training.labels import Labels
 from ddco_pyro.training.loop import train
 from ddco_pyro.training.networks import Dimensions, build_hierarchy, model_name
 from ddco_pyro.training.objective import TrainingError
 from ddco_pyro.training.optimizers import optimizer_of
-from ddco_pyro.training.processes import Ranks
-from ddco_pyro.training.recognition import Recognition, recognise
+from ddco_pyro.training.processes import Ranks, described, device_of, one_thread
+from ddco_pyro.training.recognition import recognise
 from ddco_pyro.training.ridge import cross_validated
 from ddco_pyro.training.stages import StageEnd, plan, starts_of
 
@@ -149,7 +149,7 @@ class Trainer:
             self.ridge = cross_validated(self.hierarchy, encoded[0], ridge, self.data.seed(0))
             raised = with_overrides(spec, {"training.optimizer.ridge.policy": self.ridge})
             self.data = replace(self.data, spec=raised)
-        self.recognition: Recognition | None = None
+        self.recognition: Recogniser | None = None
         if self.hierarchy.recogniser is not None:
             every = train if tune is train else replace(train, demonstrations=(*train, *tune), masks={})
             self.data, self.recognition = recognise(self.hierarchy, self.data, every)
@@ -312,7 +312,7 @@ class Trainer:
             "by_em": optimizer == "em",
             "by_lbfgs": optimizer == "lbfgs",
             "raised_ridge": self.ridge if self.ridge != self.spec.training.optimizer.ridge.policy else None,
-            "recogniser": None if self.recognition is None else self.recognition.as_data(),
+            "recogniser": None if self.recognition is None else self.recognition.model_dump(),
         }
 
     def _segments(self, number: int) -> np.ndarray:

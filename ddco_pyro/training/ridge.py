@@ -46,14 +46,11 @@ def cross_validated(model: Hierarchy, batch: Batch, ridge: float, seed: int) -> 
     for left_out in fold.unique():
         for cluster in range(1, count + 1):
             inside = alive & (clusters == cluster)
-            rows = [(x[where], batch.actions[where][:, dims].double()) for where in _parts(inside, fold, left_out)]
+            parts = inside & (fold != left_out), inside & (fold == left_out)
+            rows = [(x[where], batch.actions[where][:, dims].double()) for where in parts]
             total += _score(*rows[0], *rows[1], ridges)
     values = total / batch.steps
     return float(ridges[int((values >= values.max() - ENOUGH).nonzero()[0])])
-
-
-def _parts(inside: Tensor, fold: Tensor, left_out: Tensor) -> tuple[Tensor, Tensor]:
-    return inside & (fold != left_out), inside & (fold == left_out)
 
 
 def _score(x: Tensor, actions: Tensor, others: Tensor, their: Tensor, ridges: Tensor) -> Tensor:

@@ -177,8 +177,8 @@ def test_an_event_without_its_other_is_named_and_nothing_else_is_lost(tmp_path):
     assert found["demo_0"]["left"] == [*[""] * 10, *["grasp"] * 3, ""]
     assert notes[2:] == [
         "left out grasp in demo_0, a STOP at 5.1 s without its START",
-        "left out grasp in demo_0, a START at 5.3 s without its STOP",
         "left out reach in demo_0, a START at 5.2 s without its STOP",
+        "left out grasp in demo_0, a START at 5.3 s without its STOP",
     ]
 
 
@@ -250,9 +250,9 @@ REACH = ("demo_1", "reach", 0.1, 0.4)
         (exported(("demo_1", REGIONS), tag="a/b"), {"unit": "steps"}, "'a/b' cannot be a name of labels"),
         (exported(("demo_1", [series("reach", 0, 3), series("grasp", 2, 5)])), {"unit": "steps"},
          "demo_1: label: grasp and another segment overlap at step 2"),
-        (exported(("demo_1", REGIONS), key="csv"), {}, "Label Studio's table has no column 'demonstration'; say --col"),
+        (exported(("demo_1", REGIONS), key="csv"), {}, "say what they are with --columns demonstration=COLUMN"),
         (exported(("demo_1", [{"labels": ["a", "b"], "start": 0, "end": 1}])), {}, "has 2 labels; a step has one"),
-        (exported(("demo_1", [{"labels": ["a"]}])), {}, "is no table as Label Studio exports it, or is damaged"),
+        (exported(("demo_1", [{"labels": ["a"]}])), {}, "is no table as its tool exports it, or is damaged"),
         ("", {}, "cannot be read as a table, or is damaged"),
     ],
 )  # fmt: skip

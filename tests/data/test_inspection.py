@@ -63,23 +63,6 @@ def test_the_rate_is_read_under_usual_names(
     assert (f"control frequency: {hertz:g} Hz\n" if hertz else 'file.attrs["control_frequency"] = 20 says') in shown
 
 
-@pytest.mark.parametrize("key", ["timestamp", "robot/time", "camera_t", None])
-def test_a_demonstration_at_another_rate_is_noted(key: str | None, tmp_path: Path) -> None:
-    def change(made: dict[str, np.ndarray], number: int) -> None:
-        if key:
-            made[f"obs/{key}"] = 7 + np.arange(len(made["actions"])) * (0.2 if number == 2 else 0.1 + 0.001 * number)
-
-    path = write(tmp_path / "demos.hdf5", change)
-    if key is None:
-        with h5py.File(path, "r+") as file:
-            for name, group in file["data"].items():
-                group.attrs["hz"] = 5 if name == "demo_2" else 10
-    (note,) = (note for note in inspect(path).notes if "another rate" in note)
-    assert note.startswith(
-        f"demo_2: recorded at another rate than most; by {f'obs/{key}' if key else 'its attributes'} "
-    )
-
-
 def test_shapes_ranges_lengths_and_constants(path: Path) -> None:
     found = inspect(path)
     original = demonstrations(5)

@@ -12,12 +12,8 @@ import toy_task
 import yaml
 from command_line import call
 from large import measured, zeros
-from random_demonstrations import demonstrations as random_demonstrations
 
-from ddco_pyro.data.demonstrations import DemonstrationsError
-from ddco_pyro.data.memory import PROGRAM, allowed
-from ddco_pyro.errors import BadInput
-from ddco_pyro.spec import parse_spec
+from ddco_pyro.data import memory
 from ddco_pyro.training.data import demonstrations
 
 GIGABYTE = 10**9
@@ -26,8 +22,8 @@ LIMIT = 2 * GIGABYTE
 
 @pytest.fixture(autouse=True)
 def two_gigabytes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is allowed does not depend on the machine that runs the tests."""
-    monkeypatch.setenv("DDCO_PYRO_MEMORY", "2GB")
+    """What is free does not depend on the machine that runs the tests."""
+    monkeypatch.setattr(memory, "free", lambda: LIMIT)
 
 
 def large(path: Path, number: int, steps: int, size: int = 1000) -> Path:
@@ -57,56 +53,15 @@ def spec_of(path: Path, *observations: str) -> Path:
 def test_a_fit_to_what_is_larger_than_memory_is_refused(tmp_path: Path) -> None:
     """8 GB in a file of a few megabytes: 28 bytes for each observation and control of a step, and the program."""
     eight = large(tmp_path / "eight.hdf5", 10, 100_000)
-    spec, size = spec_of(eight, "state"), f"{math.ceil((28 * 10**6 * (1000 + 2) + PROGRAM) / 1e8) / 10:g}"
+    spec, size = spec_of(eight, "state"), f"{math.ceil((28 * 10**6 * (1000 + 2) + memory.PROGRAM) / 1e8) / 10:g}"
     for command in (["check", spec], ["fit", spec, "--out", tmp_path / "run"], ["select", spec, "--out", tmp_path]):
         ended = call(*command)
         assert (ended.status, ended.err.count("\n")) == (2, 1)
         assert ended.err.startswith(
-            f"ddco-pyro: {eight}: a fit to state takes about {size} GB of memory, and 2 are allowed;"
+            f"ddco-pyro: {eight}: a fit to state takes about {size} GB of memory, and 2 are free; leave"
         )
-        assert "leave observations out" in ended.err
-        assert ended.err.endswith(f"or allow more with DDCO_PYRO_MEMORY={size}GB\n")
     assert not (tmp_path / "run").exists()
     assert call("check", spec_of(eight, "arm")).status == 0  # what is not asked for does not count
-
-
-def test_more_can_be_allowed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "demos.hdf5"
-    random_demonstrations(4).write(path)
-    spec = parse_spec(yaml.safe_load(spec_of(path, "pose").read_text()))
-    assert demonstrations(spec).names == ("demo_0", "demo_1", "demo_2", "demo_3")
-    monkeypatch.setenv("DDCO_PYRO_MEMORY", "0.5GB")
-    with pytest.raises(DemonstrationsError, match=r"and 0\.5 are allowed"):
-        demonstrations(spec)
-    for wrong in ("much", "-1", "0", "nan", "2 apples", "1e999"):
-        monkeypatch.setenv("DDCO_PYRO_MEMORY", wrong)
-        with pytest.raises(BadInput, match=rf"DDCO_PYRO_MEMORY={wrong}: has to be a number of GB, or one with a unit"):
-            allowed()
-    for said, meant in (("16", 16e9), ("2GB", 2e9), ("0.5 gb", 5e8), ("700MB", 7e8)):
-        monkeypatch.setenv("DDCO_PYRO_MEMORY", said)
-        assert allowed() == meant
-
-
-@pytest.mark.slow
-def test_a_fit_to_pictures_stays_within_what_is_allowed(tmp_path: Path) -> None:
-    """290 MB of pictures; what they take on the way through networks is a multiple of that."""
-    path, spec, random = tmp_path / "demos.hdf5", tmp_path / "spec.yaml", np.random.default_rng(0)
-    noise = random.integers(0, 256, (420, 240, 320, 3), dtype=np.uint8)
-    with h5py.File(path, "w") as file:
-        for index in range(3):
-            file[f"data/demo_{index}/obs/seen"] = noise
-            file[f"data/demo_{index}/actions"] = random.normal(size=(420, 3))
-    data = {
-        "demonstrations": {"path": str(path), "valid_fraction": 0.2},
-        "observations": ["seen"],
-        "baseline": {"kind": "flat", "policy": {"network": "conv", "filters": 4, "hidden": [8]}},
-        "training": {"epochs": 1},
-    }
-    spec.write_text(yaml.safe_dump(data))
-    ended = measured("fit", spec, "--out", tmp_path / "run", DDCO_PYRO_MEMORY="850MB")
-    print(f"{path.stat().st_size / 1e6:.0f} MB of pictures: {ended.peak / 1e6:.0f} MB at most")
-    assert ended.status == 0, ended.err
-    assert ended.peak < 850e6
 
 
 def test_a_demonstration_that_cannot_be_segmented_is_refused(toy_run, tmp_path: Path) -> None:

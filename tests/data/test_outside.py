@@ -104,17 +104,6 @@ def test_what_is_free(groups: str, limits: dict[str, str], free: int, tmp_path: 
     for name, text in {**files, **{f"sys/fs/cgroup/{name}": text for name, text in limits.items()}}.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
-    assert memory._free(tmp_path) == free
+    assert memory.free(tmp_path) == free
     shutil.rmtree(tmp_path / "proc")
-    assert memory._free(tmp_path) > 1e8  # all that this machine has
-
-
-def test_free_memory_decides_what_is_refused_and_no_bits(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Chunks are cut as if 2 GB were allowed, wherever ``DDCO_PYRO_MEMORY`` is not set."""
-    monkeypatch.delenv("DDCO_PYRO_MEMORY", raising=False)
-    cut = memory.share()
-    for free in (1e9, 64e9):
-        monkeypatch.setattr(memory, "_free", lambda free=free: free)
-        assert (memory.allowed(), memory.share()) == (free, cut)
-    monkeypatch.setenv("DDCO_PYRO_MEMORY", "2GB")
-    assert (memory.allowed(), memory.share()) == (2e9, cut)
+    assert memory.free(tmp_path) > 1e8  # all that this machine has

@@ -17,9 +17,9 @@ from dots import followed
 from odd_files.hdf5 import spoil
 
 import ddco_pyro
-from ddco_pyro.acting.window import ObservationError, Window
+from ddco_pyro.acting.controller import ObservationError, Window
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
-from ddco_pyro.data.pictures import Pictures, Transform, shifted
+from ddco_pyro.data.pictures import Pictures, Transform, shift_into
 from ddco_pyro.fitting.digest import digest
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.encoder import ObservationEncoder
@@ -137,6 +137,12 @@ def test_pictures_are_cut_and_scaled_wherever_they_are(kept: Path) -> None:
     first = made[0]["camera"][0, 1:11, 2:10]
     scaled = cv2.resize(first, (4, 5), interpolation=cv2.INTER_AREA)
     np.testing.assert_array_equal(seen[0, 0], scaled)
+
+
+def shifted(frames: np.ndarray, down: int, right: int) -> np.ndarray:
+    moved = np.empty_like(frames)
+    shift_into(moved, frames, down, right)
+    return moved
 
 
 def test_shifting_repeats_the_edge() -> None:

@@ -210,12 +210,6 @@ def test_features_that_only_later_pictures_spoil(tmp_path, out):
     assert not out.exists()
 
 
-def test_features_that_do_not_fit_into_memory(few_dots, out, monkeypatch):
-    monkeypatch.setenv("DDCO_PYRO_MEMORY", "1kB")
-    ended = call("encode", few_dots, "--observation", "camera", "--encoder", MEANS, "--allow-code", "--out", out)
-    refused(ended, out, "take an encoder that gives fewer, or allow more with DDCO_PYRO_MEMORY")
-
-
 def test_user_code_needs_permission(few_dots, out):
     ended = call("encode", few_dots, "--observation", "camera", "--encoder", MEANS, "--out", out)
     refused(ended, out, "would import user code; pass --allow-code")

@@ -69,12 +69,6 @@ def same_rollouts(one: Path, other: Path) -> None:
     assert metrics[0] == metrics[1]
 
 
-def rolled(folder: Path) -> set[object] | None:
-    """The methods that need not be rolled out again."""
-    path = folder / "run" / "rollouts.unfinished.json"
-    return set(json.loads(path.read_text())["outcomes"]) if path.exists() else None
-
-
 def same_selection(one: Path, other: Path) -> None:
     """Equal folds, scores, choice, and fit of what was chosen."""
     for name in ("spec.yaml", "demonstrations.json", "folds.json", "selection.json", "selection.md"):
@@ -131,7 +125,7 @@ CASES = {
     "select": Case("selected", same_selection, folds),
     "segment": Case("labelled.hdf5", same_segments),
     "segment in place": Case("toy.hdf5", same_segments, inputs=("toy.hdf5",)),
-    "rollout": Case("run", same_rollouts, rolled, ("elsewhere/run",)),
+    "rollout": Case("run", same_rollouts, inputs=("elsewhere/run",)),
 }
 COMMANDS = {
     "collect": "collect {inputs}/toy.yaml --out demos.hdf5 --set demonstrations.count=40 --allow-code",

@@ -14,7 +14,7 @@ from toy_task import task
 
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.simulation.episodes import play, run_episode, run_episodes, summarize
+from ddco_pyro.simulation.episodes import run_episode, run_episodes, summarize
 from ddco_pyro.spec import RolloutSpec, parse_spec
 from ddco_pyro.statistics import paired_difference, rate
 
@@ -216,6 +216,11 @@ MODELS = {
 }
 
 
+def at(record, step):
+    """What is observed at a step, or at the last one."""
+    return {key: values[min(step, len(record) - 1)] for key, values in record.observations.items()}
+
+
 @pytest.mark.parametrize("spec", [MEAN, MARGINAL, SAMPLED], ids=["most likely", "marginal", "sampled"])
 @pytest.mark.parametrize(
     ("name", "weights", "actors"),
@@ -232,15 +237,19 @@ def test_together_as_alone(name, weights, actors, spec):
     ragged, acted, changes = replace(task, load=lambda seed: toy_task.Point(seed, steps=seed)), set(), 0
     for seed in weights:
         hierarchy = make(MODELS[name], seed, gain=3.0)
-        for found in play(ragged, Controller.from_spec(hierarchy, spec), SEEDS, keep=("offsets",)):
-            alone = run_episode(ragged, Controller.from_spec(hierarchy, spec), found.seed)
-            assert found.outcome == pytest.approx(alone.outcome, abs=1e-5, nan_ok=True)
-            assert len(alone.choices) == len(alone.record)
-            np.testing.assert_array_equal(found.choices, alone.choices)
-            offsets = (one.record.observations["offsets"] for one in (found, alone))
-            np.testing.assert_allclose(*offsets, atol=1e-5)
-            acted |= {next((d for d, choice in enumerate(row) if choice), len(row)) for row in found.choices.tolist()}
-            changes += (np.diff(found.choices, axis=0) != 0).any(1).sum()
+        alone = [run_episode(ragged, Controller.from_spec(hierarchy, spec), seed) for seed in SEEDS]
+        controller = Controller.from_spec(hierarchy, spec)
+        controller.reset_all(SEEDS)
+        for step in range(max(len(one.record) for one in alone)):
+            controls = controller.act_all([at(one.record, step) for one in alone])
+            for own, control, choices in zip(alone, controls, controller.all_choices, strict=True):
+                if step < len(own.record):
+                    np.testing.assert_array_equal(choices, own.choices[step])
+                    np.testing.assert_allclose(control, own.record.actions[step], atol=1e-5)
+        for own in alone:
+            assert len(own.choices) == len(own.record)
+            acted |= {next((d for d, choice in enumerate(row) if choice), len(row)) for row in own.choices.tolist()}
+            changes += (np.diff(own.choices, axis=0) != 0).any(1).sum()
     assert acted == actors
     assert changes > 1 or name in ("flat", "lstm", "windows")
 
@@ -249,5 +258,5 @@ def test_environments_are_closed_when_one_fails():
     made = []
     broken = replace(kept(made), outcome=lambda environment: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        play(broken, Controller.from_spec(make(MODELS["flat"]), MEAN), SEEDS)
-    assert [one.closed for one in made] == [True] * len(SEEDS)
+        run_episode(broken, Controller.from_spec(make(MODELS["flat"]), MEAN), SEEDS[0])
+    assert [one.closed for one in made] == [True]

@@ -14,13 +14,13 @@ import ddco_pyro
 from ddco_pyro.drawing import words
 from ddco_pyro.evaluation import verdicts
 from ddco_pyro.evaluation.inferred import runs, started
-from ddco_pyro.evaluation.worth import mean_run, worth
 from ddco_pyro.inference import log_likelihood
 from ddco_pyro.inference.engines import compare_engines
 from ddco_pyro.metrics import Worth
 from ddco_pyro.model.tables import always_ends
 from ddco_pyro.selection.grid import candidates
 from ddco_pyro.spec import SpecError, parse_spec, with_overrides
+from ddco_pyro.statistics import mean_run, worth
 from ddco_pyro.training.networks import (
     Dimensions,
     baseline_spec,

@@ -23,7 +23,7 @@ from ddco_pyro.fitting.fitted import load
 from ddco_pyro.metrics import Metrics
 from ddco_pyro.report import rollouts as rolling
 from ddco_pyro.report import trajectories, write_report
-from ddco_pyro.report.activity import activity
+from ddco_pyro.report.trajectories import activity
 from ddco_pyro.simulation.episodes import Episode, summarize
 from ddco_pyro.simulation.film import write_film
 from ddco_pyro.spec import TrainingSpec, parse_spec

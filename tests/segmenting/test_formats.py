@@ -26,8 +26,7 @@ from ddco_pyro.errors import BadInput
 from ddco_pyro.exporting.runner import Runner
 from ddco_pyro.segmenting import LevelLabels, Segmented, Segments
 from ddco_pyro.segmenting.formats import Asked
-from ddco_pyro.segmenting.formats.elan import ELAN
-from ddco_pyro.segmenting.formats.label_studio import LabelStudio
+from ddco_pyro.segmenting.formats.annotations import ELAN, LabelStudio
 from ddco_pyro.segmenting.formats.lerobot import SARM, Annotated
 from ddco_pyro.segmenting.formats.mimicgen import Isaac, MimicGen
 from ddco_pyro.segmenting.formats.tables import CSV
@@ -321,9 +320,9 @@ TOOLS = Path(os.environ.get("DDCO_PYRO_TOOLS", HERE.parent / ".venv-tools")) / "
         ("sarm", "lerobot:SARM", OF_DATASET),
         ("mimicgen", "mimicgen:MimicGen", ORDERED),
         ("isaac", "mimicgen:Isaac", ORDERED),
-        ("label_studio", "label_studio:LabelStudio", OTHER),
-        ("elan", "elan:ELAN", OTHER),
-        ("rerun", "rerun:Rerun", OTHER),
+        ("label_studio", "annotations:LabelStudio", OTHER),
+        ("elan", "annotations:ELAN", OTHER),
+        ("rerun", "annotations:Rerun", OTHER),
     ],
 )
 def test_the_tool_reads_what_was_planted(tmp_path, form, kind, plan):

@@ -12,7 +12,7 @@ from ddco_tasks.pushing import environment as pushing
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.fitting.fit import fit
-from ddco_pyro.simulation.episodes import play, run_episode
+from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.spec import load_spec
 from ddco_pyro.training.data import dimensions
 from ddco_pyro.training.networks import check_networks
@@ -47,7 +47,7 @@ def test_specs_fit_and_act(path: Path, demonstrations: Path, tmp_path: Path) -> 
     assert found.metrics.engine_check.value < 1e-6
     brief = replace(pushing.limited, load=lambda seed: pushing.load_single(seed), cameras=CAMERAS)
     controller = Controller.from_spec(found.hierarchy, found.spec.rollout)
-    (episode,) = play(brief, controller, [0], found.spec.observed, keep=("tip",))
+    episode = run_episode(brief, controller, 0, observed=found.spec.observed, keep=("tip",))
     levels = LEVELS[path.stem.removeprefix("pushing_")]
     assert episode.choices.shape == (len(episode.record.observations["tip"]), levels)
     lowest = 0 if path.stem.endswith("hybrid") else 1

@@ -21,7 +21,7 @@ import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.model.networks.conv import _field_means
 from ddco_pyro.spec import Spec
-from ddco_pyro.training import devices
+from ddco_pyro.training import processes
 from ddco_pyro.training.networks import Dimensions, build_hierarchy
 from ddco_pyro.training.restarts import OtherDevice
 
@@ -170,9 +170,9 @@ def test_of_several_gpus_each_process_has_its_own(monkeypatch: pytest.MonkeyPatc
     seen = []
     for rank in range(3):
         monkeypatch.setenv("LOCAL_RANK", str(rank))
-        seen.append(devices.device_of(training))
+        seen.append(processes.device_of(training))
     assert seen == [torch.device("cuda", index) for index in (0, 1, 0)]
-    assert devices.device_of(spec_of(SAME["mlp"]).training) == torch.device("cpu")
+    assert processes.device_of(spec_of(SAME["mlp"]).training) == torch.device("cpu")
 
 
 def test_a_run_goes_on_where_it_was_begun(demos: Demonstrations, tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:

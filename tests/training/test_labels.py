@@ -22,6 +22,7 @@ from ddco_pyro.evaluation.agreement import agreement
 from ddco_pyro.evaluation.effort import contributions
 from ddco_pyro.evaluation.inferred import infer
 from ddco_pyro.inference import log_likelihood, segment
+from ddco_pyro.metrics import Candidate
 from ddco_pyro.model.batch import encode
 from ddco_pyro.report import write_report
 from ddco_pyro.spec import SpecError
@@ -31,7 +32,7 @@ from ddco_pyro.training.labels import Labels
 from ddco_pyro.training.loop import backward
 from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.objective import Objective
-from ddco_pyro.training.recognition import Candidate, _left_out, _widths
+from ddco_pyro.training.recognition import _left_out, _widths
 from ddco_pyro.training.recognition import chosen as best_of
 from ddco_pyro.training.restarts import Trainer
 from ddco_pyro.training.stages import plan
@@ -343,9 +344,7 @@ def test_a_recogniser_places_what_labels_alone_do_not(tmp_path):
     assert found["recogniser"] > found["clamped"] + 0.1
     again = ddco_pyro.load(tmp_path / "recogniser")
     chosen = again.metrics.training.recogniser
-    assert (chosen.power, chosen.weight, chosen.ridge) == best_of(
-        [Candidate(*(getattr(one, name) for name in Candidate.__annotations__)) for one in chosen.tried]
-    )
+    assert (chosen.power, chosen.weight, chosen.ridge) == best_of(chosen.tried)
     assert float(again.hierarchy.power) == chosen.power
     assert float(again.hierarchy.recogniser.gamma) == chosen.weight
     for own, other in zip(fit.segment(held_out)[0], again.segment(held_out)[0], strict=True):
@@ -396,7 +395,7 @@ def test_a_recogniser_reads_pictures():
 def test_the_pair_is_chosen_by_its_mean_over_ridges():
     scores = {(0.1, 0.3): (0.5, 0.9), (1.0, 0.0): (0.8, 0.7)}
     tried = [
-        Candidate(*pair, ridge, score, score)
+        Candidate(power=pair[0], weight=pair[1], ridge=ridge, accuracy=score, edit=score)
         for pair, own in scores.items()
         for ridge, score in zip((15, 50), own, strict=True)
     ]

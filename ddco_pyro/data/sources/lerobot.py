@@ -20,7 +20,6 @@ import cv2
 import numpy as np
 
 from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError
-from ddco_pyro.data.memory import refuse_too_much
 from ddco_pyro.data.pictures import block_steps, channels_last, turned
 from ddco_pyro.data.sources.metadata import check_links, filled, first_missing, inside, rate, stored_keys
 from ddco_pyro.data.sources.recording import LABEL_NAMES, Column, Recording, damaged, joined, of_array
@@ -98,7 +97,8 @@ class LeRobot:
         named = {LABEL_NAMES: json.dumps({"subtask": subtasks})} if subtasks else {}
         about = {"robot_type": robot} if isinstance(robot, str) else {}
         self.attributes: Mapping[str, Attribute] = {**about, **named}
-        self.data_files = self._data_files()
+        named_files = {self.data_file(index) for index in self._episodes}  # some may be missing
+        self.data_files = tuple(sorted(path.relative_to(folder) for path in named_files))
         self._check_frames()
         meta = sorted((folder / "meta").rglob("*.parquet"))
         more = (folder / path for path in (ANNOTATIONS, *self.data_files))
@@ -135,11 +135,6 @@ class LeRobot:
         except (*_DAMAGE, AttributeError, OverflowError, RecursionError) as error:
             raise damaged(path, "", error) from error
         return {episode: subtasks for episode, subtasks in found.items() if subtasks}, list(names)
-
-    def _data_files(self) -> tuple[Path, ...]:
-        """The files of the episodes' rows, relative to the folder; some may be missing."""
-        named = {self.data_file(index) for index in self._episodes}
-        return tuple(sorted(path.relative_to(self.folder) for path in named))
 
     def _check_frames(self) -> None:
         """Refuse a dataset if neither its rows nor its episodes' lengths add up to ``total_frames``.
@@ -384,7 +379,6 @@ class _Rows:
 def _open(path: Path, changed: int) -> tuple[parquet.ParquetFile, Mapping[int, list[tuple[int, int]]]]:
     """A parquet file, and the spans of rows of each episode; ``changed`` identifies the version of the file."""
     file = parquet.ParquetFile(path)
-    refuse_too_much(8 * file.metadata.num_rows, f"{path}: its {file.metadata.num_rows} rows", "divide it")
     index = file.read(["episode_index"]).column(0).to_numpy()
     bounds = [0, *(np.flatnonzero(np.diff(index)) + 1).tolist(), len(index)]
     spans: dict[int, list[tuple[int, int]]] = {}
@@ -401,17 +395,12 @@ def _count(path: Path) -> int:
         raise damaged(path, "", error) from error
 
 
-ROW_BYTES = 1000
-"""Memory of a row of ``meta/episodes``, about."""
-
-
 def _episodes(folder: Path) -> tuple[dict[int, dict[str, Any]], set[int]]:
     """The rows of ``meta/episodes`` by episode, without statistics, and the episodes with two rows."""
     episodes: dict[int, dict[str, Any]] = {}
     twice: set[int] = set()
     for path in sorted((folder / "meta" / "episodes").rglob("*.parquet")):
         try:
-            refuse_too_much(ROW_BYTES * _count(path), f"{path}: its rows", "divide the dataset")
             names = parquet.read_schema(path).names
             rows = parquet.read_table(path, columns=[key for key in names if not key.startswith("stats/")]).to_pylist()
             for row in rows:

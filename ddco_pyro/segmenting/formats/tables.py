@@ -1,18 +1,21 @@
-"""Tables with a row for each step, in CSV and Parquet."""
+"""Tables with a row for each step, in CSV and Parquet, and a page with the time line of every demonstration."""
 
 from __future__ import annotations
 
 import csv
 from collections.abc import Iterator
-from itertools import chain
+from itertools import chain, islice
 from typing import Any
 
+from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import whole_file
 from ddco_pyro.data.sources.recording import BOUNDARY
+from ddco_pyro.drawing.shown import paths_of, stored_pictures
 from ddco_pyro.errors import BadInput
 from ddco_pyro.names import option_name
-from ddco_pyro.segmenting import Segmented
+from ddco_pyro.segmenting import Segmented, recorded
 from ddco_pyro.segmenting.formats import Writer
+from ddco_pyro.segmenting.page import followed, write_page
 
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
 """First characters of a text that a spreadsheet may execute as a formula."""
@@ -75,4 +78,24 @@ class Parquet(Writer):
         table = pyarrow.table({name: list(column) for name, column in zip(columns(segmented), values, strict=True)})
         with whole_file(self.out) as temporary:
             parquet.write_table(table, temporary)
+        return str(self.out)
+
+
+# --- page -------------------------------------------------------------------------------------------------------------
+
+FIRST = 10
+"""Demonstrations among which an observation that moves like a position is sought."""
+
+
+class Page(Writer):
+    """The page of :mod:`ddco_pyro.segmenting.page`."""
+
+    def write(self, segmented: Segmented) -> str:
+        asked = self.asked
+        pictures = stored_pictures(asked.source, {demo.name: len(demo) for demo in segmented.segments})
+        demos = recorded(segmented, asked.fit, asked.source)
+        first = list(islice(demos, FIRST))
+        paths = paths_of(asked.fit.spec.report.trajectory, Demonstrations(tuple(first)))
+        follows = followed(chain(first, demos), pictures, segmented, paths)
+        write_page(self.out, segmented, str(asked.run), str(asked.demos), follows)
         return str(self.out)

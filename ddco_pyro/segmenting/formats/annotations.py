@@ -1,0 +1,206 @@
+"""Annotations for other programs: ELAN, Label Studio and Rerun, with the names of all choices."""
+
+from __future__ import annotations
+
+import json
+import re
+from datetime import UTC, datetime
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from ddco_pyro.data.files import whole_folder, write_text
+from ddco_pyro.drawing.colours import option_colour
+from ddco_pyro.errors import BadInput
+from ddco_pyro.names import name_in_level
+from ddco_pyro.segmenting import Segmented, Segments
+from ddco_pyro.segmenting.formats import Writer
+
+SCHEMA = "http://www.mpi.nl/tools/elan/EAFv3.0.xsd"
+UNDETERMINED = "und"
+"""ELAN's name of no language in particular."""
+STEP = 1000.0
+"""Milliseconds of a step where the steps per second are not known."""
+
+
+class ELAN(Writer):
+    """A folder with ``<demonstration>.eaf``; times are milliseconds.
+
+    The highest level comes first. An annotation lasts from the first step of a segment to the first step of the next.
+    A controlled vocabulary has the names of all choices of a level.
+    """
+
+    def write(self, segmented: Segmented) -> str:
+        milliseconds = 1000 / segmented.frequency if segmented.frequency else STEP
+        with whole_folder(self.out) as folder:
+            for demo in segmented.segments:
+                write_text(folder / f"{demo.name}.eaf", self._document(demo, milliseconds))
+        unit = "" if segmented.frequency else "; a step is one second, since the demonstrations have no frequency"
+        return f"{self.out}: {len(segmented)} files{unit}"
+
+    def _document(self, demo: Segments, milliseconds: float) -> str:
+        when = datetime.now(UTC).isoformat(timespec="seconds")
+        root = ElementTree.Element(
+            "ANNOTATION_DOCUMENT",
+            {"AUTHOR": "ddco-pyro", "DATE": when, "FORMAT": "3.0", "VERSION": "3.0",
+             "xmlns:xsi": "http://www.w3.org/2001/XMLSchema-instance", "xsi:noNamespaceSchemaLocation": SCHEMA},
+        )  # fmt: skip
+        ElementTree.SubElement(root, "HEADER", MEDIA_FILE="", TIME_UNITS="milliseconds")
+        times = ElementTree.SubElement(root, "TIME_ORDER")
+        levels = dict(reversed(demo.levels.items()))
+        edges = {0, len(demo)}.union(*(run[1:] for level in levels.values() for run in level.runs(anew=False)))
+        for step in sorted(edges):
+            value = str(round(step * milliseconds))
+            ElementTree.SubElement(times, "TIME_SLOT", TIME_SLOT_ID=f"ts{step}", TIME_VALUE=value)
+        number = 0
+        for name, level in levels.items():
+            tier = ElementTree.SubElement(root, "TIER", TIER_ID=name, LINGUISTIC_TYPE_REF=name)
+            for option, start, stop in level.runs(anew=False):
+                number += 1
+                annotation = ElementTree.SubElement(ElementTree.SubElement(tier, "ANNOTATION"), "ALIGNABLE_ANNOTATION")
+                annotation.attrib |= {
+                    "ANNOTATION_ID": f"a{number}", "TIME_SLOT_REF1": f"ts{start}", "TIME_SLOT_REF2": f"ts{stop}"
+                }  # fmt: skip
+                text = ElementTree.SubElement(annotation, "ANNOTATION_VALUE")
+                text.text = self._names(name)[option]
+        for name in levels:
+            kind = {"LINGUISTIC_TYPE_ID": name, "TIME_ALIGNABLE": "true", "CONTROLLED_VOCABULARY_REF": name}
+            ElementTree.SubElement(root, "LINGUISTIC_TYPE", kind)
+        ElementTree.SubElement(root, "LANGUAGE", LANG_ID=UNDETERMINED)
+        for name in levels:
+            vocabulary = ElementTree.SubElement(root, "CONTROLLED_VOCABULARY", CV_ID=name)
+            ElementTree.SubElement(vocabulary, "DESCRIPTION", LANG_REF=UNDETERMINED)
+            for option, word in enumerate(self._names(name)):
+                entry = ElementTree.SubElement(vocabulary, "CV_ENTRY_ML", CVE_ID=f"{name}_{option}")
+                ElementTree.SubElement(entry, "CVE_VALUE", LANG_REF=UNDETERMINED).text = word
+        ElementTree.indent(root)
+        return '<?xml version="1.0" encoding="UTF-8"?>\n' + ElementTree.tostring(root, "unicode") + "\n"
+
+    def _names(self, level: str) -> list[str]:
+        names = self.asked.fit.names[level]
+        return [name_in_level(option, level, names) for option in range(len(names))]
+
+
+# --- Label Studio -----------------------------------------------------------------------------------------------------
+
+DEMO = "demonstration"
+"""In the data of a task, which exports keep."""
+
+REGIONS = "timeserieslabels"
+"""The kind of regions that are written."""
+
+
+class LabelStudio(Writer):
+    """A folder with ``tasks.json`` and ``config.xml``.
+
+    A task shows the controls over time, with the subtasks as predicted ``timeserieslabels``. A subtask's ``score`` is
+    its mean posterior probability; the score of the prediction is the lowest of them, so that Label Studio can begin
+    with the demonstration that is least certain. Times are steps, inclusive. Regions have the name of the level.
+    """
+
+    def write(self, segmented: Segmented) -> str:
+        tasks = [self._task(demo) for demo in segmented.segments]
+        with whole_folder(self.out) as folder:
+            write_text(folder / "tasks.json", json.dumps(tasks, ensure_ascii=False) + "\n")
+            write_text(folder / "config.xml", self._config(self.order(segmented), list(tasks[0]["data"]["series"])))
+        return f"{self.out}: {len(tasks)} tasks; make a project with config.xml and import tasks.json"
+
+    def _task(self, demo: Segments) -> dict[str, Any]:
+        actions = self.asked.source.recording(demo.name).actions.array()
+        series = {"step": list(range(len(demo)))}
+        series |= {f"control_{number}": column.tolist() for number, column in enumerate(actions.T)}
+        probability = demo.levels[self.asked.level].probability
+        scores, found = list[float](), list[dict[str, Any]]()
+        for number, (option, start, stop) in enumerate(self.runs(demo)):
+            labels = {"start": start, "end": stop - 1, "instant": False, REGIONS: [self.asked.names[option]]}
+            scores.append(float(probability[start:stop].mean()))
+            found.append({
+                "id": f"{demo.name}-{number}", "from_name": self.asked.level, "to_name": "series", "type": REGIONS,
+                "score": scores[-1], "value": labels,
+            })  # fmt: skip
+        return {
+            "data": {"series": series, DEMO: demo.name},
+            "predictions": [{"model_version": str(self.asked.run), "score": min(scores), "result": found}],
+        }
+
+    def _config(self, order: list[int], series: list[str]) -> str:
+        view = ElementTree.Element("View")
+        ElementTree.SubElement(view, "Header", value=f"${DEMO}")
+        labels = ElementTree.SubElement(view, "TimeSeriesLabels", name=self.asked.level, toName="series")
+        for option in order:
+            ElementTree.SubElement(labels, "Label", value=self.asked.names[option], background=option_colour(option))
+        shown = ElementTree.SubElement(
+            view, "TimeSeries", name="series", valueType="json", value="$series", timeColumn="step"
+        )
+        for column in series[1:]:
+            ElementTree.SubElement(shown, "Channel", column=column)
+        ElementTree.indent(view)
+        return ElementTree.tostring(view, "unicode") + "\n"
+
+
+# --- Rerun ------------------------------------------------------------------------------------------------------------
+
+
+class Rerun(Writer):
+    """A folder with ``<demonstration>.rrd``, over the timeline ``step``, and ``time`` where the frequency is known.
+
+    ``segments/<level>`` has a ``StateChange`` at the first step of each segment, a lane of the state timeline. Beside
+    it are the posterior probability of the active option, the controls, and the observations.
+    """
+
+    def check(self) -> None:
+        try:
+            import rerun
+        except ImportError:
+            rerun = None
+        if not hasattr(rerun, "StateChange"):
+            raise BadInput(f"{self.option} needs rerun-sdk 0.41; install it with: pip install 'ddco-pyro[rerun]'")
+
+    def write(self, segmented: Segmented) -> str:
+        with whole_folder(self.out) as folder:
+            for demo in segmented.segments:
+                self._write(str(folder / f"{demo.name}.rrd"), demo, segmented.frequency)
+        first = self.asked.source.recording(segmented.segments[0].name)
+        keys = [f"obs/{key}" for key in first.observations if key not in first.numbers]
+        without = f", without {', '.join(keys)} (no numbers)" if keys else ""
+        return f"{self.out}: {len(segmented)} recordings{without}; look at them with: rerun {self.out}/*.rrd"
+
+    def _write(self, path: str, demo: Segments, frequency: float | None) -> None:
+        import rerun
+        from rerun import blueprint
+
+        recording, steps = self.asked.source.recording(demo.name), np.arange(len(demo))
+        stream = rerun.RecordingStream("ddco-pyro", recording_id=demo.name)
+        lanes = blueprint.StateTimelineView(origin="segments", name="segments")
+        stream.save(path, default_blueprint=blueprint.Blueprint(blueprint.Vertical(lanes, blueprint.TimeSeriesView())))
+
+        def log(entity: str, at: np.ndarray, columns: Any) -> None:
+            times = [rerun.TimeColumn("step", sequence=at)]
+            if frequency:
+                times.append(rerun.TimeColumn("time", duration=at / frequency))
+            stream.send_columns(entity, times, columns)
+
+        for name, level in demo.levels.items():
+            runs = level.runs(anew=False)
+            states = [name_in_level(option, name, self.asked.fit.names[name]) for option, _, _ in runs]
+            starts = np.array([start for _, start, _ in runs])
+            log(f"segments/{_entity(name)}", starts, rerun.StateChange.columns(state=states))
+            log(f"probability/{_entity(name)}", steps, rerun.Scalars.columns(scalars=level.probability))
+        for key, column in {**recording.numbers, "control": recording.actions}.items():
+            if column.image:
+                pictures = [
+                    rerun.Image(picture).compress(jpeg_quality=90) for block in column.blocks() for picture in block
+                ]
+                for step, picture in enumerate(pictures):
+                    stream.set_time("step", sequence=step)
+                    stream.log(_entity(key), picture)
+            else:
+                values = column.array().reshape(len(demo), -1).astype(float)
+                log(_entity(key), steps, rerun.Scalars.columns(scalars=values))
+        stream.disconnect()
+
+
+def _entity(name: str) -> str:
+    """A name as part of a path of entities."""
+    return re.sub(r"[^\w/-]", "_", name)
