@@ -203,6 +203,8 @@ def test_a_run_goes_on_where_it_was_begun(demos: Demonstrations, tmp_path, monke
 def test_restarts_that_were_stopped_elsewhere_keep_nothing_from_being_finished(demos, tmp_path, monkeypatch) -> None:
     """Nothing is left to train; what is far behind is not, wherever that is."""
     spec = spec_of(DROPPING, starts=["random"] * 3)
+    monkeypatch.setattr("ddco_pyro.training.restarts.BY_GRADIENT", 1)
+    monkeypatch.setattr("ddco_pyro.training.restarts.BEHIND", 0.0)
     on(monkeypatch, THERE)
     with Device():
         there = ddco_pyro.fit(spec, demos, tmp_path)
