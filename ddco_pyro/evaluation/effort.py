@@ -60,8 +60,8 @@ def spent(training: Training) -> str:
 
 
 def restarts(training: Training) -> str:
-    """The best of several restarts, their starts, the ones stopped early or diverged, their effort and how their
-    segments agree with the best one's; empty for a single restart.
+    """Which of several restarts was kept: their starts and objectives, the ones stopped early or diverged, their
+    effort, and how their segments agree with those that were kept; empty for a single restart.
     """
     told = training.restarts
     if len(told.each) == 1:
@@ -70,16 +70,16 @@ def restarts(training: Training) -> str:
     early = ", ".join(f"{number} after {epochs}" for number, epochs in stopped.items()) or "none"
     ended = ", ".join(str(number) for number, restart in enumerate(told.each) if restart.diverged)
     early += f"; diverged: {ended}" if ended else ""
-    starts = [restart.start for restart in told.each]
-    every = ", ".join(f"{number} from {start}" for number, start in enumerate(starts))
-    if len(set(starts)) == 1:
-        every = f"0 to {len(starts) - 1} from {starts[0]}"
+    every = ", ".join(
+        f"{n} from {one.start}{'' if one.objective is None else f': {number(one.objective)}'}"
+        for n, one in enumerate(told.each)
+    )
     alike = ", ".join(f"{number(one.nmi)} of {n}" for n, one in enumerate(told.each) if one.nmi is not None)
     return (
-        f"restart {told.best} was the likeliest of {len(starts)} ({every}; stopped early, "
-        f"with their epochs of the last stage: {early}), which took {told.spent.epochs} epochs "
-        f"({told.spent.gradient_steps} gradient steps) together"
-        + (f"; NMI of its segments of the training demonstrations with those of the others: {alike}" if alike else "")
+        f"restart {told.best} of {len(told.each)} was kept. Objectives in nats per step: {every}. Stopped early, with "
+        f"their epochs of the last stage: {early}. Together they took {told.spent.epochs} epochs "
+        f"({told.spent.gradient_steps} gradient steps)"
+        + (f". NMI of its segments of the training demonstrations with those of the others: {alike}" if alike else "")
     )
 
 
