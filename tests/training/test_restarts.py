@@ -205,7 +205,7 @@ def test_the_objective_has_the_ridges_log_prior(demos, tmp_path):
     model, batch = trainer.run(), trainer.data.train
     (level,) = model.option_levels()
     squares = {
-        name: float(network.layers[-1].weight.double().square().sum())
+        name: float(network.layers[-1].weight.detach().double().square().sum())
         for name, network in (
             ("policy", level.policy.network),
             ("termination", level.termination),
@@ -213,7 +213,7 @@ def test_the_objective_has_the_ridges_log_prior(demos, tmp_path):
         )
     }
     biases = 1e-6 * sum(
-        float(network.layers[-1].bias.double().square().sum())
+        float(network.layers[-1].bias.detach().double().square().sum())
         for network in (level.policy.network, level.termination, model.meta_policy.network)
     )
     value = float(log_likelihood(model.tabulate(batch), batch.lengths).sum())
@@ -242,10 +242,9 @@ def test_segments_of_restarts_are_compared_with_the_best(demos, tmp_path):
     assert stages == [["joint"], ["parts-1", "joint"], ["vq-1", "mixture", "joint"], ["joint"]]
     each = trainer.summary["restarts"]["each"]
     said = effort.restarts(Training.model_validate(trainer.summary))
-    objectives = [f"{n} from {start}: {words.number(one['objective'])}" for n, (start, one) in
-                  enumerate(zip(starts, trainer.summary["restarts"]["each"], strict=True)) if one["objective"]]  # fmt: skip
-    assert objectives
-    assert all(one in said for one in objectives)
+    going = [(n, one) for n, one in enumerate(each) if one["objective"] is not None]
+    assert going
+    assert all(f"{n} from {starts[n]}: {words.number(one['objective'])}" in said for n, one in going)
     best, batch = trainer.summary["restarts"]["best"], trainer.data.train
     for number, one in enumerate(each):
         models = [trainer.data.hierarchy(n, trainer.restarts[n].states["best"]) for n in (best, number)]
