@@ -29,7 +29,7 @@ from scipy import stats
 import ddco_pyro
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.simulation.episodes import play, run_episode
+from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.spec import parse_spec
 from ddco_pyro.statistics import paired_difference, rate
 
@@ -73,14 +73,11 @@ def fitted(name, observed):
     """The fit, and the outcomes of its options and of the mixture from the same starts."""
     spec = parse_spec(yaml.safe_load(SPEC.format(task=name, observed=observed)))
     fit = ddco_pyro.fit(spec, demonstrations(name))
-    starts = range(spec.rollout.seed, spec.rollout.seed + spec.rollout.episodes)
-    played = [
-        [
-            episode.outcome
-            for episode in play(getattr(memory_tasks, name), Controller.from_spec(hierarchy, spec.rollout), starts)
-        ]
-        for hierarchy in (fit.hierarchy, fit.baselines["mixture"].hierarchy)
-    ]
+    starts, task = range(spec.rollout.seed, spec.rollout.seed + spec.rollout.episodes), getattr(memory_tasks, name)
+    played = []
+    for hierarchy in (fit.hierarchy, fit.baselines["mixture"].hierarchy):
+        controller = Controller.from_spec(hierarchy, spec.rollout)
+        played.append([run_episode(task, controller, seed).outcome for seed in starts])
     return fit, *played
 
 

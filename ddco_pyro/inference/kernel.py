@@ -403,3 +403,14 @@ def trace(
                     semiring, total, m, n, lengths[n], steps, rows, messages, spread, uniforms, joint, ended, callers,
                     actors, above,
                 )  # fmt: skip
+
+
+@entry
+def products(x: Array, pairs: Array) -> None:
+    """The products of each two columns of x [B, F] into the rows of ``pairs``: the lower triangle, row by row."""
+    for t in range(len(x)):
+        place = 0
+        for i in range(x.shape[1]):
+            for j in range(i + 1):
+                pairs[t, place + j] = x[t, i] * x[t, j]
+            place += i + 1

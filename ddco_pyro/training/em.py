@@ -21,12 +21,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
+from ddco_pyro.inference.kernel import products
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.emissions import Emission, Information
 from ddco_pyro.model.hierarchy import Caller, Hierarchy
@@ -92,17 +92,6 @@ class Features:
         whole = found.new_empty(weights.shape[1], features, features)
         whole[:, *lower] = whole[:, *lower.flip(0)] = found
         return whole
-
-
-@numba.njit(error_model="numpy", nogil=True, cache=True)
-def products(x: np.ndarray, pairs: np.ndarray) -> None:  # pragma: no cover - compiled
-    """The products of each two features of x [B, F] into the rows of ``pairs``: the lower triangle, row by row."""
-    for t in range(len(x)):
-        place = 0
-        for i in range(x.shape[1]):
-            for j in range(i + 1):
-                pairs[t, place + j] = x[t, i] * x[t, j]
-            place += i + 1
 
 
 @dataclass

@@ -15,11 +15,9 @@ import pytest
 import toy_task
 
 import ddco_pyro
-from ddco_pyro.data.tensors import read_tensors, write_tensors
-from ddco_pyro.events import EpisodeEnded
 from ddco_pyro.fitting.rollouts import policies, roll_out
 from ddco_pyro.fitting.run import RunError
-from ddco_pyro.simulation.episodes import run_episode, run_episodes
+from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.spec import with_overrides
 
 METHODS = ["open_loop", "supervisor", "flat", "per_timestep", "ddco"]
@@ -171,51 +169,3 @@ def test_other_methods_are_rolled_out(copied):
     results = roll_out(changed(copied, **{"rollout.policies": ["supervisor"]}), 2, 0, told.append, jobs=1, resume=True)
     assert Counter(event.method for event in told) == dict.fromkeys(METHODS[1:], 2)
     assert (list(results.methods), results.episodes) == (METHODS[1:], 2)
-
-
-@pytest.fixture(scope="module")
-def cut(toy_run, tmp_path_factory):
-    """The folder of rollouts that were interrupted in the third method."""
-    folder = shutil.copytree(toy_run.folder, tmp_path_factory.mktemp("cut") / "run")
-    told = []
-
-    def on_event(event):
-        told.append(event)
-        if len(told) == 2 * EPISODES + 3:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        roll_out(ddco_pyro.load(folder), EPISODES, 2, on_event, jobs=1)
-    return folder
-
-
-@pytest.fixture
-def fresh(cut, tmp_path):
-    return ddco_pyro.load(shutil.copytree(cut, tmp_path / "fresh"))
-
-
-def test_what_was_interrupted_goes_on_with_the_next_method(rolled, fresh, monkeypatch):
-    run, results, *_ = rolled
-    assert fresh.metrics.rollouts is None
-    seen, told = [], []
-
-    def counted(task, policy, *rest):
-        seen.append(policy)
-        return run_episodes(task, policy, *rest)
-
-    monkeypatch.setattr("ddco_pyro.fitting.rollouts.run_episodes", counted)
-    assert roll_out(fresh, EPISODES, 2, told.append, jobs=1) == results
-    assert len(seen) == len(METHODS) - 2
-    assert told == [EpisodeEnded(name, len(METHODS) * EPISODES) for name in METHODS for _ in range(EPISODES)]
-    assert (fresh.folder / "rollouts.csv").read_bytes() == (run.folder / "rollouts.csv").read_bytes()
-    assert {path.name for path in fresh.folder.iterdir()} == {path.name for path in run.folder.iterdir()}
-
-
-@pytest.mark.parametrize("change", ["model", "baseline", "seeds", "films"])
-def test_what_was_interrupted_is_not_mixed_with_anything_else(fresh, change):
-    if change in ("model", "baseline"):
-        path = fresh.folder / {"model": ".", "baseline": "baselines/flat"}[change] / "model.safetensors"
-        tensors, metadata = read_tensors(path)
-        write_tensors(path, {key: value + 0.5 * value.is_floating_point() for key, value in tensors.items()}, metadata)
-    episodes, film = EPISODES - (change == "seeds"), 3 if change == "films" else 0
-    assert begun(ddco_pyro.load(fresh.folder), episodes, film) == [METHODS[0]]

@@ -120,4 +120,4 @@ def test_a_likelihood_that_is_none_is_not_reported(tmp_path: Path) -> None:
     with torch.no_grad():
         next(found.hierarchy.levels[0].policy.parameters())[:] = torch.inf
     with pytest.raises(NotFinite, match=r"run: the log-likelihood of demo_0 under the fitted model is (nan|-inf); "):
-        evaluate(found, {"train": demos}, demos)
+        evaluate(found, {"train": demos}, demos, training={})
