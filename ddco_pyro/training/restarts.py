@@ -6,7 +6,8 @@ others train until patience or budget end them. The objective that decides is of
 log-likelihood (``control.power``) with the log-prior of the ridges. A restart whose log-likelihood becomes NaN or
 infinite ends there and ranks last. Neither the number of processes nor an interruption changes the result.
 
-A hierarchy contains its memoryless mixture (ψ = 1), and should be no less likely in training (:meth:`Trainer.contain`).
+A hierarchy contains its memoryless mixture (ψ = 1), and EM ends with one that is no less likely in training
+(:meth:`Trainer.contain`).
 """
 
 from __future__ import annotations
@@ -205,15 +206,16 @@ class Trainer:
     def contain(self, mixture: Hierarchy, objective: float) -> Hierarchy:
         """Keep no model that is less likely in training than a mixture which the hierarchy contains.
 
-        Where no restart is as likely, further ones go on from the mixture: first with options that last, then with ψ
-        nearly 1, where they are as likely as the mixture from the first step on.
+        Where no restart is as likely, EM goes on from the mixture: first with options that last, then with ψ nearly 1,
+        where they are as likely as the mixture from the first step on. Gradient steps do not go on, since they would
+        take more than the mixture's budget.
 
         :param mixture: networks of the same spec, whose options end after every step.
         :param objective: of the mixture, nats per step of the same demonstrations.
         :returns: the best restart's hierarchy.
         """
         self._least = max(self._least, objective - ROUNDING)
-        for logit in (SELDOM, ALMOST_ALWAYS):
+        for logit in () if self._by_gradient else (SELDOM, ALMOST_ALWAYS):
             if self.objective >= self._least:
                 break
             self._go_on(mixture, logit)
