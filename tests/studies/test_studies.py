@@ -35,7 +35,7 @@ from studies.declaration import Study
 from studies.page import report
 from studies.statistics import read_tidy
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 SPEC = {
     "demonstrations": {"path": "unused.hdf5", "labels": "phase"},
     "observations": ["place"],

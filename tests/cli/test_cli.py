@@ -32,7 +32,7 @@ from ddco_pyro.events import DemonstrationsDone, EpochEnded, TrainingBegan, Trai
 from ddco_pyro.names import method
 from ddco_pyro.spec import dump_spec, load_spec
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
