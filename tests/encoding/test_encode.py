@@ -174,17 +174,12 @@ OWN = "user_encoders:"
     ("options", "message"),
     [
         (["--observation", "camra"], "there is no observation 'camra' (did you mean 'camera'?); pictures are: camera"),
-        (["--observation", "place"], "obs/place is float64 [8, 2]; pictures are uint8 [steps, height, width"),
         (["--size", "129"], "--size 129: encoder 'user_encoders:means' gives 4 features; take at most as many"),
         (["--size", "60", "--encoder", PLACES], "--size 60: there are 35 training pictures; take at most as many"),
         (["--as", "place"], "obs/place is there already; choose another name with --as"),
         (["--encoder", "resnet18"], "there is no encoder 'resnet18'; take timm:NAME, such as timm:resnet18.a1_in1k"),
-        (["--encoder", f"{OWN}nothing"], "cannot be loaded: module 'user_encoders' has no attribute"),
         (["--encoder", "no_such_module:encoder"], "cannot be loaded: No module named 'no_such_module'"),
-        (["--encoder", f"{OWN}not_callable"], "cannot be called; it has to be a function of pictures"),
         (["--encoder", f"{OWN}raises"], "fails on pictures [8, 20, 20, 2]: expected 224 x 224 pixels"),
-        (["--encoder", f"{OWN}integers"], "gives int64; it has to give floats"),
-        (["--encoder", f"{OWN}flat"], "gives shape (8,) for 8 pictures; it has to be (8, features)"),
         (["--encoder", f"{OWN}not_finite"], "gives features that are NaN or infinite"),
         (["--encoder", f"{OWN}noisy"], "gives other features when it is called again"),
         (["--encoder", f"{OWN}together"], "gives other features of a picture among others than alone"),
@@ -208,12 +203,6 @@ def test_features_that_only_later_pictures_spoil(tmp_path, out):
     with pytest.raises(BadInput, match="gives features that are NaN or infinite in float32"):
         encoded(tmp_path / "bright.hdf5", out, f"{OWN}later_not_finite")
     assert not out.exists()
-
-
-def test_features_that_do_not_fit_into_memory(few_dots, out, monkeypatch):
-    monkeypatch.setenv("DDCO_PYRO_MEMORY", "1kB")
-    ended = call("encode", few_dots, "--observation", "camera", "--encoder", MEANS, "--allow-code", "--out", out)
-    refused(ended, out, "take an encoder that gives fewer, or allow more with DDCO_PYRO_MEMORY")
 
 
 def test_user_code_needs_permission(few_dots, out):

@@ -111,7 +111,6 @@ RECORDED = {"counts": [10], "held_out": 5, "test": {"first": 0, "count": 20}}
             "starts.test: 39 to 58 overlaps demonstrations.test (0 to 39)",
         ),
         ({"demonstrations": {**RECORDED, "test": {"count": 14}}}, "must be at least 15"),
-        ({"measures": ["nat"]}, "there is no measure 'nat' (did you mean 'nats'?)"),
         ({"contrasts": [{"contrast": "options - flat", "measure": "nats"}]}, "must be one of 4, 6"),
         ({"contrasts": [{"contrast": "options - flat", "measure": "ari", "demonstrations": 6}]}, "not among measures"),
         ({"failed": {"success": 0.0}}, "failed.success: 'success' is not among measures"),
@@ -125,10 +124,7 @@ RECORDED = {"counts": [10], "held_out": 5, "test": {"first": 0, "count": 20}}
             {**TUNED, "methods": {"options": {"grid": {"control.std": [0.1, 0.2]}}, "flat": {"baseline": "flat"}}},
             "unequal numbers of points to choose from (options 2, flat 1)",
         ),
-        (
-            {**TUNED, "methods": {"options": {"grid": {"control.std": [0.1, 0.1]}}, "flat": {"baseline": "flat"}}},
-            "methods: have nothing to choose from; give each a grid",
-        ),
+        ("methods: have nothing to choose from; give each a grid",),
         (
             {"methods": {"options": {"overrides": {"control.std": 0.2}, "grid": {"control.std": [0.1]}}}},
             "methods.options.overrides: has 'control.std', which the grid has, too",
@@ -137,7 +133,6 @@ RECORDED = {"counts": [10], "held_out": 5, "test": {"first": 0, "count": 20}}
             {"methods": {"options": {"grid": {"control.std": [0.1, 0.2]}}}, "contrasts": []},
             "choose: missing; name the measure that chooses among the points",
         ),
-        ({"overrides": {"control.stdd": 0.1}}, "options: control.stdd: unknown key; did you mean control.std?"),
     ],
 )
 def test_a_declaration_that_cannot_be_meant_is_refused_in_words(made, changes, said):
@@ -369,16 +364,6 @@ def test_a_cell_that_another_process_works_on_is_left_to_it(made):
         state = folder.run(HERE)
     assert state.missing == [first]
     assert folder.kept(second)
-
-
-def test_a_failed_cell_says_why_and_is_tried_again(made, monkeypatch):
-    folder = made(demonstrations={**STUDY["demonstrations"], "counts": [6]}, seeds={"test": {"count": 1}})
-    monkeypatch.setattr(cells, "fit", lambda *_, **__: 1 / 0)
-    failed = folder.run(HERE).failed.values()
-    assert {one.failed for one in failed} == {"unexpected ZeroDivisionError: division by zero"}
-    monkeypatch.undo()
-    state = folder.run(HERE)
-    assert (len(state.done), len(state.failed)) == (2, 0)
 
 
 SMALL = {"demonstrations": {**STUDY["demonstrations"], "counts": [6]}, "seeds": {"test": {"count": 2}}}
