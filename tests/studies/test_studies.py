@@ -111,6 +111,7 @@ RECORDED = {"counts": [10], "held_out": 5, "test": {"first": 0, "count": 20}}
             "starts.test: 39 to 58 overlaps demonstrations.test (0 to 39)",
         ),
         ({"demonstrations": {**RECORDED, "test": {"count": 14}}}, "must be at least 15"),
+        ({"measures": ["nat"]}, "there is no measure 'nat' (did you mean 'nats'?)"),
         ({"contrasts": [{"contrast": "options - flat", "measure": "nats"}]}, "must be one of 4, 6"),
         ({"contrasts": [{"contrast": "options - flat", "measure": "ari", "demonstrations": 6}]}, "not among measures"),
         ({"failed": {"success": 0.0}}, "failed.success: 'success' is not among measures"),
@@ -124,7 +125,10 @@ RECORDED = {"counts": [10], "held_out": 5, "test": {"first": 0, "count": 20}}
             {**TUNED, "methods": {"options": {"grid": {"control.std": [0.1, 0.2]}}, "flat": {"baseline": "flat"}}},
             "unequal numbers of points to choose from (options 2, flat 1)",
         ),
-        ("methods: have nothing to choose from; give each a grid",),
+        (
+            {**TUNED, "methods": {"options": {"grid": {"control.std": [0.1, 0.1]}}, "flat": {"baseline": "flat"}}},
+            "methods: have nothing to choose from; give each a grid",
+        ),
         (
             {"methods": {"options": {"overrides": {"control.std": 0.2}, "grid": {"control.std": [0.1]}}}},
             "methods.options.overrides: has 'control.std', which the grid has, too",
@@ -133,6 +137,7 @@ RECORDED = {"counts": [10], "held_out": 5, "test": {"first": 0, "count": 20}}
             {"methods": {"options": {"grid": {"control.std": [0.1, 0.2]}}}, "contrasts": []},
             "choose: missing; name the measure that chooses among the points",
         ),
+        ({"overrides": {"control.stdd": 0.1}}, "options: control.stdd: unknown key; did you mean control.std?"),
     ],
 )
 def test_a_declaration_that_cannot_be_meant_is_refused_in_words(made, changes, said):
