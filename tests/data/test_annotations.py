@@ -243,9 +243,6 @@ REACH = ("demo_1", "reach", 0.1, 0.4)
          "start=COLUMN,stop=COLUMN"),
         (plain(REACH), {"columns": {"label": "skil"}}, "has no column 'skil'; there is: demonstration, label, start_s"),
         (plain(REACH, start="start", stop="stop"), {}, "does not say the unit of its times; add --unit seconds, mill"),
-        (plain(REACH, start="start ms", stop="stop s"), {"columns": {"start": "start ms", "stop": "stop s"}},
-         "does not say the unit of its times"),
-        (plain(REACH), {"columns": {**COLUMNS["columns"], "label": "demonstration"}}, None),
         (exported(("demo_1", REGIONS)), {}, "does not say the unit of its times"),
         (exported(("demo_1", REGIONS), tag="a/b"), {"unit": "steps"}, "'a/b' cannot be a name of labels"),
         (exported(("demo_1", [series("reach", 0, 3), series("grasp", 2, 5)])), {"unit": "steps"},
@@ -258,9 +255,6 @@ REACH = ("demo_1", "reach", 0.1, 0.4)
 )  # fmt: skip
 def test_what_does_not_fit_is_refused_in_one_line(tmp_path, text, more, said):
     (tmp_path / "a.csv").write_text(text)
-    if said is None:
-        assert labels(Held({"demo_1": 12}), tmp_path / "a.csv", **more)[0] == {"demonstration": ["demo_1"]}
-        return
     with pytest.raises(BadInput) as refused:
         Labelled(Held({"demo_1": 12}), LabelTable(tmp_path / "a.csv", **more))
     assert said in str(refused.value)

@@ -16,7 +16,6 @@ from odd_files.kinds import NUMBER, ROWS, arrays
 
 import ddco_pyro
 from ddco_pyro.data.checks import reading
-from ddco_pyro.data.controls import number
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
 from ddco_pyro.data.importing import import_demonstrations
 from ddco_pyro.data.inspection import inspect
@@ -106,23 +105,6 @@ def test_what_is_written_again_has_labels_and_the_type_of_its_controls(tmp_path:
     (tmp_path / "whole").mkdir()
     Demonstrations.read(ROWS["integers [T]"].make(tmp_path / "whole")).write(tmp_path / "again.hdf5")
     assert inspect(tmp_path / "again.hdf5").fields["actions"].dtype == "int64"
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [
-        (-0.9999999, "-0.9999999"),
-        (float(np.float32(0.1)), "0.1"),
-        (0.1, "0.1"),
-        (-0.0, "0"),
-        (123456789.0, "123456789"),
-        (1.0000001e30, "1.0000001e+30"),
-        (1e300, "1e+300"),
-        (float("nan"), "nan"),
-    ],
-)
-def test_a_value_is_printed_as_it_is(value: float, text: str) -> None:
-    assert number(value) == text
 
 
 # --- what networks read -----------------------------------------------------------------------------------------------

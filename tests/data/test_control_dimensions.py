@@ -180,16 +180,6 @@ def test_what_few_demonstrations_make_decides_no_kind(others: Any, spoil: Any, s
     }
 
 
-def test_another_value_is_modelled_beside_the_one_that_a_dead_demonstration_makes() -> None:
-    random = np.random.default_rng(0)
-    made = {f"demo_{n}": free(random) for n in range(20)}
-    for demo in made.values():
-        demo[::12] = 0.25
-    made["demo_7"] = np.zeros((400, 2))
-    (part,) = control_parts(ControlSpec(), control_dimensions(made))
-    assert (part.kind, part.exact) == ("hurdle", (0.25, 0.25))
-
-
 @pytest.mark.parametrize(
     ("others", "odd", "named"),
     [

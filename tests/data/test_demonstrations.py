@@ -109,17 +109,6 @@ def test_a_file_by_somebody_else() -> None:
 # --- as a sequence ----------------------------------------------------------------------------------------------------
 
 
-def test_demonstrations_are_a_sequence() -> None:
-    demos = demonstrations(5)
-    assert len(demos) == 5
-    assert [demo.name for demo in demos] == list(demos.names)
-    assert demos[-1].name == "demo_4"
-    assert [demo.name for demo in demos[1:3]] == ["demo_1", "demo_2"]
-    assert demos.lengths == (3, 4, 5, 6, 3)
-    assert demos.observation_shapes == {"pose": (3,), "camera": (6, 5, 3)}
-    assert demos.control_size == 2
-
-
 def test_select() -> None:
     demos = demonstrations(5, {"valid": ("demo_0",)})
     chosen = demos.select(["demo_3", "demo_1"])
@@ -143,11 +132,6 @@ def test_a_split_is_a_partition(number: int, fraction: float, seed: int) -> None
     assert len(train) + len(valid) == number
     again = demos.split(fraction, seed)
     assert (again[0].names, again[1].names) == (train.names, valid.names)
-
-
-def test_the_seed_decides_a_split() -> None:
-    demos = demonstrations(12)
-    assert len({demos.split(0.3, seed)[1].names for seed in range(8)}) > 1
 
 
 @pytest.mark.parametrize(

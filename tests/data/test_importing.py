@@ -5,7 +5,6 @@ How ``fixtures/`` was made: ``fixtures/write_robomimic.py`` and ``fixtures/write
 
 from __future__ import annotations
 
-import gc
 import json
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,6 @@ from random_demonstrations import demonstrations
 from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
 from ddco_pyro.data.importing import Choice, import_demonstrations
 from ddco_pyro.data.inspection import inspect
-from ddco_pyro.data.sources.video import _frames
 from ddco_pyro.errors import BadInput
 
 ROBOMIMIC, LEROBOT = Path(__file__).parents[1] / "fixtures" / "robomimic.hdf5", odd.FIXTURE
@@ -122,17 +120,6 @@ def test_lerobots_videos_frame_by_frame(out: Path) -> None:
         np.testing.assert_allclose(brightness, 40 * episode + 5 * np.arange(len(demo)), atol=1.5)
 
 
-@no_file_is_left_open
-def test_a_video_need_not_be_read_to_its_end() -> None:
-    video = LEROBOT / odd.VIDEO
-    frames = _frames(video, "demo_0", 0.0, 20, 10.0, (16, 32))
-    assert next(frames).shape == (16, 32, 3)
-    frames.close()
-    with pytest.raises(DemonstrationsError, match="has 26 frames from second 0 on, and 99 are needed"):
-        list(_frames(video, "demo_0", 0.0, 99, 10.0, (16, 32)))
-    gc.collect()
-
-
 DROID = [
     *(odd.column(f"observation.state.{name}") for name in ("gripper_position", "joint.0")),
     *(odd.column(f"action.{name}") for name in ("gripper_position", "joint_position")),
@@ -172,26 +159,6 @@ BROKEN = odd.values("observation.state", lambda row, value: None if row % 5 else
 def test_what_is_not_chosen_is_not_read(change: odd.Change, tmp_path: Path, out: Path) -> None:
     import_demonstrations(odd.changed(change)(tmp_path), out, choice=Choice(("observation.images.wrist",)))
     assert set(Demonstrations.read(out).observation_shapes) == {"images/wrist"}
-
-
-@pytest.mark.parametrize(
-    ("changes", "arguments", "message"),
-    [
-        (DROID, ["--observation", "state.griper_position"], "(did you mean 'state.gripper_position'?); there is: obs"),
-        (DROID, ["--observation", "images/top", "--action", "action.jaw"], "there is no feature 'action.jaw'"),
-        ([BROKEN], [], "demo_0: observation.state is null in row 1; repair it"),
-        ([odd.WITHOUT_VIDEOS], ["--videos"], "demo_0: its metadata has no videos/observation.images.top/chunk_index"),
-    ],
-)
-def test_to_skip_is_no_advice_where_nothing_is_left(
-    changes: list[odd.Change], arguments: list[str], message: str, tmp_path: Path, out: Path
-) -> None:
-    dataset = odd.changed(*changes)(tmp_path)
-    for more in ([], ["--skip-broken"]):
-        ended = call("import", dataset, "--out", out, *arguments, *more)
-        assert (ended.status, ended.out) == (2, "")
-        assert message in ended.err
-        assert "--skip-broken" not in ended.err
 
 
 def test_episodes_without_all_of_their_video_are_left_out(tmp_path: Path, out: Path) -> None:
@@ -496,7 +463,6 @@ def test_broken_demonstrations_are_refused_or_left_out(tmp_path: Path, out: Path
         (["--mask", "bettr"], "there is no mask 'bettr' (did you mean 'better'?); there is: better, train, valid"),
         (["--observation", "objct"], "demo_0: there is no observation 'objct' (did you mean 'object'?); there is: "),
         (["--format", "lerobot"], "info.json: cannot be read, or is damaged"),
-        (["--format", "minari"], "cannot be read, or is damaged"),
         (["--format", "roboimic"], "there is no format 'roboimic' (did you mean 'robomimic'?); there is: lerobot, "),
         (["--action", "actions"], "has the format robomimic, with one control; --action is for the folder of a Le"),
         (["--image-size", "3"], "Invalid value for '--image-size'"),

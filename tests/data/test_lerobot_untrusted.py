@@ -15,7 +15,6 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.hdf5 import DemonstrationsError
 from ddco_pyro.data.importing import Choice, import_demonstrations
 from ddco_pyro.data.inspection import inspect
-from ddco_pyro.data.sources.metadata import stored_keys
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.spec import parse_spec
 
@@ -93,24 +92,6 @@ def test_an_episode_that_is_not_whole_is_named_and_can_be_skipped(name: str, tmp
     assert len(Demonstrations.read(out)) == 3
 
 
-def test_missing_files_and_episodes_are_skipped_by_name(tmp_path: Path) -> None:
-    for name, left in {
-        "lerobot missing file": ("demo_0", "demo_1"),
-        "lerobot episode twice": ("demo_0", "demo_1", "demo_3"),
-        "lerobot episodes missing": ("demo_0", "demo_1", "demo_2"),
-    }.items():
-        (folder := tmp_path / name).mkdir()
-        dataset, out = odd.ROWS[name].make(folder), folder / "demos.hdf5"
-        refused(call("import", dataset, "--out", out), odd.ROWS[name].says)
-        assert import_demonstrations(dataset, out, choice=Choice(skip_broken=True)).names == left
-
-
-def test_odd_but_harmless_metadata(tmp_path: Path) -> None:
-    dataset = odd.changed(odd.info(splits=[1], fps=float("inf")))(tmp_path)
-    assert inspect(dataset).frequency is None
-    assert not inspect(dataset).problems
-
-
 @pytest.mark.parametrize(
     ("times", "message"),
     [
@@ -144,26 +125,3 @@ def test_data_need_not_lie_under_data(tmp_path: Path, run: Path) -> None:
     columns = odd.parquet.read_table(out / "steps" / "2-000.parquet").column_names
     assert "language_persistent" in columns
     assert "language_persistent" in json.loads((out / "meta" / "info.json").read_text())["features"]
-
-
-@pytest.mark.parametrize(
-    ("names", "keys"),
-    [
-        (["a.b", "a.c", "ab", "a..b"], ["a/b", "a/c", "ab", "a..b"]),
-        (["state", "state.x", "state.x.y", "s.x"], ["state", "state.x", "state.x.y", "s/x"]),
-        (["a.b", "a.b.c", "a.b.c.d"], ["a/b", "a.b.c", "a.b.c.d"]),
-        (["images.top", "images/top"], ["images.top", "images/top"]),
-        (["state", "state/x", "state.x"], ["state", "state_x", "state.x"]),
-    ],
-)
-def test_keys_of_observations(names: list[str], keys: list[str]) -> None:
-    """Whatever the order of the names, each has the same key, and HDF5 stores them together."""
-    for order in (names, names[::-1]):
-        found = stored_keys(Path("d"), order, [name.replace(".", "/") for name in order])
-        assert dict(zip(order, found, strict=True)) == dict(zip(names, keys, strict=True))
-
-
-@pytest.mark.parametrize("names", [["."], ["\ud800"], ["a", "a"], [2000 * "x"], ["a\0"], [""]])
-def test_keys_that_cannot_be_stored(names: list[str]) -> None:
-    with pytest.raises(DemonstrationsError):
-        stored_keys(Path("d"), names, names)

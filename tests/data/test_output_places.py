@@ -18,7 +18,6 @@ from odd_files import snapshot
 from random_demonstrations import demonstrations
 
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.data.files import NotWritable, Output, check_outputs
 from ddco_pyro.training.data import demonstrations as of
 
 
@@ -125,18 +124,6 @@ def test_two_outputs_of_one_name_are_refused(inputs: Path, tmp_path: Path, monke
     ended = call("segment", inputs / "run", inputs / "demos.hdf5", "--csv", "new/a", "--elan", "new")
     refused(ended, "--elan new: and --csv new/a lie in one another")
     assert [path.name for path in tmp_path.iterdir()] == ["link"]
-
-
-def test_a_place_that_is_read_only(tmp_path: Path, monkeypatch) -> None:
-    """These tests may be run by root, to whom all is permitted: what the system says is made up."""
-
-    def read_only(**_: object) -> None:
-        raise OSError(30, "Read-only file system")
-
-    monkeypatch.setattr("tempfile.TemporaryFile", read_only)
-    for kind in ("file", "stream", "folder"):
-        with pytest.raises(NotWritable, match="new: cannot be written: Read-only file system; choose another place or"):
-            check_outputs([Output("--out", tmp_path / "new", kind)])
 
 
 # --- what is there already --------------------------------------------------------------------------------------------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 import re
 import shutil
 import subprocess
@@ -13,11 +12,10 @@ import numpy as np
 import pytest
 from command_line import call
 from odd_files import Row
-from odd_files.hdf5 import ROWS, demonstrations, last_not_whole
+from odd_files.hdf5 import ROWS, last_not_whole
 
 from ddco_pyro.data import memory
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.data.files import Damaged
 from ddco_pyro.data.hdf5 import DemonstrationsError
 
 
@@ -58,15 +56,6 @@ def test_nothing_is_written_before_all_headers_are_known(tmp_path: Path) -> None
     assert list(tmp_path.iterdir()) == [tmp_path / "in"]
 
 
-def test_an_array_under_two_names_is_read_twice(tmp_path: Path) -> None:
-    with demonstrations(tmp_path / "demos.hdf5") as file:
-        for group in file["data"].values():
-            group["obs/again"] = group["obs/offsets"]
-    first = Demonstrations.read(tmp_path / "demos.hdf5")[0].observations
-    assert set(first) == {"offsets", "visited", "again"}
-    np.testing.assert_array_equal(first["again"], first["offsets"])
-
-
 def test_a_minari_episode_that_is_not_whole(tmp_path: Path) -> None:
     pytest.importorskip("minari")
     from ddco_pyro.data.sources.minari import Minari
@@ -80,11 +69,6 @@ def test_a_minari_episode_that_is_not_whole(tmp_path: Path) -> None:
         file.create_dataset("episode_1/actions", (9, 2), "f8", chunks=(4, 2))[:4] = 1.0
     with pytest.raises(DemonstrationsError, match=r"episode_1/actions claims 144 bytes, but the file holds 64"):
         Minari(tmp_path, Storage(), ()).recording("demo_1")
-
-
-def test_a_damaged_file_is_said_by_another_process() -> None:
-    error = Damaged(Path("run/metrics.json"), "is no JSON", "remove it")
-    assert str(pickle.loads(pickle.dumps(error))) == str(error) == "run/metrics.json: is damaged: is no JSON; remove it"
 
 
 # --- memory -----------------------------------------------------------------------------------------------------------

@@ -155,17 +155,6 @@ def test_a_write_that_is_cut_off_leaves_what_was_there(tmp_path, error):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_nobody_sees_a_file_before_it_is_whole(tmp_path):
-    path = tmp_path / "deeper" / "file.txt"
-    with whole_file(path) as temporary:
-        temporary.write_text("half")
-        assert not path.exists()
-        temporary.write_text("whole")
-    assert path.read_text() == "whole"
-    assert list(path.parent.iterdir()) == [path]
-    assert path.stat().st_mode & 0o777 == 0o644
-
-
 def contents(folder):
     return {str(path.relative_to(folder)): path.is_file() and path.read_text() for path in folder.rglob("*")}
 
@@ -225,23 +214,6 @@ def test_a_folder_is_there_whole_wherever_its_writer_was_killed(tmp_path, monkey
     assert [one.name for one in tmp_path.iterdir()] == ["folder"]
 
 
-@pytest.mark.parametrize("error", [KeyboardInterrupt, OSError])
-def test_a_folder_comes_back_where_the_new_one_cannot_take_its_place(tmp_path, monkeypatch, error):
-    path, rename, seen = tmp_path / "folder", Path.rename, []
-    write_folder(path, "old")
-
-    def fails(self, target):
-        seen.append(target)
-        if len(seen) == 2:
-            raise error
-        return rename(self, target)
-
-    monkeypatch.setattr(Path, "rename", fails)
-    with pytest.raises(error):
-        write_folder(path, "new")
-    assert contents(tmp_path) == {"folder": False, "folder/deeper": False, "folder/deeper/file": "old"}
-
-
 def test_a_link_stays_and_what_it_leads_to_is_replaced(tmp_path):
     (tmp_path / "there").mkdir()
     link, folder = tmp_path / "link", tmp_path / "folder"
@@ -256,22 +228,6 @@ def test_a_link_stays_and_what_it_leads_to_is_replaced(tmp_path):
     assert (tmp_path / "there" / "file").read_text() == "second"
     assert (tmp_path / "there" / "folder" / "deeper" / "file").read_text() == "new"
     assert {path.name for path in (tmp_path / "there").iterdir()} == {"file", "folder"}
-
-
-def test_what_is_no_file_is_never_replaced(tmp_path):
-    os.mkfifo(tmp_path / "pipe")
-    for place in (Path("/dev/null"), tmp_path / "pipe"):
-        with pytest.raises(NotWritable, match=f"{place}: is no regular file; choose another place"):
-            write_text(place, "x")
-    assert (tmp_path / "pipe").is_fifo()
-
-
-def test_a_folder_that_cannot_be_replaced_is_said(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    message = r"^\.: cannot be written: .*; choose another place or change this one$"
-    with pytest.raises(NotWritable, match=message), whole_folder(Path(".")) as temporary:
-        (temporary / "file").touch()
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_tensors_and_metadata_come_back_bit_for_bit(tmp_path):

@@ -66,13 +66,6 @@ def short_of_the_truth(fit: ddco_pyro.Fit) -> float:
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="of 156 steps, ridges of 1 take 0.2 nats per step")
-def test_what_it_writes_is_as_likely_by_em_as_the_truth(path: Path) -> None:
-    two_skills(path)
-    assert short_of_the_truth(ddco_pyro.fit(load_spec(started(path), ["compare_with=[]"]))) < 0.1
-
-
-@pytest.mark.slow
 def test_what_it_writes_finds_what_was_planted_as_it_is(path: Path, tmp_path: Path) -> None:
     """Segments are the planted ones. By Adam they are as likely, held out and to 0.1 nats per step, as under the policy
     that they were drawn from.
@@ -255,10 +248,7 @@ def test_what_jumps_as_an_angle_or_a_quaternion_is_read_without_its_jumps(path: 
     ("settings", "says"),
     [
         ({"angles": [1, 1]}, "observations.0.angles: name a number twice"),
-        ({"angles": [2], "quaternions": [0]}, "observations.0.angles: name a number twice"),
-        ({"angles": [3]}, "there is no number 3"),
         ({"quaternions": [0]}, "there is no number 3"),
-        ({"angles": [-1]}, "observations.0.angles.0"),
     ],
 )
 def test_angles_that_are_none_are_refused(

@@ -6,7 +6,6 @@ import csv
 import json
 import math
 import shutil
-from collections import Counter
 from dataclasses import replace
 from unittest import mock
 
@@ -87,16 +86,6 @@ def test_the_first_episodes_of_each_method_are_filmed(rolled):
     assert films == {f"{method}-{seed}.mp4" for method in METHODS for seed in (FIRST, FIRST + 1)}
 
 
-@pytest.mark.slow
-def test_rolling_out_again_gives_the_same(rolled, toy_run, tmp_path):
-    run, results, *_ = rolled
-    again = ddco_pyro.load(shutil.copytree(toy_run.folder, tmp_path / "again"))
-    roll_out(again, EPISODES, film=0, jobs=2)
-    assert (again.folder / "rollouts.csv").read_bytes() == (run.folder / "rollouts.csv").read_bytes()
-    assert again.metrics.rollouts == results
-    assert not (again.folder / "videos").exists()
-
-
 def changed(run, **changes):
     return replace(run, spec=with_overrides(run.spec, changes))
 
@@ -162,10 +151,3 @@ def begun(run, episodes, film, **options):
 )
 def test_others_are(copied, changes, episodes, film, resume):
     assert begun(changed(copied, **changes), episodes, film, resume=resume) == [METHODS[0]]
-
-
-def test_other_methods_are_rolled_out(copied):
-    told = []
-    results = roll_out(changed(copied, **{"rollout.policies": ["supervisor"]}), 2, 0, told.append, jobs=1, resume=True)
-    assert Counter(event.method for event in told) == dict.fromkeys(METHODS[1:], 2)
-    assert (list(results.methods), results.episodes) == (METHODS[1:], 2)

@@ -20,7 +20,6 @@ import ddco_pyro
 from ddco_pyro.data.demonstrations import DemonstrationsError
 from ddco_pyro.drawing import words
 from ddco_pyro.evaluation import verdicts
-from ddco_pyro.events import TrainingBegan
 from ddco_pyro.metrics import Rollouts, Seeds
 from ddco_pyro.spec import load_spec, with_overrides
 
@@ -77,14 +76,6 @@ def test_what_is_done_is_not_done_again(written):
     assert ended.status == 0, ended.err
     assert {path: path.stat().st_mtime_ns for path in before} == before
     assert len(before) == 6
-
-
-@pytest.mark.slow
-def test_processes_change_no_number(written, tmp_path):
-    spec, run, _ = written
-    assert call("fit", spec, "--out", tmp_path / "run", "--seeds", 3, "--jobs", 2).status == 0
-    both = [json.loads((folder / "metrics.json").read_text())["seeds"] for folder in (run, tmp_path / "run")]
-    assert both[0] == both[1]
 
 
 def test_the_intervals_are_those_of_scipy():
@@ -227,19 +218,6 @@ def test_a_run_has_the_models_without_one_and_goes_on_with_them(run, tmp_path):
     unchanged = ddco_pyro.fit(run.spec, out=run.folder).metrics
     assert {path: path.stat().st_mtime_ns for path in before} == before
     assert unchanged.model_copy(update={"seconds": {}}) == run.metrics.model_copy(update={"seconds": {}})
-
-
-@pytest.mark.slow
-def test_fits_without_a_demonstration_are_the_same_side_by_side(run, tmp_path, monkeypatch):
-    monkeypatch.setattr("ddco_pyro.fitting.fit.LONG", 0)
-    told = []
-    again = ddco_pyro.fit(few_spec(), planted(), tmp_path / "run", told.append, jobs=2)
-    assert again.metrics.model_copy(update={"seconds": {}}) == run.metrics.model_copy(update={"seconds": {}})
-    for path in run.folder.rglob("*.safetensors"):
-        assert (tmp_path / "run" / path.relative_to(run.folder)).read_bytes() == path.read_bytes(), path
-    began = [event.model for event in told if isinstance(event, TrainingBegan) and " without " in event.model]
-    assert {name for name in began if name.startswith("ddco")} == {f"ddco without demo_{n}" for n in range(4)}
-    assert len(began) == 8
 
 
 def test_what_masks_hold_out_cannot_be_trained_with():

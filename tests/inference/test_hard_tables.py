@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracle import random_tables
 
-from ddco_pyro.inference import fused, log_likelihood, logspace, posterior
+from ddco_pyro.inference import log_likelihood, logspace, posterior
 from ddco_pyro.model.tables import NEVER, Tables, complete
 
 SHAPES = [(1,), (3,), (20,), (1, 1), (2, 2), (4, 1), (2, 1, 2)]
@@ -93,19 +93,3 @@ def test_thousands_of_steps(steps, sharp):
     tables, lengths = random_tables((5,), (True,), steps=steps, seed=8), torch.tensor([steps])
     agree(replace(tables, control=tuple(sharp * c for c in tables.control)), lengths)
     assert torch.allclose(posterior(tables, lengths).u[0].sum(-1), torch.ones(1, dtype=torch.float64))
-
-
-def test_underflow_is_seen_and_mended(monkeypatch):
-    """The past makes option 1 next to impossible, the future allows nothing else: underflow loses the path."""
-    steps = 60
-    control = torch.zeros(1, steps, 2, dtype=torch.float64)
-    control[:, : steps // 2, 0] = -40.0  # e^-1200 in all
-    control[:, steps // 2 :, 1] = -1e4
-    stay = torch.tensor([0.0, NEVER], dtype=torch.float64).expand(1, steps, 2, 2).clone()
-    selection = torch.tensor([NEVER, 0.5, 0.5], dtype=torch.float64).log().nan_to_num(nan=NEVER).expand(1, steps, 1, 3)
-    tables = Tables((selection.clone(),), (stay,), (control, torch.full((1, steps, 1), NEVER, dtype=torch.float64)))
-    repeated = []
-    mend = fused._repeat_in_log_space
-    monkeypatch.setattr(fused, "_repeat_in_log_space", lambda *args: repeated.append(args[1]) or mend(*args))
-    agree(tables, torch.tensor([steps]))
-    assert repeated == [0]

@@ -5,15 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from hierarchies import SHAPES, make_batch, make_hierarchy
+from hierarchies import make_batch, make_hierarchy
 from oracle import brute_force
 from torch.distributions import Normal
 
 from ddco_pyro.inference import log_likelihood
-from ddco_pyro.model.batch import STEPS_AT_ONCE, Batch
-from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.networks import Inputs
-from ddco_pyro.spec import parse_spec
 
 
 @pytest.mark.parametrize("emits", [("options",), ("options", "control")])
@@ -83,41 +81,3 @@ def test_a_learned_deviation_keeps_its_floor_and_is_shared_by_the_level():
 
 
 # --- memory -----------------------------------------------------------------------------------------------------------
-
-
-def test_what_goes_through_together_is_counted_in_bytes(monkeypatch):
-    """Networks of n times the hidden units take about n times the memory, and pieces are smaller in proportion."""
-    narrow, wide = (
-        Hierarchy(
-            parse_spec(
-                {
-                    "demonstrations": {"path": "unused.hdf5"},
-                    "observations": ["state"],
-                    "baseline": {"kind": "flat", "policy": {"network": "mlp", "hidden": [units]}},
-                }
-            ),
-            SHAPES,
-            2,
-            steps=4,
-        )
-        for units in (100, 1000)
-    )
-    assert wide.step_bytes == pytest.approx(10 * narrow.step_bytes, rel=0.05)
-    assert narrow.step_bytes >= 3 * 100 * 4  # what a hidden layer gives, once kept and twice in passing
-    assert narrow.steps_at_once == wide.steps_at_once == STEPS_AT_ONCE
-    monkeypatch.setattr("ddco_pyro.model.hierarchy.BYTES_AT_ONCE", 9 * wide.step_bytes)
-    assert wide.steps_at_once == 9
-    sizes = [len(piece) for _, piece in make_batch(trajectories=5).pieces(wide.steps_at_once)]
-    assert sizes == [2, 2, 1]
-    assert narrow.steps_at_once == pytest.approx(90, abs=5)
-
-
-def test_looking_at_the_memory_leaves_networks_as_they_were():
-    hierarchy = make_hierarchy(counts=(2, 2)).train()
-    before = {name: value.clone() for name, value in hierarchy.state_dict().items()}
-    state = torch.get_rng_state()
-    assert hierarchy.step_bytes > 0
-    assert torch.equal(state, torch.get_rng_state())
-    assert all(module.training for module in hierarchy.modules())
-    assert all(parameter.grad is None for parameter in hierarchy.parameters())
-    assert all(torch.equal(value, before[name]) for name, value in hierarchy.state_dict().items())

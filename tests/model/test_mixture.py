@@ -184,10 +184,6 @@ def test_the_verdict_is_about_options_that_last(memory, error, said):
     assert text.endswith("Options stay active no longer (3 steps) than the mixture keeps to one policy (4 steps).")
 
 
-def test_how_long_a_choice_is_kept():
-    assert mean_run([np.array([1, 1, 2, 2, 2]), np.array([3])]) == 6 / 3
-
-
 def test_a_run_says_what_lasting_is_worth(run):
     """By the likelihoods of what it held out, computed anew."""
     held_out = run.demonstrations.select(row.name for row in run.metrics.valid)

@@ -6,37 +6,14 @@ import pytest
 import torch
 from torch import nn
 
-from ddco_pyro.model.networks import CLASSES, InputShape, build
+from ddco_pyro.model.networks import InputShape, build
 from ddco_pyro.spec import SpecError, network_spec, parse_spec
-from ddco_pyro.spec.networks import SETTINGS
 from ddco_pyro.training.networks import Dimensions, check_models
 
 SHAPE = InputShape({"state": 3}, {}, 5)
 
 
 # --- built-in ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", CLASSES)
-def test_the_settings_of_a_spec_reach_the_network(name):
-    other = {"hidden": [7, 9], "dropout": 0.25, "activation": "elu", "filters": 2, "kernel": 3}
-    given = {key: value for key, value in other.items() if key in SETTINGS[name].model_fields}
-    shape = InputShape({"state": 3}, {"camera": (6, 6, 3)} if name == "conv" else {}, 5)
-    if name == "branches":
-        given["of"] = {"state": network_spec(network="linear")}
-    network = build(network_spec(network=name, **given), shape, 2, 4)
-    if name == "lstm":
-        assert [layer.recurrent.shape for layer in network.memory] == [(4, 7, 28), (4, 9, 36)]
-        return
-    sizes = [layer.weight.shape[1] for layer in network.layers if hasattr(layer, "weight")]
-    read = {"constant": 0, "conv": 3 + 2 * 64}.get(name, 3)
-    assert sizes == [read, *given.get("hidden", [])]
-    assert {layer.p for layer in network.layers if isinstance(layer, nn.Dropout)} == (
-        {0.25} if "dropout" in given else set()
-    )
-    assert sum(isinstance(layer, nn.ELU) for layer in network.layers) == len(given.get("hidden", []))
-    if name == "conv":
-        assert network.convolutions[0][0].weight.shape == (2 * 4, 3, 3, 3)
 
 
 # --- a user's ---------------------------------------------------------------------------------------------------------

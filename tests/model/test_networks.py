@@ -184,13 +184,6 @@ def test_several_convolutions_are_separate_networks(pool):
     assert_close(network(inputs)[0], torch.stack(expected, dim=2))
 
 
-def test_an_image_may_be_called_as_a_layer_is():
-    network = make(InputShape({"state": FEATURES}, {"0": PIXELS}), network="conv", filters=2, hidden=[3])
-    _, arrays = network.numpy_form()
-    shapes = sorted(parameter.shape for parameter in network.parameters())
-    assert sorted(array.shape for array in arrays.values()) == shapes
-
-
 def test_branches_read_each_their_own_and_are_joined():
     shape = InputShape({"pose": 2, "goal": 3, "other": 4}, {"camera": PIXELS})
     pair = {"network": "linear", "inputs": ["goal", "pose"]}

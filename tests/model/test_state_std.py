@@ -15,7 +15,6 @@ from ddco_pyro.inference.engines import compare_engines
 from ddco_pyro.model.controls import INITIAL_STD
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import SpecError
-from ddco_pyro.training.networks import Dimensions, baseline_spec, build_hierarchy, parameters
 
 OF_STATE = {"learn": True, "per_state": True}
 OF_OPTION = {"learn": True, "per_option": True}
@@ -167,17 +166,6 @@ def test_without_skill_options_lead_by_their_sigma_alone():
 
 
 # --- a baseline's own -------------------------------------------------------------------------------------------------
-
-
-def test_flat_equal_counts_the_numbers_for_sigma():
-    compare_with, control = ["flat_equal", {"kind": "flat_equal", "std": OF_STATE}], {"std": OF_OPTION}
-    spec = small_spec(control=control, hierarchy={"levels": [{"count": 3}]}, compare_with=compare_with)
-    size = Dimensions({"state": (2,)}, 2, 25)
-    whole = parameters(build_hierarchy(spec, size))
-    one, of_state = (baseline_spec(spec, baseline, size) for baseline in spec.compare_with)
-    assert of_state.baseline.policy.hidden < one.baseline.policy.hidden
-    for own in (one, of_state):
-        assert parameters(build_hierarchy(own, size)) == pytest.approx(whole, rel=0.02)
 
 
 # --- what is refused --------------------------------------------------------------------------------------------------

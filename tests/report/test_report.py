@@ -15,7 +15,7 @@ from time_lines import embedded, tracks
 from ddco_pyro.cli import console
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.drawing import words
-from ddco_pyro.drawing.shown import movement, position_key
+from ddco_pyro.drawing.shown import position_key
 from ddco_pyro.evaluation import verdicts
 from ddco_pyro.evaluation.options import degeneracies
 from ddco_pyro.fitting.fit import fit
@@ -23,7 +23,6 @@ from ddco_pyro.fitting.fitted import load
 from ddco_pyro.metrics import Metrics
 from ddco_pyro.report import rollouts as rolling
 from ddco_pyro.report import trajectories, write_report
-from ddco_pyro.report.trajectories import activity
 from ddco_pyro.simulation.episodes import Episode, summarize
 from ddco_pyro.simulation.film import write_film
 from ddco_pyro.spec import TrainingSpec, parse_spec
@@ -247,36 +246,12 @@ def test_names_are_escaped(tmp_path):
     assert "from clusters" not in page
 
 
-def test_activity_is_what_the_fit_says_in_one_go(labelled, monkeypatch):
-    found, _, demos = labelled
-    monkeypatch.setattr("ddco_pyro.model.hierarchy.STEPS_AT_ONCE", 1)  # one demonstration at a time
-    level = activity(found, demos).levels[0]
-    np.testing.assert_allclose(level.active, found.posterior(demos).u[0], atol=1e-5)
-    np.testing.assert_array_equal(level.path[level.path >= 0], np.concatenate(found.segment(demos)[0]))
-
-
 # --- what figures are drawn from --------------------------------------------------------------------------------------
 
 
 def observing(observations):
     """Demonstrations of which nothing but these observations matters."""
     return numbered((observed, np.sin(np.arange(len(observed["goal"])))[:, None]) for observed in observations)
-
-
-def test_what_moves_is_drawn_whatever_comes_first():
-    """Before a smooth reach in the alphabet: what is constant within each demonstration, in all, or measured badly."""
-    rng, time = np.random.default_rng(1), np.linspace(0, 1, 40)[:, None]
-    eased, step = 10 * time**3 - 15 * time**4 + 6 * time**5, np.ones((40, 1))
-    demos = observing(
-        {
-            "base": step * np.array([0.1, 0.2, 0.3]),
-            "goal": step * rng.normal(size=3),
-            "guess": step * rng.normal(size=3) + 1e-3 * rng.normal(size=(40, 3)),
-            "hand": rng.normal(size=3) + eased * 2 * rng.normal(size=3),
-        }
-        for _ in range(6)
-    )
-    assert position_key(demos) == "hand"
 
 
 def reaching(other, absolute, random):
@@ -347,17 +322,6 @@ def test_what_is_drawn_is_what_the_spec_names(tmp_path, size, drawn, numbers, sa
     shown = embedded(page)["tracks"][0]
     names = [[shown["n"]["names"][place] for place in path] for path in shown["paths"]]
     assert names == [[f"place[{number}]" for number in path] for path in numbers]
-
-
-def test_movement_by_hand():
-    """Even steps along a straight line: 1; there and back: half as far for the way it goes."""
-    line = np.arange(5.0)[:, None] * np.array([1.0, 2.0, 2.0])
-    assert movement([line, line]) == pytest.approx(1)
-    assert movement([line[[0, 1, 2, 1, 0]]] * 2) == pytest.approx(0.5)
-    assert movement([np.hstack([line, line])] * 2) == pytest.approx(0.5)
-    within, between = 9 * 2.0, 3 * 4.0  # the variance of 0 to 4 is 2; that of a mean of -2 and one of 2 is 4
-    assert movement([line - 2, line + 2]) == pytest.approx(np.sqrt(within / (within + between)))
-    assert movement([np.array([[1.0, 2.0, 3.0]])]) == 0
 
 
 # --- the words of the report ------------------------------------------------------------------------------------------
@@ -467,29 +431,6 @@ def test_equal_parts_that_agree_better_are_a_sign():
     (said,) = signs(train=0.41, equal_train=0.52)
     assert said.endswith("in training.")
     assert signs(train=0.1, equal_train=0.2, valid=0.6, equal_valid=0.52) == signs(train=0.1) == []
-
-
-def test_like_warnings_are_one_with_a_list():
-    """Of nineteen unused options the ten least used; a finding alone is a sentence of its own."""
-    use = {"selected": 1.0, "demonstrations": 1.0, "duration": 9.0, "segments": 1, "steps": 9, "length": 9.0}
-    rows = [use | {"choice": h, "share": 0.0005 * h if h < 20 else 0.2, "having": 3, "within": None} for h in range(24)]
-    rows[22]["within"] = rows[23]["within"] = 0.9
-    metrics = made_metrics(options=[rows], divergences=[[{"options": (20, 21), "divergence": 0.01}]])
-    level = SimpleNamespace(name="skill", lasts=True)
-    spec = SimpleNamespace(hierarchy=SimpleNamespace(levels=[level]), training=TrainingSpec())
-    signs = degeneracies(metrics, spec, {"skill": []})
-    unused, whole, alike = (sign for sign, _ in signs)
-    assert unused.startswith("19 options of level “skill” are unused; their shares of all steps are 0.1 % (option 1), ")
-    assert unused.endswith("0.5 % (option 10) and so on for 9 more.")
-    assert whole == (
-        "2 options of level “skill” say which demonstration, not which skill; they take 90 % of the 3 demonstrations "
-        "that have it (option 22) and 90 % of the 3 demonstrations that have it (option 23)."
-    )
-    assert "positions relative to the first step" in signs[1][1]
-    assert alike == (
-        "Option 20 and option 21 of level “skill” act alike; while either is active they differ, in nats per step, by "
-        "0.010."
-    )
 
 
 def test_numbers_in_words():

@@ -9,15 +9,13 @@ import av
 import cv2
 import numpy as np
 import pytest
-import torch
 from matplotlib.colors import to_rgb
 
 from ddco_pyro.data.demonstrations import Demonstration
 from ddco_pyro.drawing.colours import CONTROL, OPTIONS, option_rgb
 from ddco_pyro.drawing.diagrams import transition_graph, typical_paths
-from ddco_pyro.drawing.shown import frames, projection
-from ddco_pyro.report.inputs import _shares
-from ddco_pyro.report.skills import Instance, aligned, film_of, instances, sheet_of, transitions
+from ddco_pyro.drawing.shown import projection
+from ddco_pyro.report.skills import Instance, film_of, instances, sheet_of, transitions
 from ddco_pyro.segmenting import LevelLabels, Segmented, Segments
 from ddco_pyro.simulation.episodes import Episode
 from ddco_pyro.simulation.film import FRAMES_PER_SECOND, captioned, write_film
@@ -71,12 +69,6 @@ def test_the_most_typical_segments_come_first_and_of_different_demonstrations():
     assert instances(found, "option", 3) == []
 
 
-def test_instances_in_a_film_begin_at_their_onsets_and_rest_at_their_ends():
-    chosen = [Instance(0, 4, 14, 1.0), Instance(1, 2, 5, 1.0)]
-    np.testing.assert_array_equal(aligned(chosen, most=5), [[4, 2], [6, 4], [8, 4], [10, 4], [12, 4]])
-    np.testing.assert_array_equal(aligned([Instance(0, 7, 8, 1.0)]), [[7]])
-
-
 @pytest.fixture
 def shades():
     """Pictures of two demonstrations whose shade is 10 times the step, plus 100 in the second one."""
@@ -116,11 +108,6 @@ def test_a_projection_keeps_distances_in_the_plane_that_it_looks_at():
     np.testing.assert_allclose(turn @ turn.T, np.eye(2), atol=1e-12)
 
 
-def test_a_plane_is_drawn_as_it_is_with_one_scale():
-    points = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 1.0]])
-    np.testing.assert_allclose(points @ projection(points).T, [[0, 0], [1, 0], [1, -0.25]])
-
-
 def test_each_path_of_two_arms_has_a_line_of_its_own():
     """Two demonstrations of two arms."""
     still, moving = np.zeros((6, 2)), np.arange(12.0).reshape(6, 2)
@@ -128,23 +115,6 @@ def test_each_path_of_two_arms_has_a_line_of_its_own():
     drawn = typical_paths(both, [(0, 2, 5)], "#123456")
     assert re.findall(r'<polyline[^>]*stroke-dasharray="([^"]*)"', drawn) == ["none", "5 2.5"]
     assert drawn.count('class="faint"') == 4
-
-
-def test_shares_are_those_of_the_weights_of_a_linear_policy():
-    """y = (3 a, 4 a + 2 b) with standard deviations 1 of a and 5 of b: 3² + 4² beside (2 × 5)²."""
-    vectors = {key: torch.randn(2, 4, 1).requires_grad_() for key in ("a", "b", "unread")}
-    numbers = torch.cat([3 * vectors["a"], 4 * vectors["a"] + 2 * vectors["b"]], dim=-1)
-    spread = {"a": torch.ones(1), "b": 5 * torch.ones(1), "unread": torch.ones(1)}
-    found = _shares(numbers, torch.rand(2, 4).double(), vectors, spread)
-    assert found == pytest.approx({"a": 25 / 125, "b": 100 / 125, "unread": 0})
-
-
-@pytest.mark.parametrize("channels", [1, 2, 3, 4])
-def test_pictures_of_any_number_of_channels_are_shown_in_colour(channels):
-    pictures = np.random.default_rng(0).integers(0, 256, (5, 8, 6, channels), dtype=np.uint8)
-    shown = frames(pictures, [1, 1, 4], height=8)
-    kept = [0, 1, 2] if channels >= 3 else [0, 0, 0]
-    assert np.array_equal(shown, pictures[[1, 1, 4]][..., kept])
 
 
 # --- films ------------------------------------------------------------------------------------------------------------

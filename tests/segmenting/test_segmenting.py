@@ -25,11 +25,10 @@ from sklearn.metrics import normalized_mutual_info_score
 from time_lines import embedded, tracks, unpacked
 
 import ddco_pyro
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.importing import import_demonstrations
 from ddco_pyro.data.sources import open_source
 from ddco_pyro.drawing.colours import option_colour
-from ddco_pyro.drawing.timeline import following
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.agreement import agreement
 from ddco_pyro.fitting.fit import fit
@@ -37,7 +36,7 @@ from ddco_pyro.segmenting import LevelLabels, Segmented, Segments, recorded, seg
 from ddco_pyro.segmenting.baselines import BASELINES, segment
 from ddco_pyro.segmenting.formats import Asked
 from ddco_pyro.segmenting.formats.lerobot import Annotated
-from ddco_pyro.spec import ObservationSpec, PathSpec, parse_spec
+from ddco_pyro.spec import ObservationSpec, parse_spec
 from ddco_pyro.training.data import demonstrations
 from ddco_pyro.training.data import parts as split_in_parts
 
@@ -222,15 +221,6 @@ def test_numbers_follow_the_cursor(toy_run, written):
             np.testing.assert_allclose(row, expected, atol=span / 255 + 1e-5)
 
 
-def test_every_control_follows_the_cursor():
-    arm = {"arm": np.zeros((4, 20)), "hand": np.arange(12.0).reshape(4, 3)}
-    hand = [PathSpec(key="hand")]
-    (numbers,) = (found["n"]["names"] for found in following([Demonstration("a", arm, np.eye(4, 14))], [], 4, hand))
-    assert numbers == [f"hand[{n}]" for n in range(3)] + [f"control[{n}]" for n in range(14)]
-    (numbers,) = (found["n"]["names"] for found in following([Demonstration("a", arm, np.eye(4, 2))], [], 4, []))
-    assert numbers == ["control[0]", "control[1]", *(f"arm[{n}]" for n in range(10))]
-
-
 def test_intervals_are_those_of_the_posterior_draws(toy_run, file):
     """The very draws of ``Inferred.draws`` for a demonstration, and one interval for each segment."""
     with open_source(file) as source:
@@ -324,18 +314,6 @@ def test_without_labels_nothing_is_said_of_agreement(toy_run, file, tmp_path):
     assert "--baselines: the demonstrations have no labels/phase; no agreement is measured\n" in ended.out
     assert "Agreement" not in page.read_text()
     assert marked(page.read_text())
-
-
-def test_other_demonstrations_of_the_same_names_are_not_marked(toy_run, toy_spec, file, tmp_path):
-    with h5py.File(file, "r+") as opened:
-        for group in opened["data"].values():
-            group["actions"][:] += 0.1
-    page = tmp_path / "segments.html"
-    assert call("segment", toy_run.folder, file, "--html", page).status == 0
-    text = page.read_text()
-    assert marked(text) == set()
-    assert re.search(r"<td>options, 12 in all</td><td>\d\.\d\d</td>", text)
-    assert "were held out" not in text
 
 
 def test_the_page_escapes_what_it_shows(toy_run, tmp_path, toy_spec):

@@ -40,47 +40,6 @@ def started(command: Sequence[object], err: IO[str], folder: Path, **more: Any) 
     return subprocess.Popen([str(part) for part in command], cwd=folder, **own, **more)
 
 
-STRIKES_ITSELF = """
-import os, signal
-from ddco_pyro.cli import console
-from ddco_pyro.cli.app import main
-
-left, go_on = {after}, console.Progress.__call__
-
-def strike(progress, event):
-    global left
-    left -= type(event).__name__ == "{event}"
-    if left == 0:
-        {strike}
-    go_on(progress, event)
-
-console.Progress.__call__ = strike
-main()
-"""
-
-
-def struck(arguments: Sequence[object], folder: Path, event: str, after: int, strike: str) -> tuple[int, str]:
-    """Run a command that is struck by a signal at a moment of its own, whatever else the machine does.
-
-    :param event: the kind of event (:mod:`ddco_pyro.events`) that is the moment, such as ``EpochEnded``.
-    :param after: which of them.
-    :param strike: Python that sends the signal.
-    :returns: its exit status, and what it printed to stderr.
-    """
-    program = STRIKES_ITSELF.format(event=event, after=after, strike=strike)
-    with tempfile.TemporaryFile("w+") as err:
-        command, own = [sys.executable, "-c", program, *arguments], {**os.environ, "OMP_NUM_THREADS": "1"}
-        process = started(command, err, folder, env=own, preexec_fn=_heed)
-        status = process.wait(timeout=HANGS)
-        err.seek(0)
-        return status, err.read()
-
-
-def _heed() -> None:
-    """A shell's background jobs, and all they start, ignore Ctrl-C."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
 Kept = Callable[[Path], set[object] | None]
 """What is safe in a folder, one thing each: it may only become more. None where all is done and it is put away."""
 

@@ -19,14 +19,6 @@ def places(pictures):
     return np.stack(both, 1) @ np.random.default_rng(0).normal(size=(2, 80))
 
 
-def integers(pictures):
-    return pictures[:, 0, 0].astype(int)
-
-
-def flat(pictures):
-    return pictures.mean((1, 2, 3))
-
-
 def not_finite(pictures):
     return np.where(pictures.mean((1, 2)) > 79, np.nan, 1.0)
 
@@ -48,6 +40,3 @@ def raises(pictures):
 def later_not_finite(pictures):
     """What the first pictures, which are dark, do not show."""
     return np.where(pictures.mean((1, 2)) > 100, np.nan, 1.0)
-
-
-not_callable = "a text"

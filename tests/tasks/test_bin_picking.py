@@ -1,6 +1,5 @@
 """Bin picking against independent truths: MuJoCo's cameras, a dead band in small steps, grasps and mishaps by hand."""
 
-import itertools
 from collections.abc import Iterator
 
 import cv2
@@ -69,36 +68,6 @@ def test_an_object_is_seen_where_it_lies_by_both_eyes(environment: Environment) 
     middle = np.array([columns[0], rows[0]], float)
     disparity = middle - camera.matched(masks, middle)
     np.testing.assert_allclose(disparity, [geometry.FOCAL_LENGTH * geometry.BASELINE / 0.649, 0.0], atol=1.0)
-
-
-def test_turns_are_the_nearest_to_the_neutral_one_of_the_same_line() -> None:
-    for turn in np.linspace(-7, 7, 50):
-        nearest = geometry.nearest_turn(turn)
-        assert abs(nearest - geometry.NEUTRAL_TURN) <= np.pi / 2 + 1e-9
-        assert abs(np.sin(nearest - turn)) < 1e-9
-
-
-def test_places() -> None:
-    assert geometry.place_of(np.array([0.02, -0.02, 0.0])) == "bin"
-    assert geometry.place_of(np.array([0.0, 0.045, 0.0])) == "bin"
-    assert geometry.place_of(np.array([0.0, -0.031, 0.0])) == "outside"
-    assert geometry.place_of(np.array([-0.061, 0.02, 0.0])) == "accept"
-    assert geometry.place_of(np.array([0.061, 0.0, 0.5])) == "reject"
-    assert geometry.place_of(np.array([0.032, 0.0, 0.0])) == "outside"
-
-
-@pytest.mark.parametrize("kind", [*objects.KINDS, *objects.UNSEEN])
-def test_objects_are_as_thick_and_long_as_the_paper_says(kind: str) -> None:
-    """Those that no demonstration has shown may be shorter, and their heads thicker."""
-    shortest, thickest = (0.015, 5.9) if kind in objects.UNSEEN else (0.02, 3.0)
-    parts = objects.parts(kind)
-    thickness = [2e3 * part.radius for part in parts]
-    assert 1.0 <= min(thickness) <= thickness[0] <= 3.0
-    assert max(thickness) <= thickest
-    for one, after in itertools.pairwise(parts):
-        np.testing.assert_allclose(one.end, after.start, atol=1e-12)  # a chain
-    length = sum(np.linalg.norm(part.end - part.start) for part in parts)
-    assert shortest < length <= 0.03
 
 
 # The instrument.
@@ -277,13 +246,6 @@ def test_what_lies_in_a_cup_by_the_jaws_is_not_carried(environment: Environment)
     go(environment, (-0.061, 0.0, 0.026), 1)
     last = environment.task.trials.attempts[-1]
     assert (last.before, last.carried, last.places) == (2, frozenset(), ("accept",))
-
-
-def test_a_bin_ends_whatever_comes_and_goes() -> None:
-    """Four attempts for each object are enough where every fourth brings one into a cup."""
-    again = Attempt(2, frozenset({0}), frozenset({0}), ("accept",), 10)
-    ended = [Trials(["pin", "wire"], [again] * number).missed() for number in range(1, 9)]
-    assert ended == [False] * 7 + [True]
 
 
 def test_four_misses_in_a_row_end_the_bin(environment: Environment) -> None:

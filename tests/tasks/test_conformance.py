@@ -112,11 +112,6 @@ def test_cameras_follow_their_spec(task: Task) -> None:
     environment.close()
 
 
-def test_sources_exist_and_hold_the_task(task: Task) -> None:
-    assert task.sources
-    assert all(source.is_file() for source in task.sources)
-
-
 def test_equal_seeds_give_equal_episodes_to_their_ends(task: Task, supervised) -> None:
     environment, policy = make(task, "supervisor", seed=2)
     before, steps, actions = supervised
@@ -135,12 +130,3 @@ def test_other_seeds_start_elsewhere(task: Task) -> None:
         starts.append(environment.reset().observation)
         environment.close()
     assert any(not np.array_equal(starts[0][key], starts[1][key]) for key in starts[0])
-
-
-def test_annotations_are_integers(task: Task) -> None:
-    environment, policy = make(task, "supervisor", seed=0)
-    policy.act(environment.reset().observation)
-    for name, value in getattr(policy, "annotations", {}).items():
-        assert isinstance(name, str)
-        assert isinstance(value, int)
-    environment.close()

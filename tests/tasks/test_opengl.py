@@ -1,16 +1,12 @@
 """A machine without what cameras are drawn with: one line that says what to install, before anything else is done."""
 
 import os
-import pickle
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 from ddco_tasks.opengl import PACKAGES, advice
-from ddco_tasks.rendering import NoOpenGL
-
-from ddco_pyro.errors import Failed
 
 ROOT = Path(__file__).parents[2]
 COMMAND = Path(sys.executable).with_name("ddco-pyro")
@@ -85,10 +81,3 @@ def test_the_demo_looks_for_opengl_before_it_installs_anything(tmp_path: Path) -
     assert found.returncode == 2
     assert advice("EGL has no device that starts") in found.stderr.splitlines()
     assert not (tmp_path / ".venv").exists()
-
-
-def test_the_error_survives_another_process() -> None:
-    """Episodes run in processes, whose errors are pickled."""
-    error = pickle.loads(pickle.dumps(NoOpenGL(advice("gone"))))
-    assert str(error) == advice("gone")
-    assert isinstance(error, Failed)

@@ -5,16 +5,13 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
 from ddco_tasks.pushing import environment as pushing
-from ddco_tasks.pushing import geometry as pushing_geometry
 from ddco_tasks.pushing import planner as pushing_planner
 from ddco_tasks.pushing import rules
 from ddco_tasks.pushing.environment import single, task
-from ddco_tasks.pushing.rules import PUSH_HEIGHT, Scene
 
 from ddco_pyro.simulation.episodes import run_episode
 
@@ -53,33 +50,6 @@ def test_the_scripted_supervisor_is_a_function_of_the_observation() -> None:
         observation = {key: value[row] for key, value in record.observations.items()}
         np.testing.assert_array_equal(policy.act(observation), record.actions[row])
     environment.close()
-
-
-def scenes() -> Iterator[Scene]:
-    """Scenes with the arm beside, above and behind the box."""
-    for box, goal in ((0.0, 0.3), (0.3, -0.2), (-0.35, 0.1), (0.2, 0.45)):
-        for tip in ((-0.25, 0.12), (0.22, 0.15), (0.0, 0.45)):
-            yield Scene(pushing_geometry.inverse(np.array([tip[0] + box, tip[1]]), 0.0), box, goal)
-
-
-def test_planned_approaches_are_clear_and_lead_behind_the_box() -> None:
-    for scene in scenes():
-        if not pushing_geometry.is_clear(scene.angles, scene.box, pushing_planner.MARGIN):
-            continue
-        path = pushing_planner.Planner()._approach(scene)
-        np.testing.assert_allclose(path[0], scene.angles)
-        assert pushing_planner.may_push(path[-1], scene)
-        assert all(pushing_geometry.is_clear(angles, scene.box, 0.5 * pushing_planner.MARGIN) for angles in path)
-        np.testing.assert_array_equal(path, pushing_planner.Planner()._approach(scene))
-
-
-def test_planned_pushes_stay_low_and_end_at_the_goal() -> None:
-    for side in (-1, 1):
-        scene = Scene(pushing_planner.behind(side, -0.3 * side, 0.16), -0.3 * side, 0.3 * side)
-        path = pushing_planner.Planner()._push(scene)
-        heights = np.array([pushing_geometry.tip_position(angles)[1] for angles in path])
-        assert np.abs(heights - PUSH_HEIGHT).max() < 1.2 * pushing_planner.LEVEL
-        assert pushing_geometry.tip_position(path[-1])[0] == pytest.approx(scene.goal - 0.09 * side, abs=1e-6)
 
 
 def test_a_planned_push_is_a_function_of_the_observation() -> None:

@@ -19,7 +19,6 @@ from random_demonstrations import numbered
 
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.model.networks.conv import _field_means
 from ddco_pyro.spec import Spec
 from ddco_pyro.training import processes
 from ddco_pyro.training.networks import Dimensions, build_hierarchy
@@ -131,20 +130,6 @@ def test_the_double_refuses_what_was_left_on_the_host() -> None:
         assert float((there + 1).cpu().sum()) == 6
 
 
-@pytest.mark.parametrize("size", [(9, 7), (8, 16), (5, 30)])
-def test_means_of_fields_are_those_of_torch(size: tuple[int, int]) -> None:
-    """Value and gradient; uneven fields overlap."""
-    maps = torch.randn(2, 3, *size, dtype=torch.float64, requires_grad=True)
-    expected = torch.nn.functional.adaptive_avg_pool2d(maps, 5)
-    (slope,) = torch.autograd.grad(expected.square().sum(), maps)
-    with Device():
-        moved = maps.detach().to(THERE).requires_grad_()
-        means = _field_means(moved, 5)
-        (own,) = torch.autograd.grad(means.square().sum(), moved)
-        torch.testing.assert_close(means.detach().cpu(), expected.detach())
-        torch.testing.assert_close(own.cpu(), slope)
-
-
 # --- what is said -----------------------------------------------------------------------------------------------------
 
 
@@ -198,25 +183,6 @@ def test_a_run_goes_on_where_it_was_begun(demos: Demonstrations, tmp_path, monke
             np.testing.assert_array_equal(weights(again)[name], values)
     for name in ("model.safetensors", "history.csv"):
         assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
-
-
-def test_restarts_that_were_stopped_elsewhere_keep_nothing_from_being_finished(demos, tmp_path, monkeypatch) -> None:
-    """Nothing is left to train; what is far behind is not, wherever that is."""
-    spec = spec_of(DROPPING, starts=["random"] * 3)
-    monkeypatch.setattr("ddco_pyro.training.restarts.BY_GRADIENT", 1)
-    monkeypatch.setattr("ddco_pyro.training.restarts.BEHIND", 0.0)
-    on(monkeypatch, THERE)
-    with Device():
-        there = ddco_pyro.fit(spec, demos, tmp_path)
-    assert sum(one.stopped is not None for one in there.metrics.training.restarts.each) == 2
-    (tmp_path / "metrics.json").unlink()
-    kept = {path.name: path.read_bytes() for path in (tmp_path / "checkpoints").iterdir()}
-    on(monkeypatch, torch.device("cpu"))
-    here = ddco_pyro.fit(spec, demos, tmp_path)
-    for name, values in weights(there).items():
-        np.testing.assert_array_equal(weights(here)[name], values)
-    assert here.metrics.training == there.metrics.training
-    assert {path.name: path.read_bytes() for path in (tmp_path / "checkpoints").iterdir()} == kept
 
 
 def test_a_fit_leaves_generators_as_they_were(demos: Demonstrations, monkeypatch: pytest.MonkeyPatch) -> None:

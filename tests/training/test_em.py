@@ -27,7 +27,6 @@ from ddco_pyro.inference import log_likelihood, segment
 from ddco_pyro.model.batch import Batch, encode
 from ddco_pyro.model.emissions import KINDS, Information
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.outputs import bounded
 from ddco_pyro.spec import RidgeSpec, SpecError, parse_spec, with_overrides
 from ddco_pyro.training import em
@@ -272,19 +271,6 @@ def _at_floor(model, name):
     return bool((caller.std() < caller.std.floor + 2e-4).any())
 
 
-def test_moments_of_features_are_those_of_einsum(monkeypatch):
-    """In blocks, and where most steps weigh nothing or next to nothing."""
-    monkeypatch.setattr(em, "BLOCK", 24)  # 8 steps
-    generator = torch.Generator().manual_seed(0)
-    vector, weights = torch.randn(5, 7, 2, generator=generator), torch.rand(35, 4, generator=generator).double()
-    weights[:, 1], weights[3:, 2], weights[::2, 3] = 0, 1e-9, 0
-    x = torch.cat([vector, torch.ones(5, 7, 1)], -1).double().flatten(0, 1)
-    torch.testing.assert_close(
-        em.Features(Inputs({"state": vector}, {}, torch.arange(7)), ["state"]).moments(weights),
-        torch.einsum("mw,mf,mg->wfg", weights, x, x),
-    )
-
-
 def test_the_information_of_logits_is_at_least_fishers():
     """Its difference to diag(p) - pp^T has no negative eigenvalue; of two choices, no smaller one will do."""
     logits, weight = 3 * torch.randn(4, 6, 2, 5, dtype=torch.float64), torch.rand(4, 6, 2, dtype=torch.float64)
@@ -294,14 +280,6 @@ def test_the_information_of_logits_is_at_least_fishers():
         assert torch.linalg.eigvalsh(bound.diag_embed() - fisher).min() > -1e-12
     apart = torch.tensor([1.0, -1.0], dtype=torch.float64)
     torch.testing.assert_close((bound * apart.square()).sum(-1), fisher @ apart @ apart)
-
-
-def test_only_what_is_trained_changes():
-    model, batch = linear((2,), std=LEARNED), batch_for(None)
-    before = {name: one.clone() for name, one in model.named_parameters()}
-    expectation(model, RidgeSpec(), batch, ("meta_policy.",))
-    changed = {name for name, one in model.named_parameters() if not torch.equal(one, before[name])}
-    assert changed == {"meta_policy.network.layers.0.weight", "meta_policy.network.layers.0.bias"}
 
 
 def rows_of(batch):

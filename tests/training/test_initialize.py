@@ -158,14 +158,6 @@ def test_other_demonstrations_go_to_the_nearest_mean():
     np.testing.assert_array_equal(alive(choices, (6, 8, 3)), distances.argmin(1) + 1)
 
 
-def test_it_does_not_matter_how_many_images_are_looked_at_together(monkeypatch):
-    images = np.random.default_rng(8).integers(0, 256, (sum(LENGTHS), 16, 16, 3), dtype=np.uint8)
-    batch = make_batch(random_rows(9, 2), random_rows(10, 2), {"camera": images})
-    together = Clusters(batch, 3, seed=0).choices(batch)
-    monkeypatch.setattr("ddco_pyro.training.initialization.FRAMES_AT_ONCE", 2)
-    assert torch.equal(Clusters(batch, 3, seed=0).choices(batch), together)
-
-
 def test_images_are_seen_as_block_means():
     """Mean brightness of each block of 2 × 3 pixels, by hand, in [0, 1]; beside it the vector."""
     random = np.random.default_rng(8)
@@ -176,14 +168,6 @@ def test_images_are_seen_as_block_means():
     rows = np.hstack([vector, blocks.reshape(len(blocks), -1)])
     choices = alive(Clusters(batch, 3, seed=0).choices(batch), FEW)
     assert_k_means(rows, choices, 3)
-
-
-def test_equal_seeds_give_equal_clusters():
-    batch = make_batch(random_rows(11, 3), random_rows(12, 2))
-    for controls in (False, True):
-        one, other = (Clusters(batch, 4, seed=5, controls=controls).choices(batch) for _ in range(2))
-        assert torch.equal(one, other)
-    assert len({tuple(alive(Clusters(batch, 4, seed=seed).choices(batch))) for seed in range(6)}) > 1
 
 
 @pytest.mark.filterwarnings("error")

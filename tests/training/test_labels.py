@@ -22,7 +22,6 @@ from ddco_pyro.evaluation.agreement import agreement
 from ddco_pyro.evaluation.effort import contributions
 from ddco_pyro.evaluation.inferred import infer
 from ddco_pyro.inference import log_likelihood, segment
-from ddco_pyro.metrics import Candidate
 from ddco_pyro.model.batch import encode
 from ddco_pyro.report import write_report
 from ddco_pyro.spec import SpecError
@@ -32,7 +31,6 @@ from ddco_pyro.training.labels import Labels
 from ddco_pyro.training.loop import backward
 from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.objective import Objective
-from ddco_pyro.training.recognition import _left_out, _widths
 from ddco_pyro.training.recognition import chosen as best_of
 from ddco_pyro.training.restarts import Trainer
 from ddco_pyro.training.stages import plan
@@ -102,19 +100,6 @@ def test_it_is_the_likelihood_of_the_paths_that_have_the_labels(counts, level):
     assert objective.tune(model) == pytest.approx(values["tune"] / STEPS, abs=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("level", "own", "stages"),
-    [
-        (1, {}, ["vq-1", "level-1", "vq-2", "level-2", "meta-policy", "joint"]),
-        (2, {}, ["vq-2", "level-2", "meta-policy", "joint"]),
-        (2, {"training": {"upper_levels": "segments"}}, ["segments", "upper", "joint"]),
-    ],
-)
-def test_labels_matter_in_every_stage_that_has_their_level(level, own, stages):
-    material = make(labelled(level, (2, 2), **own), random_demonstrations())
-    assert [stage.name for stage in plan(material.spec, 2) if material.labels.matter_in(stage)] == stages
-
-
 def test_the_label_wins_over_the_cluster():
     demos = random_demonstrations([[7, -1, 3, 3], [-1, 3, -1, -1], [3, 7, 7, -1], [-1, -1, -1, 7], [7, -1, -1, -1]])
     material = make(labelled(), demos)
@@ -141,15 +126,6 @@ def test_the_first_demonstrations_in_training_have_labels_those_to_tune_with_las
         for demo, row in zip(part, tensor.tolist(), strict=True):
             given = options(demo.labels["phase"].tolist()) if demo.name in labels.demonstrations else [-1] * STEPS
             assert row == (given if seen == {1, 2} else [min(option, 1) for option in given])
-
-
-def test_demonstrations_that_train_and_tune_are_labelled_once():
-    """As with ``training.tune_fraction: 0``."""
-    demos = random_demonstrations()
-    labels = Labels.of(labelled(), demos, demos)
-    assert labels is not None
-    assert labels.demonstrations == demos.names
-    assert labels.train.tolist() == labels.tune.tolist() == [options(own) for own in LABELS]
 
 
 def test_labels_of_unequal_length_are_free_past_the_end():
@@ -204,10 +180,6 @@ def test_labels_of_every_option_name_the_other_steps():
     assert (clustered(states, 3, labels) == truth).mean() > 0.99
     some = np.where(labels == 3, -1, labels)
     assert len(np.unique(clustered(states, 3, some))) == 3
-
-
-def test_one_option_needs_no_telling_apart():
-    assert clustered(np.eye(4)[:, :2], 1, [1, -1, -1, -1]).tolist() == [1, 1, 1, 1]
 
 
 def clustered(states, count, labels):
@@ -300,19 +272,6 @@ def test_evidence_is_a_factor_of_every_path(recognised):
         assert piece.log_likelihood[n] == pytest.approx(alone, abs=1e-6)
 
 
-def test_in_training_evidence_is_of_steps_without_labels_and_starts_are_the_recognisers(recognised):
-    _, trainer = recognised
-    labels, first = trainer.data.labels, Objective(trainer.data, Progress(0), plan(trainer.data.spec, 1)[0])
-    given = trainer.hierarchy.recogniser.evidence(trainer.data.train)
-    free = labels.train < 0
-    torch.testing.assert_close(labels.evidence[0][free], given[free])
-    assert not labels.evidence[0][~free].any()
-    best = given[..., 1:3] + trainer.hierarchy.recogniser.gamma * trainer.hierarchy.recogniser.around.share[:2].log()
-    alive = torch.arange(free.shape[1]) < trainer.data.train.lengths[:, None]
-    torch.testing.assert_close(first.known[0][1][free & alive], best.argmax(-1)[free & alive] + 1)
-    torch.testing.assert_close(first.known[0][1][~free], labels.train[~free])
-
-
 def test_a_recogniser_places_what_labels_alone_do_not(tmp_path):
     """Two skills that move alike at every single step, at places that differ by person: only what is around tells."""
     random = np.random.default_rng(0)
@@ -390,30 +349,6 @@ def test_a_recogniser_reads_pictures():
         np.testing.assert_allclose(rows[: len(demo), 2:66], brightness, atol=1e-6)
         np.testing.assert_allclose(rows[: len(demo), 70:134], window(brightness, 2), atol=1e-6)
         assert (options[: len(demo)] == demo.labels["truth"] + 1).mean() > 0.9
-
-
-def test_the_pair_is_chosen_by_its_mean_over_ridges():
-    scores = {(0.1, 0.3): (0.5, 0.9), (1.0, 0.0): (0.8, 0.7)}
-    tried = [
-        Candidate(power=pair[0], weight=pair[1], ridge=ridge, accuracy=score, edit=score)
-        for pair, own in scores.items()
-        for ridge, score in zip((15, 50), own, strict=True)
-    ]
-    assert best_of(tried) == (1.0, 0.0, 15)
-
-
-def test_windows_follow_from_labelled_segments():
-    assert _widths(torch.tensor([[1, 1, 1, -1, 2, 2, 2], [-1, 1, 1, 1, 2, -1, -1]])) == (1, 2)
-
-
-def test_demonstrations_are_left_out_whole_and_a_single_one_by_parts():
-    options, lengths = torch.tensor([[1, 2, 1, 2, 1], [-1] * 5, [2, 2, 1, -1, -1]]), torch.tensor([5, 4, 3])
-    each = [hidden.any(1).tolist() for hidden in _left_out(options, lengths)]
-    assert each == [[True, False, False], [False, False, True]]
-    single = torch.tensor([[1, 2, 1, 2, 1, 1, 2, 2]])
-    parts = torch.stack([*_left_out(single, torch.tensor([8]))])
-    assert parts.sum(0).eq(1).all()
-    assert len(parts) == 4
 
 
 # --- planted options --------------------------------------------------------------------------------------------------

@@ -257,15 +257,6 @@ def test_calls_are_made_here_or_in_other_processes() -> None:
     assert list(places(3, 9, ordered=True)) == list(range(9))
 
 
-def test_a_call_in_another_process_makes_its_own_calls_there() -> None:
-    with run_all(dict.fromkeys(range(2), partial(places_and_own, 3)), Workers(2), "worked") as results:
-        assert all(found == {own} for _, (found, own) in results)
-
-
-def places_and_own(calls):
-    return {*places(2, calls).values()}, os.getpid()
-
-
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_events_come_call_after_call_and_the_wait_is_announced_once(jobs) -> None:
     def tell(number, on_event):  # pickled by value, as it is in no module

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 import pytest
 import torch
@@ -98,22 +96,6 @@ class Interrupting:
 def interrupted(trainer):
     with pytest.raises(KeyboardInterrupt):
         trainer.run()
-
-
-@pytest.mark.parametrize("epochs", [2, 4, 9])
-def test_gradient_steps_that_are_interrupted_again_and_again_give_the_same_bits(
-    undisturbed, spec, demos, tmp_path, monkeypatch, epochs
-):
-    monkeypatch.setattr(training, "SAVE_EVERY", 0.0)
-    for interruptions in itertools.count():
-        trainer = make_trainer(spec, demos, tmp_path, Interrupting(epochs))
-        try:
-            model = trainer.run().state_dict()
-        except KeyboardInterrupt:
-            continue
-        assert_same(trainer, model, tmp_path, undisturbed)
-        assert interruptions >= len(undisturbed[0].history) // epochs - 5  # the epoch after a checkpoint is made again
-        return
 
 
 def test_em_that_is_interrupted_begins_its_restart_again_and_gives_the_same_bits(demos, tmp_path):

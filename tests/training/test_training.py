@@ -88,20 +88,6 @@ def test_beside_the_levels_under_a_uniform_meta_policy_the_meta_policy_learns_of
         assert gradient.abs().max() > 0
 
 
-def test_what_is_said_of_levels_and_meta_policy_trained_apart_is_the_mean_of_both():
-    """Nats per step that can be compared with those of other stages, where the gradient is that of the sum."""
-    material = lines()
-    stage, model, rows = plan(material.spec, 1)[0], material.hierarchy(0), torch.arange(len(material.train))
-    each = stage, replace(stage, discovering=1, selecting=False), replace(stage, selecting=False)
-    both, levels, whole = (Objective(material, Progress(0), one) for one in each)
-
-    def ascended(objective):
-        return backward(objective, model, material.train, rows)
-
-    assert both.tune(model) == pytest.approx((levels.tune(model) + whole.tune(model)) / 2)
-    assert ascended(both) == pytest.approx((ascended(levels) + ascended(whole)) / 2)
-
-
 def gradients(model, objective, rows):
     model.zero_grad()
     backward(objective, model, objective.data.train, rows)

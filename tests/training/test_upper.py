@@ -166,15 +166,6 @@ def test_labels_say_which_option_is_which():
         assert (segments == truth)[3:].double().mean() > 0.85
 
 
-def test_constants_are_read_as_they_were_kept():
-    constants = random_constants(random_tables((2, 3, 2), (False,) * 3, 1, 1))
-    again = Constants.of(constants.state())
-    for kept, found in ((constants.selection, again.selection), (constants.termination, again.termination)):
-        assert len(kept) == len(found)
-        assert all(torch.equal(*both) for both in zip(kept, found, strict=True))
-    assert Constants.of({}) is None
-
-
 # --- the spec ---------------------------------------------------------------------------------------------------------
 
 

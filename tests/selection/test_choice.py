@@ -136,9 +136,6 @@ def test_different_fixed_errors_are_noted():
 PLACE, TURN = {"place": (2,)}, {"turn": (1,)}
 SIZE = Dimensions(PLACE | TURN, 2, 10)
 
-LEVEL = DATA["hierarchy"]["levels"][0]
-PHASE = {**LEVEL, "name": "phase", "count": 3}
-
 
 def with_grid(grid, **changes):
     return parse_spec({**DATA, "demonstrations": {"path": "demos.hdf5"}, "selection": {"grid": grid}, **changes})
@@ -159,18 +156,6 @@ def test_parameters_are_counted():
     for one in candidates(with_grid({"hierarchy.levels.0.count": [1, 2, 5]}), SIZE):
         k = one.spec.hierarchy.levels[0].count
         assert one.parameters == k * (3 * 2 + 2) + k * (3 + 1) + (3 + 1) * k
-
-
-def test_the_number_of_levels_is_a_field_too():
-    found = candidates(with_grid({"hierarchy.levels": [[LEVEL], [LEVEL, PHASE]]}), SIZE)
-    assert [len(one.spec.hierarchy.levels) for one in found] == [1, 2]
-    assert [one.name for one in found] == ["levels = [2]", "levels = [2, 3]"]
-    assert found[0].parameters < found[1].parameters
-
-
-def test_names_tell_equal_ends_of_key_paths_apart():
-    grid = {"hierarchy.levels.0.policy.network": ["linear"], "hierarchy.meta_policy.network": ["linear", "mlp"]}
-    assert candidates(with_grid(grid), SIZE)[1].name == "policy.network = linear, meta_policy.network = mlp"
 
 
 def test_baselines_are_compared_and_not_selected():
@@ -227,17 +212,6 @@ def test_folds_are_an_even_partition(data):
 def test_too_few_demonstrations_are_refused(count, folds, message):
     with pytest.raises(FoldError, match=f"^{message}$"):
         assign(count, folds, 0)
-
-
-def test_a_split_keeps_the_held_out_ones_out():
-    demos = two_skills(11)
-    folds = divide(demos, 4, 3)
-    assert sorted(name for names in folds.held_out for name in names) == sorted(demos.names)
-    for fold in range(4):
-        train, held_out = folds.split(fold)
-        assert held_out.names == folds.held_out[fold]
-        assert set(train.names) == set(demos.names) - set(held_out.names)
-    assert folds.dimensions.steps == max(demos.lengths)
 
 
 def test_what_its_author_set_apart_is_in_no_fold():

@@ -12,13 +12,11 @@ from planted import make_spec, make_trainer
 from random_demonstrations import of_states
 
 import ddco_pyro
-from ddco_pyro.acting.controller import ObservationError, Window
-from ddco_pyro.acting.monitor import Monitor, run_lengths
+from ddco_pyro.acting.controller import ObservationError
+from ddco_pyro.acting.monitor import Monitor
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.inference import log_likelihood, posterior
 from ddco_pyro.model.batch import encode
-from ddco_pyro.model.encoder import ObservationEncoder
-from ddco_pyro.spec import ObservationSpec
 
 WINDOWS = {"network": "lstm", "horizon": 4}
 
@@ -182,30 +180,4 @@ def test_without_demonstrations_no_fraction_is_known(phases):
     assert monitor.progress({"level-1": fit.names["level-1"]})["level-1"][2:] == (1, None, None)
 
 
-def test_runs_end_where_the_choice_changes_and_with_the_demonstration():
-    found = run_lengths([np.array([1, 1, 2, 2, 2, 1]), np.array([0, 1])], 3)
-    assert [lengths.tolist() for lengths in found] == [[1], [1, 1, 2], [3], []]
-
-
 # --- one observation at a time ----------------------------------------------------------------------------------------
-
-
-def make_encoder(differences=True):
-    specs = [ObservationSpec(key="state", differences=differences), ObservationSpec(key="step")]
-    encoder = ObservationEncoder(specs, {"state": (2,)})
-    states = np.random.default_rng(0).normal(size=(7, 2))
-    demos = Demonstrations((Demonstration("demo_0", {"state": states}, np.zeros((7, 1))),))
-    encoder.fit(demos)
-    return encoder, states
-
-
-@pytest.mark.parametrize("differences", [True, False])
-def test_steps_are_those_of_the_whole_demonstration(differences):
-    encoder, states = make_encoder(differences)
-    whole = encoder.inputs([{"state": states}])
-    window = Window(encoder)
-    for t, state in enumerate(states):
-        one = window.inputs([{"state": state}])
-        assert one.time.tolist() == [t]
-        torch.testing.assert_close(one.vector[0, 0], whole.vector[0, t])
-        assert one.vectors["step"].shape == (1, 1, 1)

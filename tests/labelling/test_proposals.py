@@ -11,7 +11,6 @@ from oracle import paths
 from planted import make_spec, make_truth, plant
 
 import ddco_pyro
-from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.labelling.proposals import Proposals, weight
 from ddco_pyro.labelling.refitting import labelled, refit
@@ -67,15 +66,6 @@ def test_it_is_the_sum_over_the_paths_that_have_the_labels_with_a_regression_of_
         np.testing.assert_array_equal(shown.probability[known > 0], 1.0)
         if len(counts) == 1:  # of several levels the path is of all of them
             np.testing.assert_array_equal(shown.options, proposals.options[list(best[1])])
-
-
-def test_without_labels_it_is_the_fits_own_segments():
-    fit, demos, _ = planted(5, 30)
-    proposals = Proposals(fit, demos, 1, 3)
-    proposals.update(free(demos))
-    (segments,) = fit.segment(demos)
-    for own, name in zip(segments, demos.names, strict=True):
-        np.testing.assert_array_equal(proposals.shown(name).options, own)
 
 
 def test_draws_of_a_boundary_are_as_frequent_as_the_sum_over_paths_says():
@@ -284,11 +274,3 @@ def test_a_refit_by_gradient_steps_is_tuned_by_demonstrations_without_labels():
         said = free(demos) | {chosen: truth[chosen]}
         again = refit(trained, LEVEL, 3, labelled(demos, said), free(demos))
         assert again.metrics.trained_labels.level == LEVEL
-
-
-def test_demonstrations_for_a_refit_have_a_persons_labels_alone_and_hold_nothing_out():
-    _, demos, _ = planted(3, 5)
-    masked = Demonstrations(demos.demonstrations, {"valid": ("demo_1",)})
-    found = labelled(masked, free(demos))
-    assert not found.masks
-    assert [sorted(demo.labels) for demo in found] == [["said"]] * 3

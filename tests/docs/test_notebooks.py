@@ -13,7 +13,7 @@ import pytest
 from killing import HANGS
 from nbclient import NotebookClient
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 QUICK = ("06_pushing",)
 SMALL = "demonstrations.count=12 demonstrations.seed=0 training.epochs=4 selection.folds=2"

@@ -96,24 +96,15 @@ def test_perceptrons_and_other_settings() -> None:
     ("ask", "says"),
     [
         (lambda model, X, U: model.predict(X), "fitted with controls U; give U"),
-        (lambda model, X, U: model.predict(X[0], U[0], [3, 3]), "whose sum is 16"),
         (lambda model, X, U: model.predict(X[0], U[0][:5]), "X has 16 steps, and U has 5"),
-        (lambda model, X, U: model.predict(X, U[:3]), "equal numbers of steps"),
         (lambda model, X, U: model.predict(X, U, [16] * 5), "leave lengths out"),
-        (lambda model, X, U: model.fit(X[0], U[0][:, 0], [16]), "one dimension"),
         (lambda model, X, U: model.set_params(settings={"training.epoch": 3}).fit(X, U), "training.epochs"),
-        (lambda model, X, U: model.set_params(settings=["training.epochs"]).fit(X, U), "has to be a mapping"),
         (lambda model, X, U: model.set_params(n_options=2.5).fit(X, U), "^n_options: must be a whole number"),
-        (lambda model, X, U: model.set_params(policy="x").fit(X, U), "^policy: no network is called 'x'"),
         (lambda model, X, U: model.set_params(random_state="x").fit(X, U), "^random_state='x': has to be a whole"),
-        (lambda model, X, U: model.sample(X, random_state="x"), "^random_state='x': has to be a whole"),
         (lambda model, X, U: model.predict([np.hstack([x, x]) for x in X], U), "X has 4 features, but"),
         (lambda model, X, U: model.score(X, [np.hstack([u, u]) for u in U]), r"actions has shape \(4,\)"),
-        (lambda model, X, U: model.decode(X, [u[:, :1] for u in U]), r"actions has shape \(1,\)"),
         (lambda model, X, U: model.predict_proba(X, [np.nan * u for u in U]), "U contains NaN"),
         (lambda model, X, U: model.predict("demos.hdf5", U), "lists of sequences"),
-        (lambda model, X, U: model.predict([x[:, 0] for x in X], U), "lists of sequences"),
-        (lambda model, X, U: model.predict(None, U[0]), "Expected 2D array"),
         (lambda model, X, U: model.predict(X[0], U[0], [8.5, 7.5]), "whole numbers"),
     ],
 )
@@ -138,15 +129,12 @@ def objects(values: Any) -> np.ndarray:
 KINDS = {
     "a 3-D array": lambda _, X, U: (np.array(X), np.array(U)),
     "an array of arrays": lambda _, X, U: (objects(X), objects(U)),
-    "an iterator": lambda _, X, U: (iter(X), iter(U)),
     "pandas": lambda pd, X, U: (listed(X, lambda x: pd.DataFrame(x, index=range(9, 25))), listed(U, pd.DataFrame)),
-    "a series of frames": lambda pd, X, U: (pd.Series(listed(X, pd.DataFrame), index=[*"edcba"]), U),
     "a frame, lengths in a series": lambda pd, X, U: (
         pd.DataFrame(np.concatenate(X), index=[f"row {n}" for n in range(80)], columns=["a", "b"]),
         pd.DataFrame(np.concatenate(U))[::-1][::-1],
         pd.Series([16] * 5, index=[*"edcba"]),
     ),
-    "polars": lambda pl, X, U: (listed(X, pl.DataFrame), listed(U, pl.DataFrame)),
     "a polars frame, lengths in a series": lambda pl, X, U: (
         pl.DataFrame(np.concatenate(X)),
         pl.DataFrame(np.concatenate(U)),
@@ -181,27 +169,6 @@ def test_the_columns_of_a_frame_have_to_be_those_of_the_fit() -> None:
         model.predict(listed(X, lambda rows: rows[["b", "a"]]), U)
     with pytest.raises(BadInput, match="U has the columns b, a; the fit had a, b"):
         model.predict(X, listed(U, lambda rows: rows[["b", "a"]]))
-
-
-@pytest.fixture(scope="module")
-def plain() -> OptionSegmenter:
-    return OptionSegmenter(2, settings={"control.std.floor": 0.01, **QUICK}).fit(*two_options())
-
-
-@pytest.mark.parametrize(
-    "given",
-    [
-        {"n_options": np.uint8(2), "random_state": np.uint32(0), "policy": np.str_("linear")},
-        {"settings": {"training.epochs": np.int64(12), "training.layerwise": np.bool_(True)}},
-        {"settings": {"training.epochs": np.array(12), "control.std.floor": np.float64(0.01)}},
-        {"differences": np.bool_(True), "control": np.str_("auto")},
-    ],
-)
-def test_settings_may_be_numpys(given: dict[str, Any], plain: OptionSegmenter) -> None:
-    X, U = two_options()
-    settings = {"control.std.floor": 0.01, **QUICK, **given.get("settings", {})}
-    model = OptionSegmenter(**{"n_options": 2, **given, "settings": settings}).fit(X, U)
-    assert model.score(X, U) == plain.score(X, U)
 
 
 # --- hmmlearn ---------------------------------------------------------------------------------------------------------

@@ -149,13 +149,6 @@ def test_the_list_leads_to_the_segments_in_the_report(toy_run, toy_spec, tmp_pat
         assert f'<div class="demonstration" id="{place}"><div class="who">{name}\n' in report.read_text()
 
 
-def test_models_and_parameters_are_named(found, folders):
-    by_name = {row.name: row for row in found.rows}
-    assert [by_name[str(folder)].model for folder in folders] == ["ddco", "flat", "per_timestep", "ddco"]
-    for folder in folders:
-        assert by_name[str(folder)].parameters == sum(one.numel() for one in load(folder).hierarchy.parameters())
-
-
 def test_demonstrations_may_be_held_out_in_another_order(folders, toy_spec, other, tmp_path):
     """A run that reads the same demonstrations from a file of its own, turned round, with masks."""
     demos = demonstrations(toy_spec)

@@ -93,13 +93,6 @@ def test_restarts_have_names_of_their_own_and_numbers_are_finite(tmp_path, monke
     ]
 
 
-def test_a_program_that_fails_costs_a_warning(tmp_path, monkeypatch) -> None:
-    kept = Kept(fails=2)
-    said = logged(monkeypatch, tmp_path, kept)
-    assert said == ["warning: --log tensorboard: the server is gone; the fit goes on without this log"]
-    assert kept.got == [(tmp_path / "run", {"seed": 3})]
-
-
 def test_the_fit_goes_on_where_a_log_fails(spec: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(LOGS, "tensorboard", (Kept(fails=2), "ddco_pyro"))
     ended = call("fit", spec, "--out", tmp_path / "run", "--log", "tensorboard")

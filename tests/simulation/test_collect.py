@@ -15,7 +15,7 @@ from scipy import stats
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
 from ddco_pyro.events import DemonstrationsDone
-from ddco_pyro.simulation.collect import cache_folder, cache_path, collect
+from ddco_pyro.simulation.collect import cache_path, collect
 from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.spec import DemonstrationsSpec, SpecError, parse_spec, with_overrides
 from ddco_pyro.training.data import demonstrations, dimensions
@@ -95,17 +95,6 @@ def test_another_version_of_a_simulator_or_of_the_tasks_package_has_another_file
     monkeypatch.setattr(importlib.metadata, "version", other)
     assert cache_path(toy_task.task, "toy", SPEC) != registered
     assert (cache_path(toy_task.task, TASK, SPEC) == named) == (package == "toy-task")
-
-
-def test_where_the_cache_is(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
-    monkeypatch.setenv("DDCO_PYRO_CACHE", str(tmp_path / "own"))
-    assert cache_folder() == tmp_path / "own"
-    monkeypatch.delenv("DDCO_PYRO_CACHE")
-    assert cache_folder() == tmp_path / "xdg" / "ddco-pyro"
-    monkeypatch.delenv("XDG_CACHE_HOME")
-    monkeypatch.setenv("HOME", str(tmp_path))
-    assert cache_folder() == tmp_path / ".cache" / "ddco-pyro"
 
 
 def test_an_unknown_supervisor_is_refused_in_one_line():
@@ -189,13 +178,6 @@ def test_leaving_out_the_wrong_ones_is_refused(path, names, message):
             ask(spec(demonstrations={"path": str(path), "exclude": names}))
 
 
-def test_dimensions_come_from_the_task_where_there_is_no_file_yet(tmp_path):
-    absent = {"path": str(tmp_path / "later.hdf5")}
-    for given in (spec(), spec(demonstrations=absent)):
-        assert dimensions(given) == Dimensions({"offsets": (4,), "visited": (1,)}, 2, 1)
-    assert not any(tmp_path.iterdir())
-
-
 def test_demonstrations_are_collected_where_there_is_no_file_yet(tmp_path):
     path, told = tmp_path / "later.hdf5", []
     given = spec(demonstrations={"path": str(path), "count": 3, "labels": "phase"})
@@ -252,12 +234,6 @@ CONV = {"network": "conv"}
 def test_a_spec_that_does_not_fit_says_where(changes, message):
     with pytest.raises(SpecError, match=message):
         build_hierarchy(spec(**changes), SIZE)
-
-
-def test_only_what_the_spec_names_has_to_be_in_order(path):
-    with h5py.File(path, "r+") as file:
-        file["data/demo_9/obs/unused"] = np.full((9, 1), np.nan)
-    assert dimensions(spec(demonstrations={"path": str(path)})) == Dimensions({"offsets": (7,)}, 3, 9)
 
 
 @pytest.mark.parametrize(

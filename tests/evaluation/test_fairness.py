@@ -16,7 +16,6 @@ from selecting import Told, spec_at
 import ddco_pyro
 from ddco_pyro.comparison import compare
 from ddco_pyro.comparison.page import write
-from ddco_pyro.evaluation import effort
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.names import method
 from ddco_pyro.selection import Workers, select
@@ -136,13 +135,6 @@ def test_stages_that_needed_more_are_named_on_the_console(fitted):
     assert said.count("warning: ") >= 4
     assert "warning: Options have not converged: the budget ended stage vq-1 after 2 epochs" in said
     assert "warning: Flat of equal size has not converged: the budget ended stage policy after 9 epochs" in said
-
-
-def test_where_nothing_rises_nothing_is_said(toy_spec):
-    still = {"training.epochs": 4, "training.optimizer.lr": 1e-9, "compare_with": []}
-    metrics = fit(with_overrides(toy_spec, still)).metrics
-    assert metrics.training.converged
-    assert effort.unconverged(metrics) == []
 
 
 def test_a_comparison_marks_them(fitted, tmp_path):

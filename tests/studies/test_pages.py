@@ -18,7 +18,7 @@ from studies import page
 from studies.__main__ import main
 from studies.statistics import COLUMNS, estimate, verdicts
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 GENERATED = [ROOT / "README.md", *sorted((ROOT / "docs" / "results").glob("*.md"))]
 STUDY = {

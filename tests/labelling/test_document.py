@@ -1,6 +1,5 @@
 """The document of a person's labels and its journal, against the list of all its states."""
 
-import json
 import subprocess
 import sys
 from contextlib import nullcontext
@@ -127,16 +126,6 @@ def test_a_journal_torn_at_any_byte_gives_the_state_after_its_whole_lines(tmp_pa
     assert said(third) == said(again)
 
 
-def test_a_new_name_in_a_journal_outlives_the_process(tmp_path):
-    journal = Journal(tmp_path / "labels.journal", empty(), "option")
-    journal.edit([("names", (*NAMES, "lift")), ("paint", "demo_0", 0, 6, 3)])
-    journal.close()
-    again = empty()
-    Journal(tmp_path / "labels.journal", again, "option").close()
-    assert again.names == (*NAMES, "lift")
-    np.testing.assert_array_equal(again.labels["demo_0"], 3)
-
-
 def recorded(lengths=LENGTHS, control=0.0):
     each = [(name, {"place": np.zeros((steps, 1))}, np.full((steps, 2), control)) for name, steps in lengths.items()]
     return Demonstrations([Demonstration(*own) for own in each])
@@ -192,14 +181,6 @@ def test_kill_9_loses_at_most_the_edit_in_flight_and_a_second_process_is_refused
     for number in range(len(document.done)):
         expected.edit([("paint", "demo_0", number % 6, 6, number % 2 + 1)])
     assert said(document) == said(expected)
-
-
-def test_an_edit_is_on_disk_when_the_call_returns(tmp_path):
-    path = tmp_path / "labels.journal"
-    journal = Journal(path, empty(), "option")
-    journal.edit([("accept", "demo_1", True, 0.5, 1)])
-    assert json.loads(path.read_bytes().splitlines()[-1]) == [["accept", "demo_1", True, 0.5, 1]]
-    journal.close()
 
 
 @pytest.mark.parametrize(

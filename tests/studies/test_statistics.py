@@ -12,7 +12,7 @@ from scipy import stats
 from studies.declaration import ContrastSpec
 from studies.statistics import COLUMNS, estimate, holm, values, verdicts
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 def by_seed(**tasks):

@@ -16,8 +16,7 @@ from ddco_pyro.acting.monitor import run_lengths
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.options import segments_of
 from ddco_pyro.labelling.refitting import Ways
-from ddco_pyro.metrics import Segments
-from ddco_pyro.selection.small import Lasting, asked, heavy_tails, in_steps, lasting, overrides, unasked
+from ddco_pyro.selection.small import heavy_tails, in_steps, lasting, overrides
 from ddco_pyro.spec import load_spec, parse_spec, with_overrides
 
 SLOW = 30
@@ -113,34 +112,3 @@ def test_heavy_tails_are_found_where_they_predict_better():
         noise = [0.3 * own * random.normal(size=(60, 2)) for own in scale]
         demos = numbered(({"state": x}, x + e) for x, e in zip(observed, noise, strict=True))
         assert heavy_tails(spec, demos) == dims
-
-
-def test_a_step_less_than_is_asked_is_near_enough():
-    """Less power would trade a step less for a step more, and options that hardly differ."""
-    medians = {0.5: 4, 0.25: 8, 0.35: 7}
-
-    def tried(power, constant):
-        return Lasting(power, constant, 0, Segments(median=medians[power], number=30, demonstrations=1), 0.0)
-
-    assert [asked(tried, steps).power for steps in (5, 6, 8)] == [0.5, 0.35, 0.25]
-
-
-@pytest.mark.parametrize(
-    ("segments", "power"),
-    [
-        ({0.5: (20, 4)}, 0.5),  # long enough at once
-        ({0.5: (3, 20), 0.05: (15, 4)}, 0.05),
-        ({0.5: (3, 20), 0.05: (4, 15), 0.02: (15, 4)}, 0.02),
-        ({0.5: (3, 20), 0.05: (40, 2), 0.16: (12, 5)}, 0.16),  # nearly whole demonstrations are no skills
-        ({0.5: (3, 20), 0.05: (60, 1), 0.16: (60, 1)}, 0.5),
-        ({0.5: (60, 1)}, 0.5),
-    ],
-)
-def test_options_last_long_enough_and_do_not_become_one(segments, power):
-    """``segments``: the median steps and the segments in a demonstration that each power gives."""
-
-    def tried(power, constant):
-        median, number = segments[power]
-        return Lasting(power, constant, 10, Segments(median=median, number=10 * number, demonstrations=10), 0.0)
-
-    assert unasked(tried, None).power == power

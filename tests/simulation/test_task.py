@@ -49,20 +49,6 @@ def with_outcome(outcome, **measures):
     return replace(toy_task.task, outcome=lambda environment: outcome, measures=measures)
 
 
-def test_what_a_task_does_not_declare_is_a_mean_but_success():
-    task = with_outcome({}, topples="mean", inserted="rate")
-    assert [task.kind(name) for name in ("success", "topples", "inserted")] == ["rate", "mean", "rate"]
-    assert [with_outcome({}).kind(name) for name in ("success", "topples", "inserted")] == ["rate", "mean", "mean"]
-
-
-def test_an_outcome_is_what_was_declared():
-    outcome = {"success": np.float32(1), "inserted": np.nan, "topples": 3}
-    task = with_outcome(outcome, success="rate", inserted="rate", topples="mean")
-    assert task.measured(None) == pytest.approx({"success": 1.0, "inserted": np.nan, "topples": 3.0}, nan_ok=True)
-    assert all(type(value) is float for value in task.measured(None).values())
-    assert with_outcome(outcome).measured(None).keys() == outcome.keys()
-
-
 @pytest.mark.parametrize(
     ("outcome", "measures", "message"),
     [

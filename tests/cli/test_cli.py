@@ -22,7 +22,7 @@ import toy_task
 import typer
 import yaml
 from command_line import COMMAND, HERE, call, with_set
-from killing import HANGS, struck
+from killing import HANGS
 
 import ddco_pyro
 from ddco_pyro.cli import console
@@ -32,7 +32,7 @@ from ddco_pyro.events import DemonstrationsDone, EpochEnded, TrainingBegan, Trai
 from ddco_pyro.names import method
 from ddco_pyro.spec import dump_spec, load_spec
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -176,20 +176,6 @@ def test_version_is_the_packages():
     assert (ended.status, ended.out, ended.err) == (0, f"ddco-pyro {declared}\n", "")
 
 
-WITH_PLANNERS = """
-import sys
-from ompl import base, geometric
-from ddco_pyro.cli.app import main
-sys.argv[1:] = ["--version"]
-main()
-"""
-
-
-def test_the_bindings_of_planners_say_nothing_at_the_end():
-    ended = subprocess.run([sys.executable, "-c", WITH_PLANNERS], capture_output=True, text=True)
-    assert (ended.returncode, ended.stderr) == (0, "")
-
-
 def test_nothing_at_all_is_help():
     ended = call()
     assert ended == call("--help")
@@ -329,25 +315,6 @@ def test_a_name_that_the_terminal_cannot_print_is_printed_all_the_same():
     assert ended.stderr.decode() == f"ddco-pyro: {shown}: there is no such file or folder; check the path\n"
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("number", ["SIGINT", "SIGTERM"])
-def test_an_interrupted_fit_goes_on_as_if_nothing_had_happened(spec, tmp_path, number):
-    longer = with_set("compare_with=[]", "training.epochs=60", "training.patience=null")
-    folder = tmp_path / "cut it"
-    interrupt = f"os.kill(os.getpid(), signal.{number})"
-    status, err = struck(["fit", spec, "--out", folder, *longer], HERE, "EpochEnded", 25, interrupt)
-    assert status == 1
-    assert not (folder / "model.safetensors").exists()
-    said, _, command = err.splitlines()[-1].partition("; continue with: ddco-pyro ")
-    assert said == "interrupted"
-    assert call(*shlex.split(command)).status == 0
-    assert call("fit", spec, "--out", tmp_path / "whole", *longer).status == 0
-    for name in ("model.safetensors", "history.csv", "spec.yaml"):
-        assert (folder / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
-    rows = (folder / "history.csv").read_text().splitlines()
-    assert len(rows) == 1 + 60
-
-
 LIGHT = """
 import runpy, sys
 import ddco_pyro
@@ -417,15 +384,3 @@ def test_a_fit_that_stops_early_says_so(clock, capsys, epochs, shown):
         f"training options: {shown}  level-1: training 1.250, tuning -0.500 nats/step",
         "training options: done after 3, 12 s",
     ]
-
-
-def test_the_first_of_many_says_nothing_of_the_time_left(clock, capsys):
-    """Restarts in processes: 30 s until they have begun, then one epoch each second."""
-    with console.Progress() as progress:
-        progress(TrainingBegan("ddco", 1000))
-        for now in range(30, 42):
-            clock[0] = now
-            progress(EpochEnded(0, "joint", 1, 1.0, 0.5))
-    first, second = capsys.readouterr().err.splitlines()
-    assert first == "training options: 1/1000  joint: training 1.000, tuning 0.500 nats/step"
-    assert second.startswith("training options: 12/1000, 988 s left")

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
-import subprocess
 
+import joblib
 import numpy as np
 import pytest
-import yaml
-from killing import COMMAND, struck
-from selecting import Told, data_at, kept, score, spec_at, two_skills
+from selecting import Told, kept, score, spec_at, two_skills
 
-import ddco_pyro
 from ddco_pyro.errors import Failed
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.selection import SelectionFailed, Workers, final_spec, folds, select
@@ -43,18 +39,6 @@ def test_a_score_is_that_of_a_fit_without_the_fold(finished):
         trained = train_model(row.candidate.spec, Dimensions.of(demos), rest)
         expected = Fit(row.candidate.spec, trained.hierarchy).log_likelihood(demos.select(names))
         np.testing.assert_array_equal(scores[row.candidate.number, 2]["log_likelihood"], expected)
-
-
-def test_what_is_refused_while_processes_import_is_one_line(tmp_path):
-    """They begin before the demonstrations are looked at."""
-    spec = data_at(tmp_path) | {"demonstrations": {"path": "nothing.hdf5"}}
-    (tmp_path / "spec.yaml").write_text(yaml.safe_dump(spec))
-    command = [COMMAND, "select", "spec.yaml", "--jobs", "2", "--out", "run"]
-    refused = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
-    assert refused.returncode == 2
-    assert refused.stderr.count("\n") == 1
-    assert "nothing.hdf5: there is no such file" in refused.stderr
-    assert not (tmp_path / "run").exists()
 
 
 def test_every_candidate_has_the_same_folds(finished):
@@ -155,43 +139,23 @@ def test_an_unexpected_error_is_told_and_tried_again_next_time(tmp_path, monkeyp
 # --- in processes -----------------------------------------------------------------------------------------------------
 
 
-def written(folder):
-    """A spec file of a selection that takes a while."""
-    data = data_at(folder)
-    data |= {"training": data["training"] | {"epochs": 16, "patience": None}}
-    (folder / "spec.yaml").write_text(yaml.safe_dump(data))
-    return folder / "spec.yaml"
-
-
-KILL = "os.killpg(0, signal.SIGKILL)"
-
-
-@pytest.mark.slow
-def test_a_killed_selection_goes_on_and_gives_the_same(tmp_path):
-    """kill -9 of the whole process group when some folds are done; what was done is not done again."""
-    spec = written(tmp_path)
-    arguments = ["select", spec, "--out"]
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    cut = tmp_path / "cut"
-    status, _ = struck([*arguments, cut, "--jobs", "2"], tmp_path, "CellDone", 2, KILL)
-    assert status == -signal.SIGKILL
-    done = {path: path.read_bytes() for path in (cut / "folds").glob("*.json")}
-    assert len(done) == 2
-    resumed = subprocess.run(
-        [COMMAND, *arguments, cut, "--jobs", "1", "--resume"], env=environment, capture_output=True, text=True
-    )
-    assert resumed.returncode == 0, resumed.stderr
-    assert f"({len(done)} of 8 kept)" in resumed.stderr
-    assert {path: path.read_bytes() for path in done} == done
-    told = Told()
-    select(ddco_pyro.load_spec(spec), tmp_path / "whole", told, ONE)
-    assert (cut / "selection.json").read_bytes() == (tmp_path / "whole" / "selection.json").read_bytes()
-    assert (cut / "selection.md").read_bytes() == (tmp_path / "whole" / "selection.md").read_bytes()
-    assert ddco_pyro.load(cut / "fit").metrics.demonstrations.train == 11  # and one to tune with
-
-
 @pytest.mark.slow
 def test_a_process_that_is_ended_from_outside_has_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr(folds, "score", lambda *_: signal.raise_signal(signal.SIGKILL))
     with pytest.raises(Failed, match=r"^a process that trained a fold was ended from outside .* continue"):
         select(spec_at(tmp_path), tmp_path / "run", Told(), Workers(2))
+
+
+@pytest.mark.slow
+def test_a_cluster_of_dask_gives_the_same(tmp_path):
+    """Two worker processes of a real scheduler."""
+    distributed = pytest.importorskip("distributed")
+    spec, size = spec_at(tmp_path), {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
+    with distributed.Client(**size, local_directory=tmp_path / "dask"), joblib.parallel_config("dask"):
+        select(spec, tmp_path / "cluster", Told())
+    select(spec, tmp_path / "here", Told(), ONE)
+    for name in ("selection.json", "folds.json"):
+        assert (tmp_path / "cluster" / name).read_bytes() == (tmp_path / "here" / name).read_bytes()
+    there, here = kept(tmp_path / "cluster"), kept(tmp_path / "here")
+    assert there.keys() == here.keys()
+    assert all(there[key]["log_likelihood"] == here[key]["log_likelihood"] for key in here)

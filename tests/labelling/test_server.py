@@ -101,7 +101,7 @@ def test_a_path_outside_the_table_is_not_there(session, path):
 
 
 def test_the_page_asks_for_nothing_outside_its_table_and_every_answer_is_guarded(client):
-    folder = Path(__file__).parent.parent / "ddco_pyro"
+    folder = Path(__file__).parents[2] / "ddco_pyro"
     static = {f"labelling/static/{file.name}" for file in (folder / "labelling" / "static").iterdir()}
     assert {name for name, _ in PAGE.values()} == {*static, "drawing/canvas.js"}
     for path, (name, kind) in PAGE.items():
@@ -192,7 +192,7 @@ def test_a_port_that_is_taken_is_named_and_tokens_differ():
 
 
 def test_an_interrupt_saves_and_ends_with_one_line():
-    program = Path(__file__).parent / "support" / "standing_in.py"
+    program = Path(__file__).parents[1] / "support" / "standing_in.py"
     interruptible = "import runpy, signal; signal.signal(signal.SIGTERM, signal.default_int_handler)"
     code = f"{interruptible}; runpy.run_path({str(program)!r}, run_name='__main__')"
     command = [sys.executable, "-c", code, "0"]
