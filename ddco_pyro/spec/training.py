@@ -28,10 +28,10 @@ class OptimizerSpec(Model):
     """The optimiser of the expectation-gradient steps."""
 
     name: Literal["adam", "adamw", "momentum", "em"] = "adam"
-    """``adam``, ``adamw``, ``momentum`` for gradient descent with momentum, or ``em``: expectation-maximisation where
-    every network of a model is linear, L-BFGS for perceptrons without dropout in a policy without options, ``adam`` for
-    other models. A spec whose networks are all linear, and that gives no other setting of gradient steps, has ``em`` if
-    it names none."""
+    """``adam``, ``adamw``, ``momentum`` for gradient descent with momentum 0.9, or ``em``: expectation-maximisation
+    where every network of a model is linear, L-BFGS for perceptrons without dropout in a policy without options,
+    ``adam`` for other models. A spec whose networks are all linear, and that gives no other setting of gradient steps,
+    has ``em`` if it names none."""
     ridge: RidgeSpec = RidgeSpec()
     """Ridges (``em`` only)."""
     lr: Positive = 1e-3
@@ -39,17 +39,9 @@ class OptimizerSpec(Model):
     schedule: Literal["constant", "cosine"] = "constant"
     """``cosine``: in each stage the learning rate falls along half a cosine to 0 at the last epoch of the stage's
     budget; needs ``training.epochs``."""
-    warmup: int = Field(default=0, ge=0)
-    """Epochs at the start of each stage over which the learning rate rises to ``lr``."""
-    momentum: Share = 0.9
-    """Momentum (``momentum`` only)."""
     weight_decay: float = Field(default=0.0, ge=0)
     """L2 penalty; for ``adamw`` the decoupled weight decay: every weight shrinks by ``lr`` × this in a step.
     Models that ``em`` trains have ridges instead."""
-
-    def problems(self) -> Problems:
-        if self.name != "momentum" and self.momentum != type(self).model_fields["momentum"].default:
-            yield "momentum", f"is for name: momentum, and {self.name} does not use it; leave it out"
 
 
 class RecogniserSpec(Model):
@@ -145,9 +137,8 @@ class TrainingSpec(Model):
 
     def problems(self) -> Problems:
         if self.optimizer.name == "em":
-            steps = self.optimizer
-            unused = {"average": self.average, "optimizer.warmup": steps.warmup}
-            for key, value in (unused | {"optimizer.schedule": steps.schedule != "constant"}).items():
+            unused = {"average": self.average, "optimizer.schedule": self.optimizer.schedule != "constant"}
+            for key, value in unused.items():
                 if value:
                     yield key, "em takes no gradient steps and would not use it; leave it out"
         if "mixture" in self.starts and self.lower_levels == "frozen":

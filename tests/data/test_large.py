@@ -99,7 +99,14 @@ def test_a_fit_to_pictures_stays_within_what_is_allowed(tmp_path: Path) -> None:
     data = {
         "demonstrations": {"path": str(path), "valid_fraction": 0.2},
         "observations": ["seen"],
-        "baseline": {"kind": "flat", "policy": {"network": "conv", "filters": 4, "hidden": [8]}},
+        "baseline": {
+            "kind": "flat",
+            "policy": {
+                "network": "conv",
+                "layers": [{"filters": 4, "kernel": 5, "stride": 2, "padding": 2}],
+                "hidden": [8],
+            },
+        },
         "training": {"epochs": 1},
     }
     spec.write_text(yaml.safe_dump(data))

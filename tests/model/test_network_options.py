@@ -19,7 +19,7 @@ SHAPE = InputShape({"state": 3}, {}, 5)
 
 @pytest.mark.parametrize("name", CLASSES)
 def test_the_settings_of_a_spec_reach_the_network(name):
-    other = {"hidden": [7, 9], "dropout": 0.25, "activation": "elu", "filters": 2, "kernel": 3}
+    other = {"hidden": [7, 9], "dropout": 0.25, "activation": "elu", "layers": [{"filters": 2, "kernel": 3}]}
     given = {key: value for key, value in other.items() if key in SETTINGS[name].model_fields}
     shape = InputShape({"state": 3}, {"camera": (6, 6, 3)} if name == "conv" else {}, 5)
     if name == "branches":

@@ -97,7 +97,13 @@ def test_what_cannot_read_it_is_refused(changes, message):
 SEEING = {
     "network": "branches",
     "of": {
-        "camera": {"network": "conv", "filters": 2, "pool": "flatten", "hidden": [4], "shared": True},
+        "camera": {
+            "network": "conv",
+            "layers": [{"filters": 2, "kernel": 5, "stride": 2, "padding": 2}],
+            "pool": "flatten",
+            "hidden": [4],
+            "shared": True,
+        },
         "vector": {"network": "lstm", "hidden": 3, "shared": True},
         "own": {"network": "mlp", "inputs": ["vector"], "hidden": [5]},
     },

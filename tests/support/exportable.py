@@ -90,7 +90,13 @@ CONVOLUTIONS = {
     "activation": "elu",
     "pool": "spatial_softmax",
 }
-LEAKY = {"network": "conv", "filters": 2, "pool": "flatten", "activation": "leaky_relu", "standardize": True}
+LEAKY = {
+    "network": "conv",
+    "layers": [{"filters": 2, "kernel": 5, "stride": 2, "padding": 2}],
+    "pool": "flatten",
+    "activation": "leaky_relu",
+    "standardize": True,
+}
 RECURRENT = {"network": "lstm", "over": {"hidden": [6]}, "hidden": [5, 4]}
 BRANCHES = {
     "network": "branches",

@@ -445,7 +445,7 @@ def test_a_flat_policy_for_each_time_step_is_least_squares_at_that_step():
 
 
 def test_a_spec_that_em_would_not_follow_is_refused():
-    for key, value in (("training.average", 0.9), ("training.optimizer.warmup", 2)):
+    for key, value in (("training.average", 0.9), ("training.optimizer.schedule", "cosine")):
         with pytest.raises(SpecError, match=f"{key}: em"):
             with_overrides(em_spec(), {key: value})
 
