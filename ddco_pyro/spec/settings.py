@@ -195,27 +195,29 @@ DISCRETE = ("binary", "categorical")
 """The kinds without a σ."""
 
 
-Freedom = Annotated[
-    Annotated[float, Field(ge=1, le=500)] | Literal["learn"],
-    nested((), lambda value: value, "a number from 1 to 500, or learn", ("learn",)),
-]
+class DistributionSpec(Model):
+    """The distribution of all control dimensions, or of some."""
+
+    kind: Kind = "auto"
+    """``gaussian``: unbounded; ``student``: heavy tails, those of Student's t with four degrees of freedom, which all
+    dimensions of a step share; ``clipped``: a Gaussian censored at bounds; ``hurdle``: one exact value with some
+    probability, else Gaussian or clipped; ``binary``: two values; ``categorical``: discrete actions, as integers or
+    one-hot rows; ``auto``: chosen for each dimension from the demonstrations and shown by ``check``, never
+    ``student``."""
+    std: Std | None = None
+    """Standard deviation σ in scaled units, or ``{learn: true, floor: ...}``; null in a part: as in ``control.std``."""
+    scale: Scale | None = None
+    """``standardize`` (by the training demonstrations), ``none``, or a list with a positive divisor for each dimension;
+    null in a part: as in ``control.scale``."""
 
 
-class PartSpec(Model):
+class PartSpec(DistributionSpec):
     """Control dimensions with their own distribution."""
 
     name: Text
     """Name of the part."""
     dims: Annotated[Items[Annotated[int, Field(ge=0)]], Field(min_length=1)]
     """Control dimensions, counted from 0."""
-    kind: Kind = "auto"
-    """As ``control.kind``."""
-    std: Std | None = None
-    """As ``control.std``; null: the same."""
-    scale: Scale | None = None
-    """As ``control.scale``; null: the same. A list has a number for each dimension of the part."""
-    freedom: Freedom | None = None
-    """As ``control.freedom``; null: the same."""
 
     def problems(self) -> Problems:
         if isinstance(self.scale, tuple) and len(self.scale) != len(self.dims):
@@ -223,22 +225,13 @@ class PartSpec(Model):
         for setting in ("scale", "std"):
             if self.kind in DISCRETE and getattr(self, setting) is not None:
                 yield setting, f"does not apply to kind: {self.kind}; leave it out"
-        if self.freedom is not None and self.kind != "student":
-            yield "freedom", "is for kind: student"
 
 
-class ControlSpec(Model):
+class ControlSpec(DistributionSpec):
     """The distribution of the control."""
 
-    kind: Kind = "auto"
-    """``gaussian``: unbounded; ``student``: heavy tails, which all dimensions of a step share; ``clipped``: a Gaussian
-    censored at bounds; ``hurdle``: one exact value with some probability, else Gaussian or clipped; ``binary``: two
-    values; ``categorical``: discrete actions, as integers or one-hot rows; ``auto``: chosen for each dimension from the
-    demonstrations and shown by ``check``, never ``student``."""
     std: Std = 0.1
     """Standard deviation σ in scaled units, or ``{learn: true, floor: ...}``."""
-    freedom: Freedom = 4.0
-    """For ``student``: degrees of freedom ν, from 1 (heaviest tails) to 500, or ``learn``."""
     scale: Scale = "standardize"
     """``standardize`` (by the training demonstrations), ``none``, or a list with a positive divisor for each control
     dimension."""
@@ -255,8 +248,6 @@ class ControlSpec(Model):
         return {path: std for path, std in stds.items() if isinstance(std, LearnedStd)}
 
     def problems(self) -> Problems:
-        if self.freedom != 4.0 and "student" not in (self.kind, *(part.kind for part in self.parts)):
-            yield "freedom", "is for kind: student"
         dimensions: dict[int, str] = {}
         for number, part in enumerate(self.parts):
             if part.name in [other.name for other in self.parts[:number]]:
