@@ -163,12 +163,12 @@ class Spec(Model):
             yield "training.labels.level", text
 
     def _segments(self) -> Problems:
-        if self.training.upper_levels != "segments":
+        if self.training.layerwise != "segments":
             return
         for number, emits in enumerate(self._emitted[1:], start=1):
             if "options" not in emits:
                 place = f"levels.{number}.policy" if number < len(self._levels) else "meta_policy"
-                yield f"hierarchy.{place}.emits", "training.upper_levels: segments needs options here"
+                yield f"hierarchy.{place}.emits", "training.layerwise: segments needs options here"
 
     @property
     def _levels(self) -> tuple[LevelSpec, ...]:

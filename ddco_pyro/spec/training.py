@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import ConfigDict, Field
 
-from ddco_pyro.spec.base import Count, Fraction, Items, Model, Positive, Problems, Seed, Share, Text
+from ddco_pyro.spec.base import Count, Fraction, Items, Model, Positive, Problems, Seed, Share, Text, nested
 
 
 class RidgeSpec(Model):
@@ -72,6 +72,9 @@ class LabelsSpec(Model):
     """A recogniser that the labelled steps train, for steps without labels and for other demonstrations; null: none."""
 
 
+Layerwise = Annotated[
+    bool | Literal["segments"], nested((), lambda value: value, "true, false, or segments", ("segments",))
+]
 Start = Literal["vq", "vq_controls", "windows", "equal_parts", "mixture", "random"]
 
 
@@ -93,13 +96,9 @@ class TrainingSpec(Model):
     window: Count = 10
     """Steps before and after a step over which ``windows`` averages observations and controls. People's skills show
     over a second, not in a step."""
-    layerwise: bool = True
-    """Whether levels are discovered one after another, lowest first, rather than all at once."""
-    upper_levels: Literal["clusters", "segments"] = "clusters"
-    """How layer-wise training discovers the levels above the lowest. ``clusters``: each level as the lowest, after the
-    level below. ``segments``: all together, from the order of the lowest level's options."""
-    lower_levels: Literal["fine_tuned", "frozen"] = "fine_tuned"
-    """Whether a last stage of layer-wise training trains all levels together, or discovered levels stay frozen."""
+    layerwise: Layerwise = True
+    """Whether levels are discovered one after another, lowest first, rather than all at once; in the end all levels
+    train together. ``segments``: the lowest alone, then all above it together, from the order of its options."""
     optimizer: OptimizerSpec = OptimizerSpec()
     """The optimiser."""
     epochs: Count | None = 800
@@ -141,11 +140,7 @@ class TrainingSpec(Model):
             for key, value in unused.items():
                 if value:
                     yield key, "em takes no gradient steps and would not use it; leave it out"
-        if "mixture" in self.starts and self.lower_levels == "frozen":
-            yield "lower_levels", "mixture trains all levels together in the end; say fine_tuned"
         if self.epochs is None and self.patience is None:
             yield "epochs", "epochs and training.patience are both null; give one of them"
         if self.epochs is None and self.optimizer.schedule == "cosine":
             yield "optimizer.schedule", "cosine ends at training.epochs, which is null"
-        if self.upper_levels == "segments" and not self.layerwise:
-            yield "upper_levels", "segments needs the lowest level discovered first; say layerwise: true"

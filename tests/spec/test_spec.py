@@ -419,7 +419,6 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ),
     ({"training.starts": ["clusters"]}, "training.starts.0: must be vq or vq_controls or windows or equal_parts"),
     ({"training.starts": []}, "training.starts: "),
-    ({"training": {"starts": ["mixture"], "lower_levels": "frozen"}}, "training.lower_levels: mixture trains all"),
     ({"task": None}, "task: missing; name a task, or give a file in demonstrations.path"),
     ({"observations": ["a", "a"]}, "observations.1.key: 'a' is given twice; keep one"),
     ({"observations": ["hand_pos", "goal"], "report.trajectory": "hand_po"}, "report.trajectory: there is no"),
@@ -430,7 +429,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"control.scale": "standardise"}, "control.scale: must be standardize, none, or a list of positive numbers"),
     ({"control.scale": [1.0, 0.0]}, "control.scale.1: must be greater than 0, got 0.0"),
     ({"training.optimizer.lr": float("inf")}, "training.optimizer.lr: must be a finite number, got inf"),
-    ({"training.layerwise": "yes"}, "training.layerwise: must be true or false, got 'yes'"),
+    ({"training.layerwise": "yes"}, "training.layerwise: must be true, false, or segments, got 'yes'"),
     ({"training": None}, "training: must be a mapping (key: value), got null"),
     ({"seed": 2**32}, "seed: must be at most 4294967295, got 4294967296"),
 ]

@@ -106,7 +106,7 @@ def test_it_is_the_likelihood_of_the_paths_that_have_the_labels(counts, level):
     [
         (1, {}, ["vq-1", "level-1", "vq-2", "level-2", "meta-policy", "joint"]),
         (2, {}, ["vq-2", "level-2", "meta-policy", "joint"]),
-        (2, {"training": {"upper_levels": "segments"}}, ["segments", "upper", "joint"]),
+        (2, {"training": {"layerwise": "segments"}}, ["segments", "upper", "joint"]),
     ],
 )
 def test_labels_matter_in_every_stage_that_has_their_level(level, own, stages):

@@ -29,10 +29,9 @@ QUICK = {"control": {"std": 1.0}, "optimizer": {"lr": 0.1}}
         ({}, 2, ["vq-1", "level-1", "vq-2", "level-2", "meta-policy", "joint"]),
         ({"starts": ["equal_parts"], "layerwise": False}, 2, ["parts-1", "parts-2", "joint"]),
         ({"starts": ["random"]}, 2, ["level-1", "level-2", "meta-policy", "joint"]),
-        ({"lower_levels": "frozen"}, 1, ["vq-1", "level-1", "meta-policy"]),
-        ({"upper_levels": "segments"}, 3, ["vq-1", "level-1", "segments", "upper", "joint"]),
+        ({"layerwise": "segments"}, 3, ["vq-1", "level-1", "segments", "upper", "joint"]),
         ({"starts": ["windows"]}, 1, ["vq-1", "level-1", "meta-policy", "joint"]),
-        ({"starts": ["mixture"], "upper_levels": "segments"}, 3, ["vq-1", "vq-2", "vq-3", "mixture", "joint"]),
+        ({"starts": ["mixture"], "layerwise": "segments"}, 3, ["vq-1", "vq-2", "vq-3", "mixture", "joint"]),
         ({"layerwise": False, "starts": ["random"]}, 3, ["joint"]),
         ({}, 0, ["policy"]),
     ],
@@ -228,7 +227,7 @@ def test_the_running_mean_of_the_weights_is_evaluated_and_kept(tmp_path, monkeyp
         ("adam", {"epochs": 12}, 2 * 6 * 2),
         pytest.param("momentum", {"epochs": 18}, 2 * 6 * 3, marks=pytest.mark.slow),
         pytest.param("adam", {"epochs": 30, "patience": 1}, None, marks=pytest.mark.slow),
-        pytest.param("adam", {"epochs": 10, "upper_levels": "segments"}, 2 * 5 * 2, marks=pytest.mark.slow),
+        pytest.param("adam", {"epochs": 10, "layerwise": "segments"}, 2 * 5 * 2, marks=pytest.mark.slow),
         pytest.param("adam", {"epochs": 12, "average": 0.9}, 2 * 6 * 2, marks=pytest.mark.slow),
         ("adam", {"epochs": 12, "starts": ["equal_parts", "mixture"]}, 12 + 12),
     ],
@@ -257,23 +256,6 @@ def test_resuming_gives_the_same_bits(tmp_path, optimizer, training, rows):
         assert resumed.history == whole.history
         assert resumed.summary == whole.summary
         assert all(torch.equal(found[name], value) for name, value in expected.items())
-
-
-def test_frozen_levels_stay_as_they_were_discovered(tmp_path, monkeypatch):
-    monkeypatch.setattr("ddco_pyro.training.loop.SAVE_EVERY", 0.0)
-    before = {}
-    spec = make_spec((2,), lower_levels="frozen", epochs=15)
-
-    def keep(row):
-        """What the checkpoint of the epoch before has: at the first of a stage, the best of the stage before."""
-        if row.stage == "meta-policy" and not before:
-            before.update(Restart.read(tmp_path / "restart-0.safetensors").states["best"])
-
-    final = make_trainer(spec, of_states([8] * 10), tmp_path, keep).run().state_dict()
-    lower = [name for name in final if name.startswith("levels.")]
-    meta = [name for name in final if name.startswith("meta_policy.network")]
-    assert all(torch.equal(final[name], before[name]) for name in lower)
-    assert any(not torch.equal(final[name], before[name]) for name in meta)
 
 
 def test_both_engines_train_to_the_same_model(tmp_path):
