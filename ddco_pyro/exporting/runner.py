@@ -305,10 +305,6 @@ class NumpyNetworks:
     def _joined(self, node: Mapping[str, Any], name: str) -> np.ndarray:
         return np.concatenate([self._evaluate(of, f"{name}.{number}") for number, of in enumerate(node["of"])], axis=1)
 
-    def _shared(self, node: Mapping[str, Any], name: str) -> np.ndarray:
-        values = self._evaluate(node["of"], f"{name}.of")
-        return np.broadcast_to(values, (node["copies"], values.shape[1]))
-
     def _perceptrons(self, node: Mapping[str, Any], name: str) -> np.ndarray:
         """K perceptrons, those of this step; an activation follows the hidden layers."""
         values = self._evaluate(node["of"], f"{name}.of")[:, None]

@@ -100,9 +100,6 @@ class HierarchySpec(Model):
                 for key, network in level.networks.items()
                 if (self.trunk if level.trunk is None or key == "trunk" else level.trunk)
             }
-            if self.trunk and level.trunk and level.trunk.shared:
-                text = "all options share the hierarchy's trunk; put these layers there"
-                yield f"levels.{index}.trunk.shared", text
         for place, head in heads.items():
             if head.network not in HEADS:
                 yield f"{place}.network", f"reads the trunk: use one of {', '.join(HEADS)}, got {head.network!r}"

@@ -46,8 +46,6 @@ class Network(Model):
     """The kind of network; ``module:Class`` for your own class."""
     inputs: Items[Text] = ()
     """Names of the observations that the network reads; empty: all of them."""
-    shared: bool = False
-    """Whether all options use one copy of the network. For trunks, and for networks in ``of`` and ``over``."""
     emits: Items[Emission] = Field(default=(), min_length=1)
     """For policies: what they choose. The lowest level emits ``[control]``. Policies above emit ``options`` (the
     default), ``control``, or both, which makes a hybrid policy."""
@@ -83,7 +81,7 @@ class Network(Model):
 
     @model_serializer(mode="wrap")
     def _without_empty(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        optional = ("inputs", "shared", "emits")
+        optional = ("inputs", "emits")
         return {key: value for key, value in serialize(self).items() if value or key not in optional}
 
 

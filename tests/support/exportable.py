@@ -101,9 +101,9 @@ RECURRENT = {"network": "lstm", "over": {"hidden": [6]}, "hidden": [5, 4]}
 BRANCHES = {
     "network": "branches",
     "of": {
-        "camera": {"network": "lstm", "over": LEAKY | {"shared": True}, "hidden": [4, 3], "horizon": 3},
+        "camera": {"network": "lstm", "over": LEAKY, "hidden": [4, 3], "horizon": 3},
         "pair": {"network": "mlp", "inputs": ["goal", "state"], "hidden": [6], "activation": "tanh"},
-        "state": {"network": "lstm", "hidden": 3, "shared": True},
+        "state": {"network": "lstm", "hidden": 3},
         "step": {"network": "linear"},
     },
     "hidden": [7],
