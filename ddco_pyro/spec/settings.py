@@ -5,9 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, NamedTuple, get_args
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, InstanceOf, PlainSerializer
 
 from ddco_pyro.spec.base import (
     Count,
@@ -297,17 +297,15 @@ class RolloutSpec(Model):
 SLICE = re.compile(r"\d{0,9}:\d{0,9}")
 
 
-class PathSpec(Model):
-    """Two or three numbers of an observation that are drawn as a path in space."""
+class PathSpec(NamedTuple):
+    """Two or three numbers of an observation that are drawn as a path in space.
 
-    key: Text
-    """Name of the observation."""
+    :param key: name of the observation.
+    :param numbers: which of its numbers, as a Python slice such as ``3:6``; None: the first three, or both of two.
+    """
+
+    key: str
     numbers: str | None = None
-    """Which of its numbers, as a Python slice such as ``3:6``; null: the first three, or both of two."""
-
-    def problems(self) -> Problems:
-        if self.numbers is not None and not SLICE.fullmatch(self.numbers):
-            yield "", f"must be a slice such as 3:6 after the key, got {show(self.numbers)}"
 
     def __str__(self) -> str:
         return self.key if self.numbers is None else f"{self.key}[{self.numbers}]"
@@ -319,16 +317,20 @@ class PathSpec(Model):
 
 
 def _paths(value: Any) -> Any:
-    """One path or several, as a list of mappings."""
-    return [_path(one) for one in (value if isinstance(value, list | tuple) and not _is_pair(value) else (value,))]
+    """One path or several."""
+    return tuple(_path(one) for one in (value if isinstance(value, list | tuple) and not _is_pair(value) else (value,)))
 
 
-def _path(value: Any) -> Any:
-    if isinstance(value, Mapping | PathSpec):
-        return value
-    if not isinstance(value, str) and not _is_pair(value):
-        raise invalid(("", f"must be KEY or [KEY, slice], such as [pose, 3:6], got {show(value)}"))
-    return dict(zip(("key", "numbers"), (value,) if isinstance(value, str) else value, strict=False))
+def _path(value: Any) -> PathSpec:
+    if isinstance(value, str) and value:
+        return PathSpec(value)
+    if isinstance(value, PathSpec) or _is_pair(value):
+        return PathSpec(*value)
+    raise invalid(("", f"must be KEY or [KEY, slice], such as [pose, 3:6], got {show(value)}"))
+
+
+def _written(paths: tuple[PathSpec, ...] | None) -> Any:
+    return paths and [path.key if path.numbers is None else [*path] for path in paths]
 
 
 def _is_pair(value: Any) -> bool:
@@ -337,16 +339,16 @@ def _is_pair(value: Any) -> bool:
     return texts and SLICE.fullmatch(value[1]) is not None
 
 
+Trajectory = Annotated[
+    Items[InstanceOf[PathSpec]],
+    Field(min_length=1),
+    BeforeValidator(_paths, json_schema_input_type=str | list[str | list[str]]),
+]
+
+
 class ReportSpec(Model):
     """What the report shows."""
 
-    trajectory: (
-        Annotated[
-            Items[PathSpec],
-            Field(min_length=1),
-            BeforeValidator(_paths, json_schema_input_type=str | PathSpec | list[str | list[str] | PathSpec]),
-        ]
-        | None
-    ) = None
+    trajectory: Annotated[Trajectory | None, PlainSerializer(_written)] = None
     """What is drawn as paths in space: an observation (its first three numbers, or both of two), ``[key, slice]``, or a
     list of these, one for each arm; null: the observation that moves most as the controls say."""

@@ -423,7 +423,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"observations": ["a", "a"]}, "observations.1.key: 'a' is given twice; keep one"),
     ({"observations": ["hand_pos", "goal"], "report.trajectory": "hand_po"}, "report.trajectory: there is no"),
     ({"report.trajectory": ["pose", "grip", 3]}, "report.trajectory: must be KEY or [KEY, slice], such as [pose, 3:6]"),
-    ({"report.trajectory": {"key": "pose", "numbers": "3-6"}}, "report.trajectory.0: must be a slice such as 3:6"),
+    ({"report.trajectory": ["pose", "3-6"]}, "report.trajectory: there is no observation '3-6'"),
     ({"report.trajectory": []}, "report.trajectory: must have at least 1 item(s)"),
     ({"control.std": -0.1}, "control.std: must be a positive number or {learn: true}, got -0.1"),
     ({"control.scale": "standardise"}, "control.scale: must be standardize, none, or a list of positive numbers"),
