@@ -16,9 +16,7 @@ class RidgeSpec(Model):
     """Of the means of controls: as many steps, of observations with unit variance, that say 0; in units of 1/σ².
     Also of the logits of switches and discrete actions."""
     gate: float = Field(default=1.0, ge=0)
-    """Of the logits of options."""
-    termination: float = Field(default=1.0, ge=0)
-    """Of terminations."""
+    """Of the logits of options and of terminations."""
     cross_validated: bool = False
     """Whether ``policy`` is raised, to at most 1000 times as much, where leaving out training demonstrations shows that
     a larger one explains them better by half a nat per step."""

@@ -206,8 +206,7 @@ class Expectation:
         self._callers = {**levels, "meta_policy": model.meta_policy}
         self._networks: dict[str, Linear] = {}
         for name, network in model.networks().items():
-            kind = ridge.termination if name.endswith("termination") else ridge.gate
-            self._networks[name] = Linear(network, kind, f"{name}.".startswith(trained))
+            self._networks[name] = Linear(network, ridge.gate, f"{name}.".startswith(trained))
         self._stds = {
             name: Std(caller, self._networks[name].trained)
             for name, caller in self._callers.items()

@@ -314,7 +314,7 @@ def test_what_is_written_is_read_as_it_was(tmp_path_factory: pytest.TempPathFact
 def test_all_defaults_are_written() -> None:
     written = yaml.safe_load(dump_spec(parse_spec(SMALL)))
     assert written["hierarchy"]["levels"][0]["termination"] == {"network": "linear"}
-    assert written["training"]["optimizer"]["ridge"].keys() == {"policy", "gate", "termination", "cross_validated"}
+    assert written["training"]["optimizer"]["ridge"].keys() == {"policy", "gate", "cross_validated"}
     assert set(written) == set(Spec.model_fields)
 
 

@@ -110,7 +110,7 @@ def penalised(model, batch, ridge, discovering=None):
         if not name.endswith("weight") or (discovering and name.startswith("meta_policy")):
             continue
         if "termination" in name:
-            value = value - 0.5 * ridge.termination * parameter.square().sum()
+            value = value - 0.5 * ridge.gate * parameter.square().sum()
             continue
         caller = model.get_submodule(name.split(".network.")[0])
         logits, std, power = caller.sizes[0], caller.std, float(model.power)
@@ -168,7 +168,7 @@ CASES = {
 def test_steps_never_lower_the_penalised_likelihood_and_end_where_its_gradient_is_zero(case):
     """Checked by autograd on the networks in float64, and by the formula of the prior."""
     counts, parts, others = CASES[case]
-    model, ridge = linear(counts, parts, **others).double(), RidgeSpec(policy=2.0, gate=1.5, termination=0.5)
+    model, ridge = linear(counts, parts, **others).double(), RidgeSpec(policy=2.0, gate=1.5)
     batch = batch_for(parts)
     assert is_linear(model)
     made, values = expectation(model, ridge, batch)
@@ -212,7 +212,7 @@ def test_constant_gates_and_terminations_are_the_hidden_markov_model_that_baum_w
     model, batch = linear((3,), above=CONSTANT, std=LEARNED).double(), batch_for(None, 20, 12)
     skills = (torch.arange(12) + torch.arange(20)[:, None]) // torch.tensor([5, 3, 2]).repeat(7)[:20, None] % 3
     batch = Batch(batch.inputs, batch.actions + skills[..., None], batch.lengths)
-    expectation(model, RidgeSpec(gate=7.0, termination=7.0), batch)  # ridges are of weights: constants have none
+    expectation(model, RidgeSpec(gate=7.0), batch)  # ridges are of weights: constants have none
     (policy,), gate = model.option_levels(), model.meta_policy.network.layers[0].bias[0, 0].detach()
     start, ends = (
         gate.softmax(0).numpy(),
@@ -311,7 +311,7 @@ def rows_of(batch):
 def test_a_flat_policy_is_least_squares():
     """Without a ridge: numpy's least squares and the residuals' standard deviation."""
     model, batch = linear((), std=LEARNED), batch_for(None)
-    expectation(model, RidgeSpec(policy=0, gate=0, termination=0), batch)
+    expectation(model, RidgeSpec(policy=0, gate=0), batch)
     x, a = rows_of(batch)
     with_one = np.hstack([x, np.ones((len(x), 1))])
     solved, *_ = np.linalg.lstsq(with_one, a, rcond=None)
@@ -352,7 +352,7 @@ def test_options_under_heavy_tails_are_recovered(freedom):
 def test_a_flat_clipped_policy_is_the_censored_regression_that_scipy_finds():
     """The Tobit model's likelihood is maximised by BFGS from other weights."""
     model, batch = linear((), CLIPPED, std=LEARNED), batch_for(CLIPPED)
-    expectation(model, RidgeSpec(policy=0, gate=0, termination=0), batch)
+    expectation(model, RidgeSpec(policy=0, gate=0), batch)
     x, a = rows_of(batch)
     with_one = np.hstack([x, np.ones((len(x), 1))])
     layer = model.meta_policy.network.layers[0]
