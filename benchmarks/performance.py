@@ -278,7 +278,7 @@ def _status(what: str) -> float:
 # --- EM and whole fits ------------------------------------------------------------------------------------------------
 
 
-ALONE = {"control.power": 1.0, "training.optimizer.ridge": dict.fromkeys(("policy", "gate", "termination"), 0.0)}
+ALONE = {"control.power": 1.0, "training.optimizer.ridge": {"policy": 0.0, "gate": 0.0}}
 """What makes the objective the likelihood of the controls alone."""
 
 

@@ -28,7 +28,7 @@ from ddco_pyro.training.processes import one_thread
 from ddco_pyro.training.restarts import Trainer
 
 AIMS = {"epoch of pictures in a file / pictures in memory": ("≤", 1.15)}
-FF = {"network": "conv", "filters": 64, "kernel": 5, "hidden": [64]}
+FF = {"network": "conv", "hidden": [64]}
 """The paper's: a convolution of 64 filters of 5 × 5 and a fully connected layer (SM 1.2)."""
 
 SIZE = (120, 160, 3)
@@ -126,8 +126,8 @@ def networks_alone(demos: Demonstrations) -> Callable[[], float]:
 
 def chunks() -> Iterator[Row]:
     """A gradient of 240 pictures of 64 × 64 in eight chunks of time, over the same in one piece."""
-    conv = {"network": "conv", "filters": 8, "kernel": 5, "hidden": [32]}
-    ends = {"network": "conv", "filters": 2, "hidden": []}
+    conv = {"network": "conv", "layers": [{"filters": 8, "kernel": 5, "stride": 2, "padding": 2}], "hidden": [32]}
+    ends = {"network": "conv", "layers": [{"filters": 2, "kernel": 5, "stride": 2, "padding": 2}], "hidden": []}
     steps, random = 240, np.random.default_rng(0)
     camera = random.integers(256, size=(steps, 64, 64, 3), dtype=np.uint8)
     demos = Demonstrations((Demonstration("demo_0", {"camera": camera}, random.normal(size=(steps, 3))),))

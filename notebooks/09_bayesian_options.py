@@ -184,7 +184,7 @@ plt.show()
 ridge = spec.training.optimizer.ridge
 spreads = {
     "levels.0.policy.network.layers.0.weight": SIGMA * ridge.policy**-0.5,
-    "levels.0.termination.layers.0.weight": ridge.termination**-0.5,
+    "levels.0.termination.layers.0.weight": ridge.gate**-0.5,
     "meta_policy.network.layers.0.weight": ridge.gate**-0.5,
 }
 priors = {

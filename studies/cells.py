@@ -258,7 +258,7 @@ class Folder:
             added = {"template": hashlib.sha256(TEMPLATE.read_bytes()).hexdigest()[:16]}
         else:
             spec = with_overrides(study.base, {**given, **_placed(cell, "demonstrations.hdf5")})
-            baseline = baseline and named_baselines(spec).get(baseline.name, baseline)
+            baseline = baseline and named_baselines(spec).get(baseline.kind, baseline)
             shown = {"report", "selection", "compare_with"}  # what a result does not depend on
             given, added = (spec.model_dump(mode="json", exclude=shown, exclude_defaults=own) for own in (True, False))
         return {
@@ -357,7 +357,7 @@ class Folder:
         demos = replace(demos, masks={"train": tuple(train), "valid": tuple(valid)})
         if (baseline := study.declared.methods[cell.of].baseline) is not None:
             bare = baseline.model_fields_set == {"kind"}
-            beside = named_baselines(spec).get(baseline.name, baseline) if bare else baseline
+            beside = named_baselines(spec).get(baseline.kind, baseline) if bare else baseline
             spec = baseline_spec(spec, beside, Dimensions.of(demos))
             return with_overrides(spec, {"compare_with": []}), demos
         mixtures = [one.model_dump(exclude_unset=True) for one in spec.compare_with if one.kind == "mixture"]

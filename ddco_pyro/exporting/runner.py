@@ -305,10 +305,6 @@ class NumpyNetworks:
     def _joined(self, node: Mapping[str, Any], name: str) -> np.ndarray:
         return np.concatenate([self._evaluate(of, f"{name}.{number}") for number, of in enumerate(node["of"])], axis=1)
 
-    def _shared(self, node: Mapping[str, Any], name: str) -> np.ndarray:
-        values = self._evaluate(node["of"], f"{name}.of")
-        return np.broadcast_to(values, (node["copies"], values.shape[1]))
-
     def _perceptrons(self, node: Mapping[str, Any], name: str) -> np.ndarray:
         """K perceptrons, those of this step; an activation follows the hidden layers."""
         values = self._evaluate(node["of"], f"{name}.of")[:, None]
@@ -344,7 +340,7 @@ class NumpyNetworks:
             weight, bias = self._weights[f"{name}.{number}.weight"], self._weights[f"{name}.{number}.bias"]
             maps = _convolved(np.broadcast_to(maps, (node["copies"], *maps.shape[1:])), weight, bias, layer)
             maps = ACTIVATIONS[node["activation"]](maps)
-        return POOLS[node["pool"]](maps, node["pooled"]).reshape(node["copies"], -1)
+        return POOLS[node["pool"]](maps).reshape(node["copies"], -1)
 
 
 def _sigmoid(x: np.ndarray) -> np.ndarray:
@@ -369,13 +365,13 @@ ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 
 
-def _means(maps: np.ndarray, pooled: int) -> np.ndarray:
-    """Means over ``pooled`` × ``pooled`` fields, [K, filters, pooled, pooled]."""
-    rows, columns = (_fields(length, pooled) for length in maps.shape[2:])
+def _means(maps: np.ndarray) -> np.ndarray:
+    """Means over 8 × 8 fields, [K, filters, 8, 8]."""
+    rows, columns = (_fields(length, 8) for length in maps.shape[2:])
     return np.stack([np.stack([maps[:, :, a:b, c:d].mean((2, 3)) for c, d in columns], -1) for a, b in rows], -2)
 
 
-def _expected_places(maps: np.ndarray, _: int) -> np.ndarray:
+def _expected_places(maps: np.ndarray) -> np.ndarray:
     """The expected (row, column), each from -1 to 1, under the softmax of each map, [K, filters, 2]."""
     weights = np.exp(maps - maps.max((2, 3), keepdims=True))
     weights /= weights.sum((2, 3), keepdims=True)
@@ -383,9 +379,9 @@ def _expected_places(maps: np.ndarray, _: int) -> np.ndarray:
     return np.stack([weights.sum(3) @ rows, weights.sum(2) @ columns], -1)
 
 
-POOLS: dict[str, Callable[[np.ndarray, int], np.ndarray]] = {
+POOLS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "mean": _means,
-    "flatten": lambda maps, _: maps,
+    "flatten": lambda maps: maps,
     "spatial_softmax": _expected_places,
 }
 

@@ -244,7 +244,7 @@ def _fit_model(
 
 def _contains(spec: Spec, baseline: Spec) -> bool:
     """Whether a hierarchy contains a baseline, a mixture of the same policies that is trained in the same way."""
-    if spec.hierarchy is None or baseline.hierarchy is None or spec.training.lower_levels == "frozen":
+    if spec.hierarchy is None or baseline.hierarchy is None:
         return False
     return baseline.training == spec.training and baseline.control == spec.control
 

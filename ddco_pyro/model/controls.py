@@ -12,7 +12,7 @@ from torch.nn.functional import softplus
 
 from ddco_pyro.data.controls import ControlPart, number, same
 from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
-from ddco_pyro.model.emissions import KINDS, Emission, Parameter, Product
+from ddco_pyro.model.emissions import KINDS, Emission, Product
 from ddco_pyro.spec import ControlSpec, LearnedStd
 
 INITIAL_STD = 0.5
@@ -45,9 +45,7 @@ class ControlScaling(nn.Module):
     ) -> None:
         super().__init__()
         self.parts = parts
-        self.counts = [
-            len(part.dims) * part.continuous + len(KINDS[part.kind].further_parameters(spec, part)) for part in parts
-        ]
+        self.counts = [len(part.dims) * part.continuous for part in parts]
         varying = [dimension for dimension in range(size) if dimension not in constant]
         self.groups = [tuple(varying.index(dimension) for dimension in part.dims) for part in parts]
         shift, scale, standardized = _declared(spec, varying, parts)
@@ -191,10 +189,9 @@ def _declared(
 
 
 class ControlStd(nn.Module):
-    """The parameters of a caller's control that no network gives: fixed, or learned above a floor.
+    """The standard deviations σ of a caller's continuous dimensions, in scaled units: fixed, or learned above a floor.
 
-    They are the standard deviations σ of continuous dimensions, in scaled units, and what a kind has beside
-    (:meth:`~ddco_pyro.model.emissions.Emission.further_parameters`), one part after the other.
+    Those of one part come after those of the other.
 
     The options of a level share a σ unless the spec says ``per_option``: with its own σ an option can collect the steps
     where a Gaussian control hardly varies, as on a bound, whatever the skill (docs/decisions.md). With ``per_state``
@@ -209,21 +206,16 @@ class ControlStd(nn.Module):
 
     def __init__(self, spec: ControlSpec, scaling: ControlScaling, copies: int) -> None:
         super().__init__()
-        stds: dict[int, LearnedStd] = {}
-        each: list[Parameter] = []
-        for part in scaling.parts:
-            for std in (_std_of(spec, dimension) for dimension in part.dims if part.continuous):
-                if isinstance(std, LearnedStd):
-                    stds[len(each)] = std
-                each.append(Parameter(None, std.floor, INITIAL_STD) if isinstance(std, LearnedStd) else Parameter(std))
-            each += KINDS[part.kind].further_parameters(spec, part)
+        each = [_std_of(spec, dimension) for part in scaling.parts for dimension in part.dims if part.continuous]
+        stds = {place: std for place, std in enumerate(each) if isinstance(std, LearnedStd)}
         self.own = [place for place, std in stds.items() if std.per_option]
         self.of_state = [place for place, std in stds.items() if std.per_state]
-        learned = [place for place, parameter in enumerate(each) if parameter.fixed is None]
-        self.shared = [place for place in learned if place not in (*self.own, *self.of_state)]
-        self.register_buffer("fixed", torch.tensor([float(one.fixed or 0.0) for one in each]), persistent=False)
-        self.register_buffer("floor", torch.tensor([one.floor for one in each]), persistent=False)
-        start = [math.log(math.expm1(max(one.start - one.floor, 1e-3))) for one in each]
+        self.shared = [place for place in stds if place not in (*self.own, *self.of_state)]
+        fixed = [0.0 if isinstance(std, LearnedStd) else std for std in each]
+        floor = [std.floor if isinstance(std, LearnedStd) else 0.0 for std in each]
+        self.register_buffer("fixed", torch.tensor(fixed), persistent=False)
+        self.register_buffer("floor", torch.tensor(floor), persistent=False)
+        start = [math.log(math.expm1(max(INITIAL_STD - least, 1e-3))) for least in floor]
         self.register_buffer("start", torch.tensor(start), persistent=False)
         if self.shared:
             self.raw = nn.Parameter(torch.tensor([start[place] for place in self.shared]))

@@ -71,7 +71,7 @@ def overrides(spec: Spec, power: float, constant: bool, window: int) -> dict[str
     """The key paths of a spec whose options last as these values make them."""
     values: dict[str, Any] = {"control.power": power}
     if power < USUAL:
-        values |= {f"training.optimizer.ridge.{gate}": RIDGE for gate in ("gate", "termination")}
+        values["training.optimizer.ridge.gate"] = RIDGE
         values |= {"training.starts": ["windows"], "training.window": window} if window else {}
     if constant and spec.hierarchy is not None:
         levels = enumerate(spec.hierarchy.levels)

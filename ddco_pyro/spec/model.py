@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, SerializerFunctionWrapHandler, field_validator, model_serializer
 
-from ddco_pyro.spec.base import Count, Emission, Items, Model, Problems, Text, bare, nested
+from ddco_pyro.spec.base import Count, Emission, Items, Model, Problems, bare, nested
 from ddco_pyro.spec.networks import LinearSpec, MlpSpec, Network, NetworkSpec, PolicySpec, TrunkSpec
 from ddco_pyro.spec.settings import LearnedStd
 from ddco_pyro.spec.training import OptimizerSpec
@@ -100,9 +100,6 @@ class HierarchySpec(Model):
                 for key, network in level.networks.items()
                 if (self.trunk if level.trunk is None or key == "trunk" else level.trunk)
             }
-            if self.trunk and level.trunk and level.trunk.shared:
-                text = "all options share the hierarchy's trunk; put these layers there"
-                yield f"levels.{index}.trunk.shared", text
         for place, head in heads.items():
             if head.network not in HEADS:
                 yield f"{place}.network", f"reads the trunk: use one of {', '.join(HEADS)}, got {head.network!r}"
@@ -116,8 +113,6 @@ def _emitting(policy: PolicySpec, default: Emission) -> PolicySpec:
 
 Kind = Literal["flat", "flat_equal", "per_timestep", "mixture"]
 
-_OF_A_MIXTURE = ("levels", "count", "meta_policy")
-
 
 class BaselineSpec(Model):
     """A model to compare a hierarchy with: without options, or with options that do not last."""
@@ -125,34 +120,16 @@ class BaselineSpec(Model):
     kind: Kind
     """``flat``: one policy for all time steps. ``flat_equal``: a flat policy whose hidden layers are scaled by one
     factor until the policy has as many parameters as the hierarchy. ``per_timestep``: one perceptron for each time
-    step, with the settings in ``policy``. ``mixture``: several policies, of which the meta-policy selects one at every
-    step (ψ = 1); in ``compare_with`` a mixture is the hierarchy with all its networks except the terminations."""
+    step, with the settings in ``policy``. ``mixture``, in ``compare_with``: the hierarchy with all its networks except
+    the terminations, so that every option ends after every step (ψ = 1)."""
     policy: NetworkSpec = MlpSpec()
-    """The policy's network, π. For a ``mixture`` in place of ``hierarchy``: the network of each expert."""
-    levels: Items[Text] = ()
-    """For a ``mixture`` in ``compare_with``: names of the levels whose options end after every step; empty: all."""
-    count: Count | None = None
-    """For a ``mixture`` in place of ``hierarchy``: number of experts."""
-    meta_policy: PolicySpec | None = None
-    """For a ``mixture`` in place of ``hierarchy``: the gate, which selects the expert; null: the default network."""
+    """The policy's network, π; a ``mixture`` has those of the hierarchy."""
     optimizer: OptimizerSpec | None = None
     """In ``compare_with``: settings that differ from ``training.optimizer`` for this baseline; null: none."""
     std: LearnedStd | None = None
     """In ``compare_with``: the σ of this baseline wherever σ is learned in ``control.std`` and ``control.parts``. Null:
     as in ``control``. The floor stays unless ``floor`` is given. With ``{learn: true, per_state: true}`` the σ of a
     flat policy depends on the state, as the σ of options differs between options."""
-
-    @property
-    def name(self) -> str:
-        """The baseline's name in tables."""
-        return "_".join((self.kind, *self.levels))
-
-    @property
-    def as_hierarchy(self) -> HierarchySpec:
-        """The hierarchy that a ``mixture`` in place of ``hierarchy`` is: one level, whose options end every step."""
-        assert self.count is not None  # checked where the property is read
-        expert = LevelSpec(name="expert", count=self.count, policy=self.policy, termination=ALWAYS)
-        return HierarchySpec(levels=(expert,), meta_policy=self.meta_policy or MlpSpec())
 
     def problems(self) -> Problems:
         network = self.policy.network
@@ -162,13 +139,12 @@ class BaselineSpec(Model):
         if self.kind == "per_timestep" and network not in (*PERCEPTRONS, "per_timestep"):
             text = f"per_timestep has a perceptron for each step: use one of {', '.join(PERCEPTRONS)}"
             yield "policy.network", f"{text}, got {network!r}, or say kind: flat"
-        for key in _OF_A_MIXTURE:
-            if key in self.model_fields_set and self.kind != "mixture":
-                yield key, f"is a setting of mixture, not of {self.kind}; leave it out"
+        if self.kind == "mixture" and "policy" in self.model_fields_set:
+            yield "policy", "a mixture has the networks of the hierarchy; leave it out"
 
     @model_serializer(mode="wrap")
     def _without_foreign_keys(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        foreign = ("policy", *_OF_A_MIXTURE[1:]) if self.kind == "mixture" else _OF_A_MIXTURE
+        foreign = ("policy",) if self.kind == "mixture" else ()
         return {key: value for key, value in serialize(self).items() if key not in foreign}
 
 

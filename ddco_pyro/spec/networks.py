@@ -46,8 +46,6 @@ class Network(Model):
     """The kind of network; ``module:Class`` for your own class."""
     inputs: Items[Text] = ()
     """Names of the observations that the network reads; empty: all of them."""
-    shared: bool = False
-    """Whether all options use one copy of the network. For trunks, and for networks in ``of`` and ``over``."""
     emits: Items[Emission] = Field(default=(), min_length=1)
     """For policies: what they choose. The lowest level emits ``[control]``. Policies above emit ``options`` (the
     default), ``control``, or both, which makes a hybrid policy."""
@@ -83,7 +81,7 @@ class Network(Model):
 
     @model_serializer(mode="wrap")
     def _without_empty(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        optional = ("inputs", "shared", "emits")
+        optional = ("inputs", "emits")
         return {key: value for key, value in serialize(self).items() if value or key not in optional}
 
 
@@ -140,30 +138,15 @@ class ConvSpec(MlpSpec):
     """Convolutions followed by a perceptron."""
 
     network: Literal["conv"]  # type: ignore[assignment]
-    filters: Count = 64
-    """Number of filters of a single convolution with stride 2."""
-    kernel: Count = 5
-    """Height and width in pixels of each filter of a single convolution."""
-    layers: Items[ConvolutionLayer] = ()
-    """Several convolutions, first layer first, in place of ``filters`` and ``kernel``."""
+    layers: Annotated[Items[ConvolutionLayer], Field(min_length=1)] = (
+        ConvolutionLayer(filters=64, kernel=5, stride=2, padding=2),
+    )
+    """The convolutions, first layer first."""
     pool: Pool = "mean"
-    """What is read of each map: the ``mean`` of ``pooled`` × ``pooled`` fields, all of the map (``flatten``), or the
-    place where the map is active (``spatial_softmax``)."""
-    pooled: Count = 8
-    """Number of fields along each side of a map."""
+    """What is read of each map: the ``mean`` of 8 × 8 fields, all of the map (``flatten``), or the place where the map
+    is active (``spatial_softmax``)."""
     standardize: bool = False
     """Whether each picture is shifted and scaled to mean 0 and standard deviation 1 over its pixels and channels."""
-
-    def problems(self) -> Problems:
-        yield from super().problems()
-        for key in ("filters", "kernel"):
-            if self.layers and key in self.model_fields_set:
-                yield key, "each of layers has its own; leave it out"
-
-    @model_serializer(mode="wrap")
-    def _without_empty(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        unused = ("filters", "kernel") if self.layers else ("layers",)
-        return {key: value for key, value in super()._without_empty(serialize).items() if key not in unused}
 
 
 class LstmSpec(Network):

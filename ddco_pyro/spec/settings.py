@@ -5,9 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, NamedTuple, get_args
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, InstanceOf, PlainSerializer
 
 from ddco_pyro.spec.base import (
     Count,
@@ -195,27 +195,29 @@ DISCRETE = ("binary", "categorical")
 """The kinds without a σ."""
 
 
-Freedom = Annotated[
-    Annotated[float, Field(ge=1, le=500)] | Literal["learn"],
-    nested((), lambda value: value, "a number from 1 to 500, or learn", ("learn",)),
-]
+class DistributionSpec(Model):
+    """The distribution of all control dimensions, or of some."""
+
+    kind: Kind = "auto"
+    """``gaussian``: unbounded; ``student``: heavy tails, those of Student's t with four degrees of freedom, which all
+    dimensions of a step share; ``clipped``: a Gaussian censored at bounds; ``hurdle``: one exact value with some
+    probability, else Gaussian or clipped; ``binary``: two values; ``categorical``: discrete actions, as integers or
+    one-hot rows; ``auto``: chosen for each dimension from the demonstrations and shown by ``check``, never
+    ``student``."""
+    std: Std | None = None
+    """Standard deviation σ in scaled units, or ``{learn: true, floor: ...}``; null in a part: as in ``control.std``."""
+    scale: Scale | None = None
+    """``standardize`` (by the training demonstrations), ``none``, or a list with a positive divisor for each dimension;
+    null in a part: as in ``control.scale``."""
 
 
-class PartSpec(Model):
+class PartSpec(DistributionSpec):
     """Control dimensions with their own distribution."""
 
     name: Text
     """Name of the part."""
     dims: Annotated[Items[Annotated[int, Field(ge=0)]], Field(min_length=1)]
     """Control dimensions, counted from 0."""
-    kind: Kind = "auto"
-    """As ``control.kind``."""
-    std: Std | None = None
-    """As ``control.std``; null: the same."""
-    scale: Scale | None = None
-    """As ``control.scale``; null: the same. A list has a number for each dimension of the part."""
-    freedom: Freedom | None = None
-    """As ``control.freedom``; null: the same."""
 
     def problems(self) -> Problems:
         if isinstance(self.scale, tuple) and len(self.scale) != len(self.dims):
@@ -223,22 +225,13 @@ class PartSpec(Model):
         for setting in ("scale", "std"):
             if self.kind in DISCRETE and getattr(self, setting) is not None:
                 yield setting, f"does not apply to kind: {self.kind}; leave it out"
-        if self.freedom is not None and self.kind != "student":
-            yield "freedom", "is for kind: student"
 
 
-class ControlSpec(Model):
+class ControlSpec(DistributionSpec):
     """The distribution of the control."""
 
-    kind: Kind = "auto"
-    """``gaussian``: unbounded; ``student``: heavy tails, which all dimensions of a step share; ``clipped``: a Gaussian
-    censored at bounds; ``hurdle``: one exact value with some probability, else Gaussian or clipped; ``binary``: two
-    values; ``categorical``: discrete actions, as integers or one-hot rows; ``auto``: chosen for each dimension from the
-    demonstrations and shown by ``check``, never ``student``."""
     std: Std = 0.1
     """Standard deviation σ in scaled units, or ``{learn: true, floor: ...}``."""
-    freedom: Freedom = 4.0
-    """For ``student``: degrees of freedom ν, from 1 (heaviest tails) to 500, or ``learn``."""
     scale: Scale = "standardize"
     """``standardize`` (by the training demonstrations), ``none``, or a list with a positive divisor for each control
     dimension."""
@@ -255,8 +248,6 @@ class ControlSpec(Model):
         return {path: std for path, std in stds.items() if isinstance(std, LearnedStd)}
 
     def problems(self) -> Problems:
-        if self.freedom != 4.0 and "student" not in (self.kind, *(part.kind for part in self.parts)):
-            yield "freedom", "is for kind: student"
         dimensions: dict[int, str] = {}
         for number, part in enumerate(self.parts):
             if part.name in [other.name for other in self.parts[:number]]:
@@ -306,17 +297,15 @@ class RolloutSpec(Model):
 SLICE = re.compile(r"\d{0,9}:\d{0,9}")
 
 
-class PathSpec(Model):
-    """Two or three numbers of an observation that are drawn as a path in space."""
+class PathSpec(NamedTuple):
+    """Two or three numbers of an observation that are drawn as a path in space.
 
-    key: Text
-    """Name of the observation."""
+    :param key: name of the observation.
+    :param numbers: which of its numbers, as a Python slice such as ``3:6``; None: the first three, or both of two.
+    """
+
+    key: str
     numbers: str | None = None
-    """Which of its numbers, as a Python slice such as ``3:6``; null: the first three, or both of two."""
-
-    def problems(self) -> Problems:
-        if self.numbers is not None and not SLICE.fullmatch(self.numbers):
-            yield "", f"must be a slice such as 3:6 after the key, got {show(self.numbers)}"
 
     def __str__(self) -> str:
         return self.key if self.numbers is None else f"{self.key}[{self.numbers}]"
@@ -328,16 +317,20 @@ class PathSpec(Model):
 
 
 def _paths(value: Any) -> Any:
-    """One path or several, as a list of mappings."""
-    return [_path(one) for one in (value if isinstance(value, list | tuple) and not _is_pair(value) else (value,))]
+    """One path or several."""
+    return tuple(_path(one) for one in (value if isinstance(value, list | tuple) and not _is_pair(value) else (value,)))
 
 
-def _path(value: Any) -> Any:
-    if isinstance(value, Mapping | PathSpec):
-        return value
-    if not isinstance(value, str) and not _is_pair(value):
-        raise invalid(("", f"must be KEY or [KEY, slice], such as [pose, 3:6], got {show(value)}"))
-    return dict(zip(("key", "numbers"), (value,) if isinstance(value, str) else value, strict=False))
+def _path(value: Any) -> PathSpec:
+    if isinstance(value, str) and value:
+        return PathSpec(value)
+    if isinstance(value, PathSpec) or _is_pair(value):
+        return PathSpec(*value)
+    raise invalid(("", f"must be KEY or [KEY, slice], such as [pose, 3:6], got {show(value)}"))
+
+
+def _written(paths: tuple[PathSpec, ...] | None) -> Any:
+    return paths and [path.key if path.numbers is None else [*path] for path in paths]
 
 
 def _is_pair(value: Any) -> bool:
@@ -346,16 +339,16 @@ def _is_pair(value: Any) -> bool:
     return texts and SLICE.fullmatch(value[1]) is not None
 
 
+Trajectory = Annotated[
+    Items[InstanceOf[PathSpec]],
+    Field(min_length=1),
+    BeforeValidator(_paths, json_schema_input_type=str | list[str | list[str]]),
+]
+
+
 class ReportSpec(Model):
     """What the report shows."""
 
-    trajectory: (
-        Annotated[
-            Items[PathSpec],
-            Field(min_length=1),
-            BeforeValidator(_paths, json_schema_input_type=str | PathSpec | list[str | list[str] | PathSpec]),
-        ]
-        | None
-    ) = None
+    trajectory: Annotated[Trajectory | None, PlainSerializer(_written)] = None
     """What is drawn as paths in space: an observation (its first three numbers, or both of two), ``[key, slice]``, or a
     list of these, one for each arm; null: the observation that moves most as the controls say."""

@@ -75,14 +75,8 @@ class Spec(Model):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        """A mixture in place of a hierarchy becomes that hierarchy; EM trains linear networks by default."""
-        spec, baseline, training = self, self.baseline, self.training
-        if baseline and baseline.kind == "mixture" and self.hierarchy is None:
-            if baseline.count is None:
-                raise invalid(("baseline.count", "missing; give the number of experts of the mixture"))
-            if baseline.levels:
-                raise invalid(("baseline.levels", "is for a mixture in compare_with; leave it out"))
-            spec = spec.model_copy(update={"hierarchy": baseline.as_hierarchy, "baseline": None})
+        """EM trains linear networks by default."""
+        spec, training = self, self.training
         if not (training.optimizer.name == "em" or training.takes_gradient_steps) and spec._is_linear:
             optimizer = training.optimizer.model_copy(update={"name": "em"})
             spec = spec.model_copy(update={"training": training.model_copy(update={"optimizer": optimizer})})
@@ -112,6 +106,8 @@ class Spec(Model):
         if self.hierarchy is not None and self.baseline is not None:
             yield "baseline", "stands beside hierarchy; keep one of the two (compare_with takes baselines to compare)"
         baseline = self.baseline
+        if baseline and baseline.kind == "mixture":
+            yield "baseline", "mixture takes its experts from a hierarchy; declare one, with termination: always"
         if baseline and baseline.kind == "flat_equal" and "hidden" not in baseline.policy.model_fields_set:
             yield "baseline", "flat_equal takes its size from a hierarchy; list it in compare_with there, or say flat"
         if baseline and baseline.optimizer:
@@ -133,12 +129,6 @@ class Spec(Model):
                 yield place, "mixture takes its experts from a hierarchy; declare one, or leave it out"
             elif not any(level.lasts for level in self._levels):
                 yield place, "the hierarchy is a mixture already: none of its options lasts; leave it out"
-            for key in ("policy", "count", "meta_policy"):
-                if key in baseline.model_fields_set:
-                    yield f"{place}.{key}", "a mixture in compare_with has the networks of the hierarchy; leave it out"
-            for name in baseline.levels:
-                if known and name not in known:
-                    yield f"{place}.levels", _no_level(name, known)
         if self.compare_with and not self.demonstrations.validates:
             yield "compare_with", "needs held-out demonstrations to compare on; raise demonstrations.valid_fraction"
 
@@ -173,12 +163,12 @@ class Spec(Model):
             yield "training.labels.level", text
 
     def _segments(self) -> Problems:
-        if self.training.upper_levels != "segments":
+        if self.training.layerwise != "segments":
             return
         for number, emits in enumerate(self._emitted[1:], start=1):
             if "options" not in emits:
                 place = f"levels.{number}.policy" if number < len(self._levels) else "meta_policy"
-                yield f"hierarchy.{place}.emits", "training.upper_levels: segments needs options here"
+                yield f"hierarchy.{place}.emits", "training.layerwise: segments needs options here"
 
     @property
     def _levels(self) -> tuple[LevelSpec, ...]:
@@ -289,11 +279,9 @@ def _set_model(data: dict[str, Any], value: Any) -> None:
         baseline = {"kind": value} if isinstance(value, str) else value
         data["compare_with"] = []
         levels = hierarchy.get("levels") or []
-        if baseline["kind"] == "mixture" and levels and "count" not in baseline:
-            named = baseline.get("levels") or [level.get("name", "option") for level in levels]
+        if baseline["kind"] == "mixture" and levels:
             for level in levels:
-                if level.get("name", "option") in named:
-                    level["termination"] = "always"
+                level["termination"] = "always"
         else:
             data |= {"hierarchy": None, "baseline": baseline}
             (data.get("training") or {}).pop("labels", None)

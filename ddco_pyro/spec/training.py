@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import ConfigDict, Field
 
-from ddco_pyro.spec.base import Count, Fraction, Items, Model, Positive, Problems, Seed, Share, Text
+from ddco_pyro.spec.base import Count, Fraction, Items, Model, Positive, Problems, Seed, Share, Text, nested
 
 
 class RidgeSpec(Model):
@@ -16,9 +16,7 @@ class RidgeSpec(Model):
     """Of the means of controls: as many steps, of observations with unit variance, that say 0; in units of 1/σ².
     Also of the logits of switches and discrete actions."""
     gate: float = Field(default=1.0, ge=0)
-    """Of the logits of options."""
-    termination: float = Field(default=1.0, ge=0)
-    """Of terminations."""
+    """Of the logits of options and of terminations."""
     cross_validated: bool = False
     """Whether ``policy`` is raised, to at most 1000 times as much, where leaving out training demonstrations shows that
     a larger one explains them better by half a nat per step."""
@@ -28,10 +26,10 @@ class OptimizerSpec(Model):
     """The optimiser of the expectation-gradient steps."""
 
     name: Literal["adam", "adamw", "momentum", "em"] = "adam"
-    """``adam``, ``adamw``, ``momentum`` for gradient descent with momentum, or ``em``: expectation-maximisation where
-    every network of a model is linear, L-BFGS for perceptrons without dropout in a policy without options, ``adam`` for
-    other models. A spec whose networks are all linear, and that gives no other setting of gradient steps, has ``em`` if
-    it names none."""
+    """``adam``, ``adamw``, ``momentum`` for gradient descent with momentum 0.9, or ``em``: expectation-maximisation
+    where every network of a model is linear, L-BFGS for perceptrons without dropout in a policy without options,
+    ``adam`` for other models. A spec whose networks are all linear, and that gives no other setting of gradient steps,
+    has ``em`` if it names none."""
     ridge: RidgeSpec = RidgeSpec()
     """Ridges (``em`` only)."""
     lr: Positive = 1e-3
@@ -39,17 +37,9 @@ class OptimizerSpec(Model):
     schedule: Literal["constant", "cosine"] = "constant"
     """``cosine``: in each stage the learning rate falls along half a cosine to 0 at the last epoch of the stage's
     budget; needs ``training.epochs``."""
-    warmup: int = Field(default=0, ge=0)
-    """Epochs at the start of each stage over which the learning rate rises to ``lr``."""
-    momentum: Share = 0.9
-    """Momentum (``momentum`` only)."""
     weight_decay: float = Field(default=0.0, ge=0)
     """L2 penalty; for ``adamw`` the decoupled weight decay: every weight shrinks by ``lr`` × this in a step.
     Models that ``em`` trains have ridges instead."""
-
-    def problems(self) -> Problems:
-        if self.name != "momentum" and self.momentum != type(self).model_fields["momentum"].default:
-            yield "momentum", f"is for name: momentum, and {self.name} does not use it; leave it out"
 
 
 class RecogniserSpec(Model):
@@ -80,6 +70,9 @@ class LabelsSpec(Model):
     """A recogniser that the labelled steps train, for steps without labels and for other demonstrations; null: none."""
 
 
+Layerwise = Annotated[
+    bool | Literal["segments"], nested((), lambda value: value, "true, false, or segments", ("segments",))
+]
 Start = Literal["vq", "vq_controls", "windows", "equal_parts", "mixture", "random"]
 
 
@@ -101,13 +94,9 @@ class TrainingSpec(Model):
     window: Count = 10
     """Steps before and after a step over which ``windows`` averages observations and controls. People's skills show
     over a second, not in a step."""
-    layerwise: bool = True
-    """Whether levels are discovered one after another, lowest first, rather than all at once."""
-    upper_levels: Literal["clusters", "segments"] = "clusters"
-    """How layer-wise training discovers the levels above the lowest. ``clusters``: each level as the lowest, after the
-    level below. ``segments``: all together, from the order of the lowest level's options."""
-    lower_levels: Literal["fine_tuned", "frozen"] = "fine_tuned"
-    """Whether a last stage of layer-wise training trains all levels together, or discovered levels stay frozen."""
+    layerwise: Layerwise = True
+    """Whether levels are discovered one after another, lowest first, rather than all at once; in the end all levels
+    train together. ``segments``: the lowest alone, then all above it together, from the order of its options."""
     optimizer: OptimizerSpec = OptimizerSpec()
     """The optimiser."""
     epochs: Count | None = 800
@@ -145,16 +134,11 @@ class TrainingSpec(Model):
 
     def problems(self) -> Problems:
         if self.optimizer.name == "em":
-            steps = self.optimizer
-            unused = {"average": self.average, "optimizer.warmup": steps.warmup}
-            for key, value in (unused | {"optimizer.schedule": steps.schedule != "constant"}).items():
+            unused = {"average": self.average, "optimizer.schedule": self.optimizer.schedule != "constant"}
+            for key, value in unused.items():
                 if value:
                     yield key, "em takes no gradient steps and would not use it; leave it out"
-        if "mixture" in self.starts and self.lower_levels == "frozen":
-            yield "lower_levels", "mixture trains all levels together in the end; say fine_tuned"
         if self.epochs is None and self.patience is None:
             yield "epochs", "epochs and training.patience are both null; give one of them"
         if self.epochs is None and self.optimizer.schedule == "cosine":
             yield "optimizer.schedule", "cosine ends at training.epochs, which is null"
-        if self.upper_levels == "segments" and not self.layerwise:
-            yield "upper_levels", "segments needs the lowest level discovered first; say layerwise: true"

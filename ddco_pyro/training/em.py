@@ -45,9 +45,7 @@ FARTHEST = 8.0
 HALVINGS = 10
 """How often a step that lowers the penalised log-likelihood is halved before it is given up."""
 ABOVE_FLOOR = 1e-4
-"""A learned parameter stays so far above its floor."""
-LARGEST_PARAMETER = 500.0
-"""The largest value of a learned parameter that is no σ."""
+"""A learned σ stays so far above its floor."""
 TOLERANCE = 1e-5
 """EM has converged where a step gains less, in nats per step of the demonstrations."""
 ROUGHLY = 1e-3
@@ -172,24 +170,6 @@ class Std:
         value[:, at] = mean.sqrt().maximum(self.module.floor[at].double() + ABOVE_FLOOR)
         return value
 
-    def scored(self, value: Tensor, gradient: Tensor, information: Tensor, places: Sequence[int]) -> Tensor:
-        """A table with a Fisher scoring step of the logarithms of the parameters at these places.
-
-        :param gradient: with respect to all parameters, [K, C].
-        :param information: of the logarithm, [K].
-        """
-        value = value.clone()
-        for place in places:
-            slope, weight = gradient[:, place] * value[:, place], information
-            if place in self.module.shared:
-                slope, weight = (total.sum().expand(len(value)) for total in (slope, weight))
-            elif place not in self.module.own:
-                continue
-            factor = (slope / weight.clamp(min=BIAS)).clamp(-math.log(2), math.log(2)).exp()
-            least = self.module.floor[place].double() + ABOVE_FLOOR
-            value[:, place] = (value[:, place] * factor).clamp(max=LARGEST_PARAMETER).maximum(least)
-        return value
-
     def store(self) -> None:
         """Give the module these values."""
         module = self.module
@@ -226,8 +206,7 @@ class Expectation:
         self._callers = {**levels, "meta_policy": model.meta_policy}
         self._networks: dict[str, Linear] = {}
         for name, network in model.networks().items():
-            kind = ridge.termination if name.endswith("termination") else ridge.gate
-            self._networks[name] = Linear(network, kind, f"{name}.".startswith(trained))
+            self._networks[name] = Linear(network, ridge.gate, f"{name}.".startswith(trained))
         self._stds = {
             name: Std(caller, self._networks[name].trained)
             for name, caller in self._callers.items()
@@ -313,7 +292,7 @@ class Expectation:
             choices = each.shape[1] if caller is None else caller.sizes[0]
             each[:, choices:] = _penalties(weight[..., choices:], self._ridge.policy)
             for group in sums[name].groups.values():
-                if group.std and group.of_numbers:
+                if group.std:
                     std, places = self._stds[name], list(group.std)
                     sigma = std.value[:, places]
                     each[:, group.columns] = _penalties(weight[..., group.columns], self._ridge.policy) / sigma.square()
@@ -401,12 +380,8 @@ class Expectation:
                 sums[name].add_gradient(xs[self._networks[name].reads].x, of[name], None)
                 learned[name] = [Information(slice(0, 1), weight)]
         every_group = [(name, group) for name, groups in learned.items() for group in groups]
-        for name, group in every_group:
-            if not group.of_numbers:  # the parameter is its one feature
-                sums[name].add_information(group, group.weight.sum((0, 1)).reshape(-1, 1, 1))
         for reads, x in xs.items():
-            its = [(name, group) for name, group in every_group if group.of_numbers]
-            its = [(name, group) for name, group in its if self._networks[name].reads == reads]
+            its = [(name, group) for name, group in every_group if self._networks[name].reads == reads]
             if its:
                 weights = [group.weight.flatten(0, 1).flatten(1) for _, group in its]
                 moments = x.moments(torch.cat(weights, dim=1)).split([each.shape[1] for each in weights])
@@ -426,12 +401,6 @@ class Expectation:
             for place, information in own.information.items():
                 group, columns = own.groups[place], own.groups[place].columns
                 gradient, weight = own.gradient[..., columns], network.weight[..., columns]
-                if not group.of_numbers:
-                    assert std is not None
-                    assert value is not None
-                    assert isinstance(own.std, Tensor)
-                    value = std.scored(value, own.std, information[:, -1, -1], group.std)
-                    continue
                 if group.std:
                     assert std is not None
                     scale = std.value[:, list(group.std)].unsqueeze(1)  # [K, 1, n]

@@ -144,10 +144,10 @@ def parameters(network: nn.Module) -> int:
 
 
 def model_name(spec: Spec) -> str:
-    """The name of a model in tables: ``ddco``, or a baseline's (:attr:`~ddco_pyro.spec.BaselineSpec.name`)."""
+    """The name of a model in tables: ``ddco``, or the kind of a baseline."""
     if spec.hierarchy is None:
         assert spec.baseline is not None  # a spec has one or the other
-        return spec.baseline.name
+        return spec.baseline.kind
     memoryless = [level.name for level in spec.hierarchy.levels if not level.lasts]
     if not memoryless:
         return HIERARCHY
@@ -173,10 +173,10 @@ def check_models(spec: Spec, dimensions: Dimensions) -> dict[str, tuple[Spec, Hi
 def named_baselines(spec: Spec) -> dict[str, BaselineSpec]:
     """The spec's baselines (``compare_with``) by name, numbered from the second model of one name on."""
     names: dict[str, BaselineSpec] = {}
-    alone = spec.baseline.name if spec.baseline else None
+    alone = spec.baseline.kind if spec.baseline else None
     for baseline in spec.compare_with:
-        before = (baseline.name == alone) + sum(other.name == baseline.name for other in names.values())
-        names[f"{baseline.name}_{before + 1}" if before else baseline.name] = baseline
+        before = (baseline.kind == alone) + sum(other.kind == baseline.kind for other in names.values())
+        names[f"{baseline.kind}_{before + 1}" if before else baseline.kind] = baseline
     return names
 
 

@@ -37,12 +37,14 @@ def optimizer_of(spec: OptimizerSpec, model: Hierarchy) -> str:
 
 # --- gradient steps on minibatches ------------------------------------------------------------------------------------
 
+MOMENTUM = 0.9
+
 
 def gradient_optimizer(name: str, spec: OptimizerSpec, parameters: list[nn.Parameter]) -> torch.optim.Optimizer:
     """``adam``, ``adamw`` or ``momentum``."""
     common = {"params": parameters, "lr": spec.lr, "weight_decay": spec.weight_decay}
     if name == "momentum":
-        return _uncompiled(torch.optim.SGD)(**common, momentum=spec.momentum)
+        return _uncompiled(torch.optim.SGD)(**common, momentum=MOMENTUM)
     return _uncompiled(torch.optim.AdamW if name == "adamw" else torch.optim.Adam)(**common)
 
 
@@ -51,11 +53,10 @@ def learning_rate(spec: OptimizerSpec, epoch: int, cap: int | None) -> float:
 
     :param cap: the epochs that the stage may take.
     """
-    rate = spec.lr * min(1.0, (epoch + 1) / (spec.warmup + 1))
     if spec.schedule == "constant":
-        return rate
+        return spec.lr
     assert cap is not None  # a spec with this schedule has a budget
-    return rate * 0.5 * (1 + math.cos(math.pi * epoch / cap))
+    return spec.lr * 0.5 * (1 + math.cos(math.pi * epoch / cap))
 
 
 def _uncompiled(kind: type[torch.optim.Optimizer]) -> Callable[..., torch.optim.Optimizer]:

@@ -59,8 +59,8 @@ def plan(spec: Spec, depth: int, restart: int = 0) -> list[Stage]:
     stages: list[Stage] = []
     way = WAYS[starts_of(spec)[restart]]
     mixed = way.memoryless
-    layerwise = training.layerwise and not mixed
-    together = training.upper_levels == "segments" and depth > 1 and not mixed
+    layerwise = bool(training.layerwise) and not mixed
+    together = training.layerwise == "segments" and depth > 1 and not mixed
     for level in range(1, 2 if together else depth + 1):
         networks = _memoryless(level) if mixed else (f"levels.{level - 1}.",)
         networks = networks if level > 1 else ("trunk.", *networks)
@@ -82,9 +82,7 @@ def plan(spec: Spec, depth: int, restart: int = 0) -> list[Stage]:
     if mixed:
         policies = (name for level in range(1, depth + 1) for name in _memoryless(level))
         stages.append(Stage("mixture", None, None, ("trunk.", *policies, "meta_policy."), memoryless=True))
-    if not layerwise or training.lower_levels == "fine_tuned":
-        stages.append(Stage("joint", None, None, EVERYTHING))
-    return stages
+    return [*stages, Stage("joint", None, None, EVERYTHING)]
 
 
 def _memoryless(level: int) -> tuple[str, ...]:

@@ -27,7 +27,7 @@ from ddco_pyro.spec import ObservationSpec, SpecError, parse_spec
 from ddco_pyro.training.networks import Dimensions, build_hierarchy
 
 HEIGHT, WIDTH = 12, 10
-CONV = {"network": "conv", "filters": 3, "kernel": 3, "pooled": 2, "hidden": [5]}
+CONV = {"network": "conv", "layers": [{"filters": 3, "kernel": 3, "stride": 2, "padding": 1}], "hidden": [5]}
 RAW = {"key": "camera", "crop": [1, 2, 10, 8], "resize": [5, 4], "frames": 2}
 
 

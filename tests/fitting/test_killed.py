@@ -161,7 +161,12 @@ def write_pictures(folder: Path) -> None:
     random = np.random.default_rng(0)
     pictures = ({"camera": random.integers(0, 256, (9, 12, 10, 3), dtype=np.uint8)} for _ in range(10))
     numbered((seen, random.normal(size=(9, 2))) for seen in pictures).write(folder / "pictures.hdf5")
-    policy = {"network": "conv", "filters": 2, "kernel": 3, "pooled": 2, "hidden": [4], "dropout": 0.1}
+    policy = {
+        "network": "conv",
+        "layers": [{"filters": 2, "kernel": 3, "stride": 2, "padding": 1}],
+        "hidden": [4],
+        "dropout": 0.1,
+    }
     data = {
         "demonstrations": {"path": str(folder / "pictures.hdf5")},
         "observations": [{"key": "camera", "augment": {"shift": 1}}],

@@ -15,7 +15,7 @@ from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs
 
 SHAPES = {"state": (3,), "camera": (10, 9, 3)}
-CONV = {"network": "conv", "filters": 3, "kernel": 3, "pooled": 2, "hidden": [6]}
+CONV = {"network": "conv", "layers": [{"filters": 3, "kernel": 3, "stride": 2, "padding": 1}], "hidden": [6]}
 BRANCHES = {
     "network": "branches",
     "of": {"camera": {**CONV, "dropout": 0.2}, "state": {"network": "mlp", "hidden": [4]}},

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
 
 import numpy as np
 import pyro
@@ -252,12 +251,10 @@ KINDS = {
     "gaussian, σ of each step": lambda: Gaussian(numbers(2, 3, 2, 2), std_of_steps(), SCALE.log()),
     "clipped, σ of each step": lambda: clipped(numbers(2, 3, 2, 2), std_of_steps()),
     "hurdle, clipped, σ of each step": lambda: hurdle(numbers(2, 3, 2, 1, seed=2), numbers(2, 3, 2, 2), std_of_steps()),
-    "student": lambda: student(STD, torch.tensor([3.0])),
-    "student, own σ and ν": lambda: student(torch.stack([STD, 2 * STD]), torch.tensor([[3.0], [7.0]])),
-    "student, σ of each step": lambda: student(std_of_steps(), torch.tensor([3.0])),
-    "student beside": lambda: Product(
-        (((2, 0), student(STD, torch.tensor([3.0]))), ((1,), Binary(numbers(2, 3, 2, 1, seed=1))))
-    ),
+    "student": lambda: student(STD),
+    "student, own σ": lambda: student(torch.stack([STD, 2 * STD])),
+    "student, σ of each step": lambda: student(std_of_steps()),
+    "student beside": lambda: Product((((2, 0), student(STD)), ((1,), Binary(numbers(2, 3, 2, 1, seed=1))))),
     "binary": lambda: Binary(numbers(2, 3, 2, 2)),
     "categorical": lambda: Categorical(numbers(2, 3, 2, 4), torch.tensor(False)),
     "rows": lambda: Categorical(numbers(2, 3, 2, 4), torch.tensor(True)),
@@ -270,8 +267,8 @@ KINDS = {
 }
 
 
-def student(std, freedom):
-    return Student(numbers(2, 3, 2, 2), std, SCALE.log(), freedom.double())
+def student(std):
+    return Student(numbers(2, 3, 2, 2), std, SCALE.log())
 
 
 def std_of_steps():
@@ -316,41 +313,30 @@ def test_gradients_are_finite_differences(kind):
     torch.testing.assert_close(emission.by_dimension(actions).sum(-1), emission.log_density(actions))
 
 
-@pytest.mark.parametrize("kind", ["student", "student, own σ and ν"])
+@pytest.mark.parametrize("kind", ["student", "student, own σ"])
 def test_a_student_is_that_of_scipy(kind):
     emission, actions = KINDS[kind](), actions_of(kind)
-    scales, nu = emission.std.expand(2, 2) * SCALE, emission.freedom.expand(2, 1)
+    scales = emission.std.expand(2, 2) * SCALE
     found = emission.log_density(actions)
     for n, t, k in itertools.product(range(2), range(3), range(2)):
-        truth = stats.multivariate_t(emission.mean[n, t, k] * SCALE, np.diag(scales[k] ** 2), df=float(nu[k, 0]))
+        truth = stats.multivariate_t(emission.mean[n, t, k] * SCALE, np.diag(scales[k] ** 2), df=4)
         assert float(found[n, t, k]) == pytest.approx(truth.logpdf(actions[n, t] * SCALE), abs=1e-12)
 
 
 def test_draws_of_a_student_have_its_radius_and_its_controller():
     """(a - μ)² / σ² over A dimensions is A times an F variate; the export's numpy draws the same."""
-    emission = Student(numbers(1, 2), STD, SCALE.log(), torch.tensor([3.0]).double())
+    emission = Student(numbers(1, 2), STD, SCALE.log())
     noise = torch.randn(4000, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     drawn = emission.draw(noise)[:, 0]
     radius = ((drawn - emission.mean) / STD).square().sum(-1) / 2
-    assert stats.kstest(radius, stats.f(2, 3).cdf).pvalue > 0.01
+    assert stats.kstest(radius, stats.f(2, 4).cdf).pvalue > 0.01
     part = {"scale": [1.0, 1.0], "shift": [0.0, 0.0], "ends": [[], []]}
-    parameters = np.append(STD, 3.0)
     for own, z in zip(drawn[:200], noise.numpy(), strict=False):
-        np.testing.assert_allclose(student_control(part, emission.mean[0].numpy(), parameters, z), own, rtol=1e-10)
-
-
-def test_what_a_student_expects_to_learn_of_its_freedom_is_the_variance_of_its_slope():
-    nu = torch.tensor([3.5], dtype=torch.float64)
-    emission = Student(torch.zeros(1, 2, dtype=torch.float64), torch.ones(2), torch.zeros(2), nu)
-    drawn = emission.draw(torch.randn(20_000, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)))
-    each = nu.detach().expand(len(drawn), 1, 1).requires_grad_()  # a copy for each control
-    (slopes,) = torch.autograd.grad(replace(emission, freedom=each).log_density(drawn[:, 0]).sum(), each)
-    *_, own = emission.information(torch.ones(1, dtype=torch.float64), drawn[0])
-    assert float((slopes * nu).var()) == pytest.approx(float(own.weight), rel=0.05)
+        np.testing.assert_allclose(student_control(part, emission.mean[0].numpy(), STD.numpy(), z), own, rtol=1e-10)
 
 
 def test_the_divergence_of_students_is_at_least_that_of_draws():
-    emission = student(torch.stack([STD, 2 * STD]), torch.tensor([[3.0], [7.0]]))
+    emission = student(torch.stack([STD, 2 * STD]))
     noise = torch.randn(4000, 2, 3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     total = 0.0
     for i in range(2):
@@ -359,7 +345,7 @@ def test_the_divergence_of_students_is_at_least_that_of_draws():
         total = total + 0.5 * (scores[..., i] - scores[..., 1 - i]).mean(0)
     bound = emission.divergence(0)[..., 1]
     assert (bound > total - 0.05).all()
-    same = Student(torch.zeros(2, 2), STD, SCALE.log(), torch.tensor([3.0]))
+    same = Student(torch.zeros(2, 2), STD, SCALE.log())
     assert float(same.divergence(0)[..., 1]) == 0
 
 

@@ -70,14 +70,6 @@ def test_a_mixture_beside_is_the_spec_with_terminations_always():
     assert [model_name(own) for own in (spec, first, second)] == ["ddco", "mixture", "mixture"]
 
 
-def test_a_mixture_that_stands_alone_is_a_hierarchy():
-    spec = spec_of(hierarchy=None, compare_with=[], baseline={"kind": "mixture", "count": 3, "policy": {"hidden": [4]}})
-    (level,) = spec.hierarchy.levels
-    assert (level.count, level.policy.hidden, level.policy.emits, level.lasts) == (3, (4,), ("control",), False)
-    assert spec.baseline is None
-    assert model_name(spec) == "mixture"
-
-
 TWO = [{"name": "option", "count": 2}, {"name": "phase", "count": 2}]
 
 
@@ -101,9 +93,9 @@ def test_what_is_no_model_is_refused():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"hierarchy": None, "baseline": "mixture", "compare_with": []}, "baseline.count: missing; give the number"),
+        ({"hierarchy": None, "baseline": "mixture", "compare_with": []}, "baseline: mixture takes its experts from"),
         ({"hierarchy": None, "baseline": "flat", "compare_with": ["mixture"]}, "compare_with.0: mixture takes its"),
-        ({"compare_with": [{"kind": "mixture", "count": 3}]}, "compare_with.0.count: a mixture in compare_with has"),
+        ({"compare_with": [{"kind": "mixture", "policy": {}}]}, "compare_with.0.policy: a mixture has the networks of"),
         (
             {"hierarchy": {"levels": [{"count": 2, "termination": "always"}]}, "compare_with": ["mixture"]},
             "compare_with.0: the hierarchy is a mixture already",

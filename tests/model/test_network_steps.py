@@ -32,9 +32,13 @@ pictures = st.dictionaries(
     min_size=1,
 )  # fmt: skip
 perceptrons = st.fixed_dictionaries({"network": st.sampled_from(["mlp", "per_timestep"]), "hidden": sizes})
+filters = st.builds(
+    lambda number, kernel: {"filters": number, "kernel": kernel, "stride": 2, "padding": kernel // 2},
+    st.integers(1, 3), st.integers(1, 5),
+)  # fmt: skip
 convolutions = st.fixed_dictionaries(
-    {"network": st.just("conv"), "hidden": sizes, "filters": st.integers(1, 3), "kernel": st.integers(1, 5)},
-    optional={"pool": st.sampled_from(["flatten", "mean", "spatial_softmax"]), "pooled": st.integers(1, 3)},
+    {"network": st.just("conv"), "hidden": sizes, "layers": filters.map(lambda one: [one])},
+    optional={"pool": st.sampled_from(["flatten", "mean", "spatial_softmax"])},
 )
 users = st.sampled_from(
     [{"network": "user_networks:Own", "options": {"gain": 0.7}}, {"network": "user_networks:Remembering"}]

@@ -64,9 +64,12 @@ def test_an_activation_follows_every_convolution_and_every_hidden_layer(name):
     assert_close(network(inputs)[0][:, :, 0].flatten(0, 1), expected)
 
 
+CONVOLUTION = [{"filters": 3, "kernel": 5, "stride": 2, "padding": 2}]
+
+
 def test_a_standardised_picture_is_seen_whatever_its_brightness_and_contrast():
     """As numpy standardises it; half as strong and darker or brighter it gives the same."""
-    shape, settings = InputShape({}, {"camera": PIXELS}), {"network": "conv", "filters": 3, "pool": "flatten"}
+    shape, settings = InputShape({}, {"camera": PIXELS}), {"network": "conv", "layers": CONVOLUTION, "pool": "flatten"}
     plain, network = make(shape, **settings), make(shape, **settings, standardize=True)
     network.load_state_dict(plain.state_dict())
     picture = 2 * torch.randint(0, 64, (1, 1, *PIXELS), dtype=torch.uint8)
@@ -80,7 +83,7 @@ def test_a_standardised_picture_is_seen_whatever_its_brightness_and_contrast():
 
 def test_a_picture_of_one_colour_is_standardised_to_nothing():
     shape = InputShape({}, {"camera": PIXELS})
-    network = make(shape, network="conv", filters=3, pool="flatten", standardize=True)
+    network = make(shape, network="conv", layers=CONVOLUTION, pool="flatten", standardize=True)
     grey = torch.full((1, 1, *PIXELS), 100.0, requires_grad=True)
     found = network(Inputs({}, {"camera": grey}, torch.zeros(1)))[0]
     assert_close(found, network(Inputs({}, {"camera": torch.zeros_like(grey)}, torch.zeros(1)))[0])
@@ -132,11 +135,11 @@ def test_each_step_costs_one_network_however_many_there_are(trajectories, steps,
 # --- images -----------------------------------------------------------------------------------------------------------
 
 
-def separate_conv(network, k, inputs, filters):
+def separate_conv(network, k, inputs):
     """The k-th convolutional network, image by image, with ordinary torch layers."""
     columns = [inputs.vector.flatten(0, 1)]
     for (stacked,), image in zip(network.convolutions, inputs.images.values(), strict=True):
-        own = slice(k * filters, (k + 1) * filters)
+        own = slice(3 * k, 3 * (k + 1))
         pixels = torch.stack([frame.permute(2, 0, 1) for frame in image.flatten(0, 1)]) / 255
         maps = nn.functional.conv2d(pixels, stacked.weight[own], stacked.bias[own], stride=2, padding=2)
         columns.append(nn.functional.adaptive_avg_pool2d(maps.clamp(min=0), POOLED).flatten(1))
@@ -145,10 +148,10 @@ def separate_conv(network, k, inputs, filters):
 
 @pytest.mark.parametrize("images", [("camera",), ("camera", "wrist")])
 def test_conv_networks_are_separate_networks(images):
-    shape, filters = InputShape({"state": FEATURES}, dict.fromkeys(images, PIXELS), LONGEST), 3
-    network = make(shape, network="conv", filters=filters, hidden=[8])
+    shape = InputShape({"state": FEATURES}, dict.fromkeys(images, PIXELS), LONGEST)
+    network = make(shape, network="conv", layers=CONVOLUTION, hidden=[8])
     inputs = make_inputs(images=images)
-    expected = torch.stack([separate_conv(network, k, inputs, filters) for k in range(COPIES)], dim=2)
+    expected = torch.stack([separate_conv(network, k, inputs) for k in range(COPIES)], dim=2)
     assert_close(network(inputs)[0], expected)
 
 
@@ -161,7 +164,7 @@ def expected_places(maps):
 
 
 POOLS = {
-    "mean": lambda maps: nn.functional.adaptive_avg_pool2d(maps, 3).flatten(1),
+    "mean": lambda maps: nn.functional.adaptive_avg_pool2d(maps, POOLED).flatten(1),
     "flatten": lambda maps: maps.flatten(1),
     "spatial_softmax": expected_places,
 }
@@ -171,7 +174,7 @@ POOLS = {
 def test_several_convolutions_are_separate_networks(pool):
     layers = [{"filters": 3, "kernel": 4, "stride": 2, "padding": 1}, {"filters": 2, "kernel": 3}]
     shape = InputShape({}, {"camera": PIXELS})
-    network = make(shape, network="conv", layers=layers, pool=pool, pooled=3, hidden=[8])
+    network = make(shape, network="conv", layers=layers, pool=pool, hidden=[8])
     inputs = random_inputs(shape, 2, LONGEST, 0)
     pixels = inputs.images["camera"].flatten(0, 1).permute(0, 3, 1, 2) / 255
     first, second = network.convolutions[0]
@@ -187,7 +190,7 @@ def test_several_convolutions_are_separate_networks(pool):
 def test_branches_read_each_their_own_and_are_joined():
     shape = InputShape({"pose": 2, "goal": 3, "other": 4}, {"camera": PIXELS})
     pair = {"network": "linear", "inputs": ["goal", "pose"]}
-    picture = {"network": "conv", "filters": 2, "hidden": [6]}
+    picture = {"network": "conv", "layers": CONVOLUTION, "hidden": [6]}
     network = make(shape, network="branches", of={"camera": picture, "pair": pair, "goal": {"hidden": [5]}}, hidden=[8])
     inputs = random_inputs(shape, 2, LONGEST, 0)
     seen = Inputs({}, inputs.images, inputs.time)
@@ -196,7 +199,7 @@ def test_branches_read_each_their_own_and_are_joined():
         assert isinstance(layers[-2], nn.ReLU)  # what is read are hidden layers
     expected = []
     for k in range(COPIES):
-        picture = separate_conv(camera, k, seen, 2)
+        picture = separate_conv(camera, k, seen)
         vectors = inputs.vectors
         joined = [picture, vectors["goal"], vectors["pose"], separate(goal.layers, k)(vectors["goal"])]
         expected.append(separate(network.layers, k)(torch.cat(joined, -1)))

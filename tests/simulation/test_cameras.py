@@ -38,7 +38,12 @@ def own_cache(tmp_path, monkeypatch):
 
 
 def spec_of(*observations, **parts):
-    policy = {"network": "conv", "filters": 2, "pool": "spatial_softmax", "hidden": [4]}
+    policy = {
+        "network": "conv",
+        "layers": [{"filters": 2, "kernel": 5, "stride": 2, "padding": 2}],
+        "pool": "spatial_softmax",
+        "hidden": [4],
+    }
     return parse_spec(
         {
             "task": TASK,

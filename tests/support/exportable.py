@@ -90,14 +90,20 @@ CONVOLUTIONS = {
     "activation": "elu",
     "pool": "spatial_softmax",
 }
-LEAKY = {"network": "conv", "filters": 2, "pool": "flatten", "activation": "leaky_relu", "standardize": True}
+LEAKY = {
+    "network": "conv",
+    "layers": [{"filters": 2, "kernel": 5, "stride": 2, "padding": 2}],
+    "pool": "flatten",
+    "activation": "leaky_relu",
+    "standardize": True,
+}
 RECURRENT = {"network": "lstm", "over": {"hidden": [6]}, "hidden": [5, 4]}
 BRANCHES = {
     "network": "branches",
     "of": {
-        "camera": {"network": "lstm", "over": LEAKY | {"shared": True}, "hidden": [4, 3], "horizon": 3},
+        "camera": {"network": "lstm", "over": LEAKY, "hidden": [4, 3], "horizon": 3},
         "pair": {"network": "mlp", "inputs": ["goal", "state"], "hidden": [6], "activation": "tanh"},
-        "state": {"network": "lstm", "hidden": 3, "shared": True},
+        "state": {"network": "lstm", "hidden": 3},
         "step": {"network": "linear"},
     },
     "hidden": [7],

@@ -29,8 +29,13 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*to a meta parameter:UserWarnin
 USERS = ("networks", "checkpoint", "restarts", "loop")
 """Who asks for the device of a spec."""
 
-SPATIAL = {"network": "conv", "filters": 3, "kernel": 3, "pool": "spatial_softmax", "hidden": [5]}
-MEANS = {"network": "conv", "filters": 2, "kernel": 3, "pooled": 2, "hidden": [4]}
+SPATIAL = {
+    "network": "conv",
+    "layers": [{"filters": 3, "kernel": 3, "stride": 2, "padding": 1}],
+    "pool": "spatial_softmax",
+    "hidden": [5],
+}
+MEANS = {"network": "conv", "layers": [{"filters": 2, "kernel": 3, "stride": 2, "padding": 1}], "hidden": [4]}
 MLP = {"network": "mlp", "hidden": [6], "inputs": ["pose"]}
 LINEAR = {"network": "linear", "inputs": ["pose"]}
 LSTM = {"network": "lstm", "over": {"network": "mlp", "hidden": [4], "inputs": ["pose"]}, "hidden": 3}

@@ -334,7 +334,7 @@ def test_a_recogniser_reads_pictures():
         return seen, random.normal(size=(len(phase), 2)), {"phase": known, "truth": phase}
 
     demos = numbered(one(number) for number in range(6))
-    conv = {"network": "conv", "filters": 2, "kernel": 3, "hidden": [3]}
+    conv = {"network": "conv", "layers": [{"filters": 2, "kernel": 3, "stride": 2, "padding": 1}], "hidden": [3]}
     labels = {"level": "level-1", "from": "phase", "recogniser": RECOGNISER}
     seen = ["state", "camera"]
     level = {"name": "level-1", "count": 2, "policy": conv, "termination": {**LINEAR, "inputs": ["state"]}}

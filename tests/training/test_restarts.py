@@ -180,26 +180,17 @@ def test_a_restart_is_as_the_same_start_alone(demos, tmp_path):
 
 def test_the_objective_has_the_ridges_log_prior(demos, tmp_path):
     """Σ log p − ½ ρ Σ w² of gate and termination, and of the mean in units of 1/σ² with its normaliser."""
-    ridge = {"policy": 2.0, "gate": 3.0, "termination": 5.0}
+    ridge = {"policy": 2.0, "gate": 3.0}
     optimizer = {"name": "em", "ridge": ridge}
     spec = make_spec((2,), starts=["vq"], control={"std": 1.0, "scale": "none"}, optimizer=optimizer, epochs=30)
     trainer = make_trainer(spec, demos, tmp_path)
     model, batch = trainer.run(), trainer.data.train
     (level,) = model.option_levels()
-    squares = {
-        name: float(network.layers[-1].weight.detach().double().square().sum())
-        for name, network in (
-            ("policy", level.policy.network),
-            ("termination", level.termination),
-            ("gate", model.meta_policy.network),
-        )
-    }
-    biases = 1e-6 * sum(
-        float(network.layers[-1].bias.detach().double().square().sum())
-        for network in (level.policy.network, level.termination, model.meta_policy.network)
-    )
+    networks = [("policy", level.policy.network), ("gate", level.termination), ("gate", model.meta_policy.network)]
+    squares = [(name, float(network.layers[-1].weight.detach().double().square().sum())) for name, network in networks]
+    biases = 1e-6 * sum(float(network.layers[-1].bias.detach().double().square().sum()) for _, network in networks)
     value = float(log_likelihood(model.tabulate(batch), batch.lengths).sum())
-    value -= 0.5 * (sum(ridge[name] * square for name, square in squares.items()) + biases)
+    value -= 0.5 * (sum(ridge[name] * square for name, square in squares) + biases)
     assert trainer.objective == pytest.approx(value / batch.steps, abs=1e-5)
 
 

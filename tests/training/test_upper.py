@@ -169,15 +169,10 @@ def test_labels_say_which_option_is_which():
 # --- the spec ---------------------------------------------------------------------------------------------------------
 
 
-def test_segments_need_a_lowest_level_found_before():
-    with pytest.raises(SpecError, match=r"training\.upper_levels: segments needs the lowest level discovered first"):
-        make_spec((2, 2), upper_levels="segments", layerwise=False)
-
-
 @pytest.mark.parametrize("place", ["hierarchy.levels.1.policy.emits", "hierarchy.meta_policy.emits"])
 def test_segments_need_callers_that_select(place):
-    spec = make_spec((2, 2), upper_levels="segments")
-    assert with_overrides(spec, {place: ["options", "control"]}).training.upper_levels == "segments"
-    with pytest.raises(SpecError, match=f"{place}: training.upper_levels: segments needs options here") as caught:
+    spec = make_spec((2, 2), layerwise="segments")
+    assert with_overrides(spec, {place: ["options", "control"]}).training.layerwise == "segments"
+    with pytest.raises(SpecError, match=f"{place}: training.layerwise: segments needs options here") as caught:
         with_overrides(spec, {place: ["control"]})
     assert len(caught.value.problems) == 1

@@ -11,7 +11,7 @@ from typing import get_args
 
 import numpy as np
 
-from ddco_pyro.model.emissions.base import Emission, Information, Parameter, Part, Steps
+from ddco_pyro.model.emissions.base import Emission, Information, Part, Steps
 from ddco_pyro.model.emissions.binary import Binary
 from ddco_pyro.model.emissions.categorical import Categorical
 from ddco_pyro.model.emissions.clipped import Clipped
@@ -32,5 +32,5 @@ CONTROLS: dict[str, Callable[[Part, np.ndarray, np.ndarray, np.ndarray | None], 
 
 __all__ = [
     "CONTROLS", "KINDS", "Binary", "Categorical", "Clipped", "Emission", "Gaussian", "Hurdle", "Information",
-    "Parameter", "Product", "Steps",
+    "Product", "Steps",
 ]  # fmt: skip

@@ -10,14 +10,13 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, ClassVar, NamedTuple, Protocol, Self
+from typing import Any, ClassVar, Protocol, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ddco_pyro.data.controls import ControlPart
-from ddco_pyro.spec import ControlSpec
 
 LOG_2PI = math.log(2 * math.pi)
 
@@ -51,9 +50,9 @@ class Steps(Protocol):
 class Information:
     """The information that the posterior expects of some numbers of a network, for an M-step.
 
-    :param columns: the numbers; none for a parameter that is no σ, whose information is the weight.
+    :param columns: the numbers.
     :param weight: h of each output [N, T, K, n]. Or a weight of all outputs, [N, T, K]: h is the weight times 1/σ².
-    :param std: the places of σ of these means, or of the parameter, among the parameters of the control.
+    :param std: the places of σ of these means among the parameters of the control.
     :param count: how many controls the weight stands for, [N, T, K]; None where it is their number.
     """
 
@@ -61,11 +60,6 @@ class Information:
     weight: Tensor
     std: tuple[int, ...] = ()
     count: Tensor | None = None
-
-    @property
-    def of_numbers(self) -> bool:
-        """Whether it is of numbers of a network, and not of a parameter alone."""
-        return self.columns.stop > self.columns.start
 
     def moved(self, numbers: int, parameters: int) -> Information:
         """The same information where so many numbers and parameters come before."""
@@ -80,18 +74,6 @@ class Information:
         """
         p = logits.softmax(-1)
         return cls(columns, 2 * weight.unsqueeze(-1) * p * (1 - p))
-
-
-class Parameter(NamedTuple):
-    """A parameter of a caller's distribution that no network gives: a σ, or another positive number.
-
-    :param fixed: the value; None for a learned one.
-    :param floor: the lower bound of a learned one; it begins at ``start``.
-    """
-
-    fixed: float | None
-    floor: float = 0.0
-    start: float = 0.0
 
 
 class Emission(ABC):
@@ -117,8 +99,7 @@ class Emission(ABC):
         """The distribution of a part of the control; a product joins those of parts, and is of none.
 
         :param numbers: of the callers' network, [..., K, size].
-        :param parameters: σ of a continuous part, then :meth:`further_parameters`, then those of other parts; [n],
-            [K, n] or [..., K, n].
+        :param parameters: σ of a continuous part, then those of other parts; [n], [K, n] or [..., K, n].
         :param log_scale: logarithms of the units, [A].
         :param ends: the lower and the upper bounds in scaled units, [A].
         """
@@ -128,11 +109,6 @@ class Emission(ABC):
     def size(cls, part: ControlPart) -> int:
         """How many numbers a network gives a caller: A, unless a kind says otherwise."""
         return len(part.dims)
-
-    @classmethod
-    def further_parameters(cls, spec: ControlSpec, part: ControlPart) -> list[Parameter]:
-        """The parameters beside σ."""
-        return []
 
     @classmethod
     def possible(cls, part: ControlPart, scaled: np.ndarray) -> np.ndarray:

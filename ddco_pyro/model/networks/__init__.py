@@ -45,17 +45,15 @@ are those of :mod:`ddco_pyro.spec.networks`."""
 def build(spec: NetworkSpec, shape: InputShape | Network, outputs: int, copies: int) -> Network:
     """``copies`` independent networks of the observations, or of a trunk's features, that give ``outputs`` numbers.
 
-    :raises ShapeError: the network is to be shared, or as :func:`build_trunk`.
+    :raises ShapeError: as :func:`build_trunk`.
     """
-    if spec.shared:
-        raise ShapeError("shared: options would all do the same; share a trunk, or a network in of or over")
     if isinstance(spec, UserNetworkSpec):
         return _of_user(spec, shape, outputs, copies)
     return build_trunk(spec, shape, copies).add_head(outputs)
 
 
 def build_trunk(spec: NetworkSpec, shape: InputShape | Network, copies: int) -> Network:
-    """``copies`` independent networks for others to read, or a single ``shared`` one.
+    """``copies`` independent networks for others to read.
 
     A user's network has ``spec.features`` outputs.
 
@@ -63,7 +61,6 @@ def build_trunk(spec: NetworkSpec, shape: InputShape | Network, copies: int) -> 
     :raises ShapeError: the network cannot read these observations, cannot be imported or made, or is refused by
         :func:`ddco_pyro.model.networks.probe.try_network`.
     """
-    copies = 1 if spec.shared else copies
     if isinstance(spec, UserNetworkSpec):
         return _of_user(spec, shape, spec.features, copies)
     settings, seen = spec.settings, _selected(spec, shape)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import torch
@@ -26,15 +27,15 @@ SHARPNESS = 10.0
 the same, and training is slow."""
 
 POOLED = 8
-"""Blocks a side to whose means a picture is reduced for clustering."""
+"""Fields along each side of a map, or of a picture for clustering, whose means are read."""
 
 
 class Conv(Network):
     """K networks of convolutions over each picture, pooled, and a perceptron over the pooled maps and the vectors.
 
-    :param layers: the convolutions; by default a single one of ``filters`` and ``kernel`` with stride 2.
-    :param pool: ``mean`` of ``pooled`` × ``pooled`` fields of each map, ``flatten`` for the whole map, or the expected
-        place under its softmax, ``spatial_softmax``.
+    :param layers: the convolutions.
+    :param pool: ``mean`` of :data:`POOLED` × :data:`POOLED` fields of each map, ``flatten`` for the whole map, or the
+        expected place under its softmax, ``spatial_softmax``.
     :param standardize: whether each picture is scaled to mean 0 and standard deviation 1.
     :raises ShapeError: there is no picture, or one is too small for the layers.
     """
@@ -46,22 +47,18 @@ class Conv(Network):
         hidden: tuple[int, ...],
         dropout: float,
         activation: Activation,
-        filters: int,
-        kernel: int,
         layers: Sequence[ConvolutionLayer],
         pool: Pool,
-        pooled: int,
         standardize: bool,
     ) -> None:
         super().__init__()
         if not shape.images:
             raise ShapeError("needs an image among the observations, and all of them are vectors: use network: mlp")
-        self.reads, self.copies, self.pool, self.pooled = list(shape.vectors), copies, pool, pooled
+        self.reads, self.copies, self.pool = list(shape.vectors), copies, pool
         self.pictures = list(shape.images)
         self.activation, self.standardize = ACTIVATIONS[activation](), standardize
-        first, *rest = layers or [ConvolutionLayer(filters=filters, kernel=kernel, stride=2, padding=kernel // 2)]
-        pairs = list(zip([first, *rest], rest, strict=False))
-        firsts = [_convolution(first, size[-1], copies) for size in shape.images.values()]
+        pairs = list(itertools.pairwise(layers))
+        firsts = [_convolution(layers[0], size[-1], copies) for size in shape.images.values()]
         self.convolutions = nn.ModuleList(
             nn.ModuleList(
                 [own, *(_convolution(layer, copies * above.filters, copies, copies) for above, layer in pairs)]
@@ -89,7 +86,7 @@ class Conv(Network):
         facts = {"kind": "convolutions", "key": key, "copies": self.copies, "layers": strides}
         facts |= {"activation": self.layers.activation, "standardize": self.standardize}
         arrays = arrays_of({str(number): layer for number, layer in enumerate(layers)})
-        return facts | {"pool": self.pool, "pooled": self.pooled}, arrays
+        return facts | {"pool": self.pool}, arrays
 
     def strengthen(self, factor: float) -> None:
         """Multiply the last maps of each picture by a factor."""
@@ -110,7 +107,7 @@ class Conv(Network):
         for layer in layers:
             maps = self.activation(layer(maps))
         if self.pool == "mean":
-            maps = _field_means(maps, self.pooled)
+            maps = _field_means(maps, POOLED)
         elif self.pool == "spatial_softmax":
             maps = _spatial_softmax(maps)
         return maps.reshape(len(image), self.copies, -1).transpose(0, 1)
@@ -125,7 +122,7 @@ class Conv(Network):
             )
             if min(height, width) < 1:
                 raise ShapeError(f"{key} of {size[0]} × {size[1]} is too small for its layers: take some out, or pad")
-        each = {"mean": self.pooled**2, "flatten": height * width, "spatial_softmax": 2}[self.pool]
+        each = {"mean": POOLED**2, "flatten": height * width, "spatial_softmax": 2}[self.pool]
         return layers[-1].out_channels // self.copies * each
 
 

@@ -279,17 +279,13 @@ class Branches(Network):
         after: State = ()
         for branch in self.branches():
             features, own = branch(inputs, state[len(after) :][: len(branch.initial_state(1))])
-            values.append(options_first(features).expand(self.copies, -1, -1))
+            values.append(options_first(features))
             after = (*after, *own)
         return options_last(self.layers(torch.cat(values, -1)), inputs.batch), after
 
     def numpy_form(self) -> NumpyForm | None:
         """Perceptrons over the branches; None where a branch has no form."""
-        forms = [
-            form if branch.copies == self.copies else over_layers(form, {"kind": "shared", "copies": self.copies}, {})
-            for branch in self.branches()
-            if (form := branch.numpy_form()) is not None
-        ]
+        forms = [form for branch in self.branches() if (form := branch.numpy_form()) is not None]
         return self.layers.numpy_form(joined(forms)) if len(forms) == len(self.of) else None
 
 

@@ -244,6 +244,7 @@ widths = st.lists(counts, max_size=3)
 perceptrons = keys(hidden=counts | widths, dropout=shares)
 sizes = st.lists(counts, min_size=1)
 memories = keys(over=st.none() | perceptrons, hidden=sizes, horizon=st.none() | counts, inputs=st.lists(texts))
+convolutions = st.fixed_dictionaries({"filters": counts, "kernel": counts}, optional={"stride": counts})
 branches = st.fixed_dictionaries({"of": st.dictionaries(texts, perceptrons, min_size=1, max_size=2)})
 networks = st.one_of(
     perceptrons,
@@ -252,7 +253,7 @@ networks = st.one_of(
     having(keys(), network="linear"),
     having(keys(), network="constant"),
     keys(network=st.just("per_timestep"), hidden=widths, dropout=shares),
-    having(keys(filters=counts, kernel=counts, hidden=st.lists(counts)), network="conv"),
+    having(keys(layers=st.lists(convolutions, min_size=1, max_size=2), hidden=st.lists(counts)), network="conv"),
     having(keys(options=st.dictionaries(texts, values, max_size=3)), network="a.b:C"),
 )
 emissions = st.lists(st.sampled_from(["options", "control"]), min_size=1, unique=True)
@@ -313,7 +314,7 @@ def test_what_is_written_is_read_as_it_was(tmp_path_factory: pytest.TempPathFact
 def test_all_defaults_are_written() -> None:
     written = yaml.safe_load(dump_spec(parse_spec(SMALL)))
     assert written["hierarchy"]["levels"][0]["termination"] == {"network": "linear"}
-    assert written["training"]["optimizer"]["ridge"].keys() == {"policy", "gate", "termination", "cross_validated"}
+    assert written["training"]["optimizer"]["ridge"].keys() == {"policy", "gate", "cross_validated"}
     assert set(written) == set(Spec.model_fields)
 
 
@@ -326,7 +327,7 @@ def test_the_schema_accepts_what_is_accepted(data: dict[str, Any]) -> None:
     VALIDATOR.validate(data)
 
 
-WRONG_NETWORKS = {"network": "mpl"}, {"hidden": [0]}, {"hiden": [3]}, {"dropout": 1}, {"network": "conv", "kernel": 1.5}
+WRONG_NETWORKS = {"network": "mpl"}, {"hidden": [0]}, {"hiden": [3]}, {"dropout": 1}, {"network": "conv", "layers": []}
 WRONG = [{"hierarchy.levels.0.policy": network} for network in WRONG_NETWORKS]
 
 
@@ -392,13 +393,9 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"hierarchy.meta_policy": {"network": "linear", "hidden": [8]}}, "hierarchy.meta_policy.hidden: does not apply"),
     ({"control.parts": [{"name": "arm", "dims": [0, 1], "scale": [1.0]}]}, "control.parts.0.scale: has 1 numbers"),
     ({"control.parts": [{"name": "jaw", "dims": [0], "kind": "binary", "scale": [1]}]}, "control.parts.0.scale: does"),
-    ({"training.optimizer": {"name": "adam", "momentum": 0.5}}, "training.optimizer.momentum: is for name: momentum"),
     ({"observations": ["step"]}, "observations: step alone says nothing about the state"),
     ({"observations": ["state", {"key": "step", "differences": True}]}, "observations.1.differences: step grows by"),
-    (
-        {"hierarchy.meta_policy": {"network": "conv", "kernel": 3, "layers": [{"filters": 2, "kernel": 3}]}},
-        "hierarchy.meta_policy.kernel: each of layers has its own; leave it out",
-    ),
+    ({"hierarchy.meta_policy": {"network": "conv", "layers": []}}, "hierarchy.meta_policy.layers: must have at least"),
     ({"hierarchy.meta_policy": {"network": "branches"}}, "hierarchy.meta_policy.of: missing; it has to be given"),
     (
         {"hierarchy.levels.0.trunk": {"network": "mlp"}, "hierarchy.levels.0.policy": {"network": "lstm"}},
@@ -422,18 +419,17 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ),
     ({"training.starts": ["clusters"]}, "training.starts.0: must be vq or vq_controls or windows or equal_parts"),
     ({"training.starts": []}, "training.starts: "),
-    ({"training": {"starts": ["mixture"], "lower_levels": "frozen"}}, "training.lower_levels: mixture trains all"),
     ({"task": None}, "task: missing; name a task, or give a file in demonstrations.path"),
     ({"observations": ["a", "a"]}, "observations.1.key: 'a' is given twice; keep one"),
     ({"observations": ["hand_pos", "goal"], "report.trajectory": "hand_po"}, "report.trajectory: there is no"),
     ({"report.trajectory": ["pose", "grip", 3]}, "report.trajectory: must be KEY or [KEY, slice], such as [pose, 3:6]"),
-    ({"report.trajectory": {"key": "pose", "numbers": "3-6"}}, "report.trajectory.0: must be a slice such as 3:6"),
+    ({"report.trajectory": ["pose", "3-6"]}, "report.trajectory: there is no observation '3-6'"),
     ({"report.trajectory": []}, "report.trajectory: must have at least 1 item(s)"),
     ({"control.std": -0.1}, "control.std: must be a positive number or {learn: true}, got -0.1"),
     ({"control.scale": "standardise"}, "control.scale: must be standardize, none, or a list of positive numbers"),
     ({"control.scale": [1.0, 0.0]}, "control.scale.1: must be greater than 0, got 0.0"),
     ({"training.optimizer.lr": float("inf")}, "training.optimizer.lr: must be a finite number, got inf"),
-    ({"training.layerwise": "yes"}, "training.layerwise: must be true or false, got 'yes'"),
+    ({"training.layerwise": "yes"}, "training.layerwise: must be true, false, or segments, got 'yes'"),
     ({"training": None}, "training: must be a mapping (key: value), got null"),
     ({"seed": 2**32}, "seed: must be at most 4294967295, got 4294967296"),
 ]
@@ -445,11 +441,11 @@ def test_refused_with_the_key_path_and_one_line(overrides: dict[str, Any], messa
 
 
 def test_every_problem_has_its_line() -> None:
-    both = {"name": "em", "warmup": 2, "schedule": "cosine"}
-    message = refusal({"seed": "a", "hierarchy.levels.0.count": 0, "traning": {}, "training.optimizer": both})
+    changes = {"training.average": 0.9, "training.optimizer": {"name": "em", "schedule": "cosine"}}
+    message = refusal({"seed": "a", "hierarchy.levels.0.count": 0, "traning": {}, **changes})
     assert message.splitlines() == [
         "hierarchy.levels.0.count: must be at least 1, got 0",
-        "training.optimizer.warmup: em takes no gradient steps and would not use it; leave it out",
+        "training.average: em takes no gradient steps and would not use it; leave it out",
         "training.optimizer.schedule: em takes no gradient steps and would not use it; leave it out",
         "seed: must be a whole number, got 'a'",
         "traning: unknown key; did you mean training?",
