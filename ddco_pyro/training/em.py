@@ -26,7 +26,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from ddco_pyro.inference.kernel import products
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.emissions import Emission, Information
 from ddco_pyro.model.hierarchy import Caller, Hierarchy
@@ -80,6 +79,8 @@ class Features:
 
     def moments(self, weights: Tensor) -> Tensor:
         """Σ_t h_t x_t x_t^T for each column of weights [N·T, W], none below 0: [W, F, F]."""
+        from ddco_pyro.inference.kernel import products  # and numba and pyro, which not every command needs
+
         features = self.x.shape[-1]
         pairs = np.empty((BLOCK, features * (features + 1) // 2))
         found = torch.zeros(weights.shape[1], pairs.shape[1], dtype=torch.float64)

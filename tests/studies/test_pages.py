@@ -335,7 +335,7 @@ def test_numbers_of_readme_are_those_of_the_tables_by_pandas_alone():
     again = [rows("studies/frozen_again.csv", method=name, demonstrations="10", measure="success")
              for name in ("options", "mixture")]  # fmt: skip
     assert f"26 tasks | 10 | success | – | {difference(*again, '+.0%')} | 3 |" in text
-    arena = [rows(results("arena_em"), study="arena_em", method=name, demonstrations="50", measure="nmi")
+    arena = [rows("studies/arena_em.csv", study="arena_em", method=name, demonstrations="50", measure="nmi")
              for name in ("options", "mixture")]  # fmt: skip
     assert f"Meta-World, 9 tasks | 50 | NMI | – | {difference(*arena, '+.2f')} | 3 |" in text
     for named, task in (("knot tying", "Knot_Tying"), ("suturing", "Suturing")):
