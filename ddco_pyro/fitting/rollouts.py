@@ -27,6 +27,9 @@ from ddco_pyro.statistics import paired_difference
 OrNaN = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
 """A number; NaN, null in the file, for a measure that does not apply."""
 
+FIRST_SEED = 1000
+"""Seed of the first episode; each following episode adds 1."""
+
 
 def policies(fit: Fit, best: bool = False) -> dict[str, Policy | str]:
     """The policies to roll out, by name: scripted ones, baselines, and the model itself last.
@@ -71,7 +74,7 @@ def roll_out(
     :raises Damaged: the file of an interrupted rollout is damaged.
     """
     folder = fit.run_folder
-    seeds = range(fit.spec.rollout.seed, fit.spec.rollout.seed + episodes)
+    seeds = range(FIRST_SEED, FIRST_SEED + episodes)
     played = policies(fit, best)
     held = fit.metrics.rollouts
     whole = held and (held.seed, held.episodes, {*held.methods}) == (seeds.start, episodes, {*played})
