@@ -231,7 +231,7 @@ class Window:
         ]
         if not now:
             raise ObservationError("there are no observations; give one for each episode")
-        last = [*self._last, now][-self.encoder.steps_seen :]
+        last = [*self._last, now][-2:]  # differences are from the step before
         episodes = zip(*last, strict=True)
         recent = self.encoder.inputs(
             ({key: np.stack([seen[key] for seen in episode]) for key in self.encoder.shapes} for episode in episodes),

@@ -137,32 +137,28 @@ def same(left: Observed, right: Observed) -> bool:
 
 
 class Transform(NamedTuple):
-    """The preprocessing of pictures: crop, scale, then stack with earlier pictures.
+    """The preprocessing of pictures: crop, then scale.
 
     :param crop: top, left, height, width in the file's pixels; None for no crop.
     :param resize: height and width after scaling; None for no scaling.
-    :param frames: number of successive pictures that are stacked.
     """
 
     crop: tuple[int, ...] | None = None
     resize: tuple[int, ...] | None = None
-    frames: int = 1
 
     def as_data(self) -> dict[str, Any]:
         """The settings that differ from their defaults, as plain data."""
         return {key: value for key, value in self._asdict().items() if value != self._field_defaults[key]}
 
     def shape(self, stored: Sequence[int]) -> tuple[int, ...]:
-        """[H', W', C'] of preprocessed pictures [H, W, C].
+        """[H', W', C] of preprocessed pictures [H, W, C].
 
         :raises TransformError: the crop leaves the picture, or there are no pictures.
         """
         if self == Transform():
             return tuple(stored)
         if len(stored) != PICTURE_DIMENSIONS:
-            raise TransformError(
-                f"has shape {list(stored)} at each step: crop, resize and frames are for pictures [H, W, C]"
-            )
+            raise TransformError(f"has shape {list(stored)} at each step: crop and resize are for pictures [H, W, C]")
         height, width, colours = stored
         if self.crop is not None:
             top, left, *size = self.crop
@@ -171,29 +167,25 @@ class Transform(NamedTuple):
                     f"crop: [{', '.join(map(str, self.crop))}] is not within {height} × {width} pixels"
                 )
             height, width = size
-        return *(self.resize or (height, width)), self.frames * colours
+        return *(self.resize or (height, width)), colours
 
     def seen(self, array: Observed, steps: slice) -> Iterator[np.ndarray]:
-        """Preprocessed pictures of consecutive steps, [steps, H', W', C'], block by block.
+        """Preprocessed pictures of consecutive steps, [steps, H', W', C], block by block.
 
         :raises DemonstrationsError: a file cannot be read.
         """
         last, at_once = min(steps.stop, len(array)), block_steps(array.shape[1:], array.dtype)
         for first in range(steps.start, last, at_once):
-            before = min(self.frames - 1, first)
-            yield self(array[first - before : min(first + at_once, last)])[before:]
+            yield self(array[first : min(first + at_once, last)])
 
     def __call__(self, frames: np.ndarray) -> np.ndarray:
-        """Pictures [T, H, W, C] from a first step on to [T, H', W', C']."""
+        """Pictures [T, H, W, C] to [T, H', W', C]."""
         if self.crop is not None:
             top, left, height, width = self.crop
             frames = frames[:, top : top + height, left : left + width]
         if self.resize is not None and frames.shape[1:3] != self.resize:
             frames = resized(frames, self.resize)
-        if self.frames == 1:
-            return frames
-        rows = np.arange(len(frames))  # earlier pictures first; the first picture is repeated
-        return np.concatenate([frames[np.maximum(rows - back, 0)] for back in reversed(range(self.frames))], axis=-1)
+        return frames
 
 
 def resized(frames: np.ndarray, size: tuple[int, ...]) -> np.ndarray:

@@ -63,7 +63,6 @@ class Runner:
         self.terminations: tuple[float, ...] = ()
         self.outputs: Outputs = {}
         self._last: dict[str, np.ndarray] | None = None
-        self._pictures: dict[str, list[np.ndarray]] = {}
         self._marginal: np.ndarray | None = None
         self._state = [np.array(part["values"], part["kind"]).reshape(part["shape"]) for part in self.about["state"]]
 
@@ -83,7 +82,7 @@ class Runner:
             observation = {**observation, built_in["key"]: np.array([self.time / built_in["longest"]])}
         specs = self.about["observations"]
         now = {spec["key"]: _checked(observation, spec) for spec in specs}
-        images = {spec["key"]: self._recent(now[spec["key"]], spec) for spec in specs if spec["image"]}
+        images = {spec["key"]: _picture(now[spec["key"]], spec) for spec in specs if spec["image"]}
         features = self._features(now, self._last or now)
         self.outputs, self._state = self._networks(features, self.time, images, self._state)
         generator = np.random.default_rng([self.seed, self.time])
@@ -97,13 +96,6 @@ class Runner:
         """ψ of each active choice, lowest level first; 1 for control."""
         active = enumerate(self.choices)
         return tuple(float(outputs[f"termination_{level}"][choice - 1]) if choice else 1.0 for level, choice in active)
-
-    def _recent(self, picture: np.ndarray, spec: Mapping[str, Any]) -> np.ndarray:
-        """The picture as networks see it, stacked behind earlier ones where networks see several."""
-        cut = _picture(picture, spec)
-        before = self._pictures.get(spec["key"], [cut] * spec.get("frames", 1))
-        self._pictures[spec["key"]] = seen = [*before[1:], cut]
-        return np.concatenate(seen, axis=-1)
 
     def _features(self, now: Mapping[str, np.ndarray], before: Mapping[str, np.ndarray]) -> np.ndarray:
         parts = [np.zeros(0)]

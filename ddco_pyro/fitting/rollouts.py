@@ -16,6 +16,9 @@ from ddco_pyro.simulation.film import write_film
 from ddco_pyro.simulation.task import SUCCESS, Policy, Task, find_task
 from ddco_pyro.statistics import paired_difference, success_worth
 
+FIRST_SEED = 1000
+"""Seed of the first episode; each following episode adds 1."""
+
 
 def policies(fit: Fit, best: bool = False) -> dict[str, Policy | str]:
     """The policies to roll out, by name: scripted ones, baselines, and the model itself last.
@@ -58,7 +61,7 @@ def roll_out(
     :raises RunError: there is no task, or the fit has no folder.
     """
     folder = fit.run_folder
-    seeds = range(fit.spec.rollout.seed, fit.spec.rollout.seed + episodes)
+    seeds = range(FIRST_SEED, FIRST_SEED + episodes)
     played = policies(fit, best)
     held = fit.metrics.rollouts
     whole = held and (held.seed, held.episodes, {*held.methods}) == (seeds.start, episodes, {*played})

@@ -23,7 +23,7 @@ NARROWEST = 1e-6
 
 class ObservationEncoder(nn.Module):
     """Observations by name to one feature vector: angles and quaternions turned into numbers that do not jump,
-    the first step taken off and differences appended, standardised where the spec says so.
+    differences appended, standardised.
 
     Mean and standard deviation are those of the demonstrations given to :meth:`fit`, and are kept with the model. A
     dimension that varies by rounding alone (:func:`~ddco_pyro.data.checks.rounding`) is only centred, and so are
@@ -39,7 +39,7 @@ class ObservationEncoder(nn.Module):
     The built-in observation :data:`~ddco_pyro.spec.STEP` is made here: the number of the step divided by ``longest``,
     the steps of the longest demonstration given to :meth:`fit`.
 
-    :raises ShapeError: an observation cannot be read, cropped, scaled, binned or augmented as the spec says.
+    :raises ShapeError: an observation cannot be read, cropped, scaled, binned or shifted as the spec says.
     """
 
     mean: Tensor
@@ -61,7 +61,7 @@ class ObservationEncoder(nn.Module):
         self.specs = tuple(spec for spec in specs if kinds[spec.key] == "vector")
         pictures = [spec for spec in specs if kinds[spec.key] == "picture"]
         self.transforms = {spec.key: _transform(spec) for spec in pictures}
-        self.shifts = {spec.key: spec.augment.shift for spec in pictures if spec.augment}
+        self.shifts = {spec.key: spec.shift for spec in pictures if spec.shift}
         seen = {spec.key: _seen_shape(spec, shapes) for spec in specs}
         self.images = {spec.key: seen[spec.key] for spec in pictures}
         widths = [spec.turned(int(np.prod(shapes[spec.key]))) for spec in self.specs]
@@ -75,11 +75,6 @@ class ObservationEncoder(nn.Module):
             self.register_buffer("high", torch.full_like(self.mean, torch.inf))
         if STEP in self.keys:
             self.register_buffer("longest", torch.ones((), dtype=torch.float64))
-
-    @property
-    def steps_seen(self) -> int:
-        """Steps that the features and pictures of one step are made of: this step and those before it."""
-        return max([2, *(transform.frames for transform in self.transforms.values())])
 
     @property
     def keys(self) -> list[str]:
@@ -101,10 +96,8 @@ class ObservationEncoder(nn.Module):
             places, cut = self.places.numpy(), self._cut(torch.as_tensor(rows)).numpy()
             moves = moves[places] & (np.ptp(cut, axis=0) > NARROWEST * np.ptp(rows, axis=0)[places])
             rows = cut
-        standardize = np.repeat(np.array([spec.standardize for spec in self.specs], dtype=bool), self.sizes)
-        changes = standardize & moves
-        self.mean.copy_(torch.as_tensor(np.where(standardize, rows.mean(0), 0.0)))
-        self.std.copy_(torch.as_tensor(np.where(changes, rows.std(0), 1.0)))
+        self.mean.copy_(torch.as_tensor(rows.mean(0)))
+        self.std.copy_(torch.as_tensor(np.where(moves, rows.std(0), 1.0)))
 
     @property
     def has_bins(self) -> bool:
@@ -223,13 +216,13 @@ def _ends(values: np.ndarray, bins: int) -> np.ndarray:
 
 
 def _transform(spec: ObservationSpec) -> Transform:
-    return Transform(spec.crop, spec.resize, spec.frames)
+    return Transform(spec.crop, spec.resize)
 
 
 def _seen_shape(spec: ObservationSpec, shapes: Shapes) -> tuple[int, ...]:
     """The shape of a step of an observation as networks see it.
 
-    :raises ShapeError: it cannot be cropped, scaled, binned or augmented as the spec says.
+    :raises ShapeError: it cannot be cropped, scaled, binned or shifted as the spec says.
     """
     stored = shapes[spec.key]
     if spec.bins and len(stored) == PICTURE_DIMENSIONS:
@@ -240,10 +233,8 @@ def _seen_shape(spec: ObservationSpec, shapes: Shapes) -> tuple[int, ...]:
             f"observations: {spec.key!r} has shape {list(stored)} at each step: angles and quaternions name numbers of "
             f"a vector, counted from 0, and there is no number {last}"
         )
-    if spec.augment and spec.augment.shift and len(stored) != PICTURE_DIMENSIONS:
-        raise ShapeError(
-            f"observations: {spec.key!r} has shape {list(stored)} at each step: augment.shift is for pictures"
-        )
+    if spec.shift and len(stored) != PICTURE_DIMENSIONS:
+        raise ShapeError(f"observations: {spec.key!r} has shape {list(stored)} at each step: shift is for pictures")
     try:
         return _transform(spec).shape(stored)
     except TransformError as error:

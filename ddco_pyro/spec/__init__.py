@@ -9,7 +9,6 @@ from ddco_pyro.spec.networks import Activation, ConvolutionLayer, NetworkSpec, P
 from ddco_pyro.spec.settings import (
     DISCRETE,
     STEP,
-    AugmentSpec,
     ControlSpec,
     DemonstrationsSpec,
     InferenceSpec,
@@ -31,7 +30,6 @@ __all__ = [
     "DISCRETE",
     "STEP",
     "Activation",
-    "AugmentSpec",
     "BaselineSpec",
     "ControlSpec",
     "ConvolutionLayer",

@@ -62,8 +62,8 @@ class Network(Model):
 
     @property
     def hidden_sizes(self) -> tuple[int, ...]:
-        """Sizes of the hidden layers; empty for networks without the setting ``hidden``."""
-        return getattr(self, "hidden", ())
+        """Sizes of the hidden layers; empty for networks without."""
+        return ()
 
     @model_validator(mode="before")
     @classmethod
@@ -102,12 +102,22 @@ class ConstantSpec(Network):
             yield "inputs", "a constant reads no observation; leave it out"
 
 
-class MlpSpec(Network):
+class LayeredSpec(Network):
+    """A network with hidden layers."""
+
+    hidden: Sizes = (64,)
+    """Sizes of the hidden or recurrent layers, first layer first; a bare number is a single layer."""
+
+    @property
+    def hidden_sizes(self) -> tuple[int, ...]:
+        """Sizes of the hidden layers."""
+        return self.hidden
+
+
+class MlpSpec(LayeredSpec):
     """A multi-layer perceptron."""
 
     network: Literal["mlp"] = "mlp"
-    hidden: Sizes = (64,)
-    """Sizes of the hidden layers, first layer first; a bare number is a single layer."""
     dropout: Share = 0.0
     """Probability with which a hidden unit is dropped in training."""
     activation: Activation = "relu"
@@ -149,7 +159,7 @@ class ConvSpec(MlpSpec):
     """Whether each picture is shifted and scaled to mean 0 and standard deviation 1 over its pixels and channels."""
 
 
-class LstmSpec(Network):
+class LstmSpec(LayeredSpec):
     """An LSTM."""
 
     network: Literal["lstm"]

@@ -86,20 +86,16 @@ STEP = "step"
 """The built-in observation: the number of the step divided by the steps of the longest training demonstration."""
 
 
-class AugmentSpec(Model):
-    """Data augmentation of an observation, in training alone."""
-
-    shift: int = Field(default=0, ge=0)
-    """For pictures: the largest shift in pixels along either axis. In an epoch all pictures of a trajectory have the
-    same shift; edge pixels are repeated."""
-
-
 Size = Annotated[Items[Count], Field(min_length=2, max_length=2)]
 Part = Annotated[Items[Annotated[int, Field(ge=0)]], Field(min_length=4, max_length=4)]
 
 
 class ObservationSpec(Model):
-    """One observation that the networks read."""
+    """One observation that the networks read.
+
+    Vectors are shifted and scaled to mean 0 and standard deviation 1 over the training demonstrations. Dimensions that
+    are constant up to rounding are only shifted.
+    """
 
     key: Text
     """Name of the observation in the demonstrations; ``step`` is built in."""
@@ -111,9 +107,6 @@ class ObservationSpec(Model):
     quaternions: Items[Annotated[int, Field(ge=0)]] = ()
     """For vectors: the first of each four numbers that are a unit quaternion, in either order. Each becomes the ten
     products of two of its numbers, of which a rotation matrix consists, and which are the same for q and −q."""
-    standardize: bool = True
-    """Shift and scale to mean 0 and standard deviation 1 over the training demonstrations. Dimensions that are constant
-    up to rounding are only shifted."""
     bins: Annotated[int, Field(ge=0, le=64)] = 0
     """For vectors: bins of a piecewise-linear encoding, appended to each number and each difference. A bin holds the
     number clipped to one part of its range; the parts hold equally many distinct values. Networks can then read small
@@ -122,11 +115,9 @@ class ObservationSpec(Model):
     """For pictures: top, left, height and width of the crop, in the file's pixels; null: no crop."""
     resize: Size | None = None
     """For pictures: height and width after the crop is scaled by area averaging; null: not scaled."""
-    frames: Count = 1
-    """For pictures: number of successive pictures stacked along the channels, oldest first. Before the first step the
-    first picture is repeated. A single picture does not show velocities."""
-    augment: AugmentSpec | None = None
-    """Data augmentation in training; null: none."""
+    shift: int = Field(default=0, ge=0)
+    """For pictures, in training alone: the largest shift in pixels along either axis. In an epoch all pictures of a
+    trajectory have the same shift; edge pixels are repeated."""
 
     def problems(self) -> Problems:
         if self.crop is not None and 0 in self.crop[2:]:
@@ -140,8 +131,8 @@ class ObservationSpec(Model):
             elif getattr(self, key) and len(set(turned)) < len(turned):
                 yield key, "name a number twice; each is part of one angle or quaternion"
                 break
-        if self.key == STEP and self.augment:
-            yield "augment", f"{STEP} is computed and is no picture; leave it out"
+        if self.key == STEP and self.shift:
+            yield "shift", f"{STEP} is computed and is no picture; leave it out"
 
     def turned(self, size: int) -> int:
         """For vectors: numbers of a step of ``size`` numbers, with angles and quaternions in their place."""
@@ -283,8 +274,6 @@ class RolloutSpec(Model):
 
     episodes: Count = 50
     """Number of episodes."""
-    seed: Seed = 1000
-    """Seed of the first episode; each following episode adds 1."""
     control: Literal["mean", "sample"] = "mean"
     """Whether the control is the mean of its distribution or a sample."""
     options: OptionExecution = "marginal"

@@ -73,7 +73,7 @@ def fitted(name, observed):
     """The fit, and the outcomes of its options and of the mixture from the same starts."""
     spec = parse_spec(yaml.safe_load(SPEC.format(task=name, observed=observed)))
     fit = ddco_pyro.fit(spec, demonstrations(name))
-    starts, task = range(spec.rollout.seed, spec.rollout.seed + spec.rollout.episodes), getattr(memory_tasks, name)
+    starts, task = range(1000, 1000 + spec.rollout.episodes), getattr(memory_tasks, name)
     played = []
     for hierarchy in (fit.hierarchy, fit.baselines["mixture"].hierarchy):
         controller = Controller.from_spec(hierarchy, spec.rollout)

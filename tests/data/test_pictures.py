@@ -28,7 +28,7 @@ from ddco_pyro.training.networks import Dimensions, build_hierarchy
 
 HEIGHT, WIDTH = 12, 10
 CONV = {"network": "conv", "layers": [{"filters": 3, "kernel": 3, "stride": 2, "padding": 1}], "hidden": [5]}
-RAW = {"key": "camera", "crop": [1, 2, 10, 8], "resize": [5, 4], "frames": 2}
+RAW = {"key": "camera", "crop": [1, 2, 10, 8], "resize": [5, 4]}
 
 
 def demonstrations(number: int = 8) -> Demonstrations:
@@ -110,26 +110,8 @@ def test_transform_by_hand() -> None:
         assert transform(picture).shape[1:] == transform.shape(picture.shape[1:])
 
 
-def test_pictures_are_seen_behind_those_before_them(kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Along the channels, the oldest first, and the first one repeated, wherever a trajectory is cut."""
-    monkeypatch.setattr("ddco_pyro.data.pictures.BLOCK_BYTES", 3 * HEIGHT * WIDTH * 3)
-    spec = ObservationSpec(key="camera", frames=3)
-    encoder = ObservationEncoder([spec], {"camera": (HEIGHT, WIDTH, 3)})
-    assert encoder.images == {"camera": (HEIGHT, WIDTH, 9)}
-    demos = demonstrations()
-    for each in (Demonstrations.read(kept), demos):
-        frames = encoder.inputs(demo.observations for demo in each).images
-        whole, part = frames["camera"], frames.part(torch.tensor([2]), slice(6, 11))["camera"]
-        seen = demos[2].observations["camera"]
-        for step in range(12):
-            expected = np.concatenate([seen[max(step - back, 0)] for back in (2, 1, 0)], axis=-1)
-            np.testing.assert_array_equal(whole[2, step], expected)
-            if 6 <= step < 11:
-                np.testing.assert_array_equal(part[0, step - 6], expected)
-
-
 def test_pictures_are_cut_and_scaled_wherever_they_are(kept: Path) -> None:
-    encoder = ObservationEncoder([ObservationSpec(**RAW | {"frames": 1})], {"camera": (HEIGHT, WIDTH, 3)})
+    encoder = ObservationEncoder([ObservationSpec(**RAW)], {"camera": (HEIGHT, WIDTH, 3)})
     assert encoder.images == {"camera": (5, 4, 3)}
     read, made = ([demo.observations for demo in demos] for demos in (Demonstrations.read(kept), demonstrations()))
     seen, expected = (encoder.inputs(each).loaded().images["camera"] for each in (read, made))
@@ -153,7 +135,7 @@ def test_shifting_repeats_the_edge() -> None:
 
 
 def test_a_trajectory_is_shifted_as_one_and_anew_in_each_epoch() -> None:
-    spec = parse_spec(spec_of(Path("unused"), {"key": "camera", "augment": {"shift": 3}}))
+    spec = parse_spec(spec_of(Path("unused"), {"key": "camera", "shift": 3}))
     encoder = ObservationEncoder(spec.observations, demonstrations().observation_shapes)
     demos = demonstrations()
     whole = Batch(
@@ -177,10 +159,10 @@ def test_a_trajectory_is_shifted_as_one_and_anew_in_each_epoch() -> None:
     ("observation", "message"),
     [
         ({"key": "camera", "crop": [3, 3, 10, 4]}, r"'camera' crop: \[3, 3, 10, 4\] is not within 12 × 10 pixels"),
-        ({"key": "pose", "frames": 2}, r"'pose' has shape \[3\] at each step: crop, resize and frames are for"),
+        ({"key": "pose", "resize": [4, 4]}, r"'pose' has shape \[3\] at each step: crop and resize are for"),
         (
-            {"key": "pose", "augment": {"shift": 1}},
-            r"'pose' has shape \[3\] at each step: augment.shift is f",
+            {"key": "pose", "shift": 1},
+            r"'pose' has shape \[3\] at each step: shift is f",
         ),
         ({"key": "camera", "bins": 4}, r"'camera' has pictures: bins are for vectors"),
     ],
@@ -200,7 +182,7 @@ def test_what_cannot_be_cut_is_refused(kept: Path, observation: dict[str, Any], 
 def test_a_streamed_fit_is_that_in_memory(kept: Path, chunks: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Bit for bit, weights and numbers, in chunks of time too, with cut and shifted pictures."""
     starts = ["vq_controls" if chunks else "vq"]
-    spec = parse_spec(spec_of(kept, {**RAW, "augment": {"shift": 1}}, starts=starts))
+    spec = parse_spec(spec_of(kept, {**RAW, "shift": 1}, starts=starts))
     if chunks:
         step_bytes = build_hierarchy(spec, Dimensions.of(demonstrations())).step_bytes
         monkeypatch.setattr("ddco_pyro.model.hierarchy.BYTES_AT_ONCE", 17 * step_bytes)

@@ -180,8 +180,8 @@ def test_pictures_alone_are_seen_by_one_network(tmp_path: Path) -> None:
     numbered(records).write(tmp_path / "seen.hdf5")
     written = started(tmp_path / "seen.hdf5")
     spec = load_spec(written)
-    assert [(one.key, one.resize, one.augment and one.augment.shift) for one in spec.observations] == [
-        ("2nd eye", None, None),
+    assert [(one.key, one.resize, one.shift) for one in spec.observations] == [
+        ("2nd eye", None, 0),
         ("eye", (32, 64), 3),
     ]
     assert set(spec.hierarchy.trunk.of) == set(CAMERAS)

@@ -146,7 +146,6 @@ def begun(run, episodes, film, **options):
         ({}, EPISODES, 2, False),
         ({}, EPISODES - 1, 2, True),
         ({}, EPISODES, 3, True),
-        ({"rollout.seed": FIRST + 1}, EPISODES, 2, True),
     ],
 )
 def test_others_are(copied, changes, episodes, film, resume):

@@ -169,7 +169,7 @@ def write_pictures(folder: Path) -> None:
     }
     data = {
         "demonstrations": {"path": str(folder / "pictures.hdf5")},
-        "observations": [{"key": "camera", "augment": {"shift": 1}}],
+        "observations": [{"key": "camera", "shift": 1}],
         "baseline": {"kind": "flat", "policy": policy},
         "training": {"epochs": 60, "patience": None, "shards": 2, "batch_size": 4},
     }

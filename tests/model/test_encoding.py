@@ -72,13 +72,14 @@ def test_a_dimension_that_never_changes_is_only_centred():
 
 
 def test_differences_stand_behind_their_observation_and_begin_with_zero():
-    specs = ObservationSpec(key="pose", differences=True, standardize=False), ObservationSpec(key="grid")
-    found = fitted(*specs).inputs(demo.observations for demo in DEMOS).vector
-    assert found.shape == (3, 5, 3 + 3 + 4)
+    encoder = fitted(ObservationSpec(key="pose", differences=True), ObservationSpec(key="grid"))
+    seen = encoder.inputs(demo.observations for demo in DEMOS).vector
+    assert seen.shape == (3, 5, 3 + 3 + 4)
+    found = (seen.double() * encoder.std + encoder.mean).numpy()
     for n, demo in enumerate(DEMOS):
         pose = demo.observations["pose"]
-        np.testing.assert_array_equal(found[n, : len(demo), :3], pose.astype(np.float32))  # not standardised
-        np.testing.assert_allclose(found[n, 0, 3:6], 0)
+        np.testing.assert_allclose(found[n, : len(demo), :3], pose, atol=1e-5)
+        np.testing.assert_allclose(found[n, 0, 3:6], 0, atol=1e-6)
         np.testing.assert_allclose(found[n, 1 : len(demo), 3:6], pose[1:] - pose[:-1], atol=1e-5)
 
 
@@ -147,11 +148,12 @@ def test_a_part_that_holds_one_value_alone_is_only_centred():
 
 
 def test_the_step_is_a_part_of_the_longest_training_demonstration():
-    encoder = fitted(ObservationSpec(key="pose"), ObservationSpec(key="step", standardize=False))
+    encoder = fitted(ObservationSpec(key="pose"), ObservationSpec(key="step"))
     found = encoder.inputs(demo.observations for demo in DEMOS)
     assert list(found.vectors) == ["pose", "step"]
-    np.testing.assert_allclose(found.vectors["step"][0, :, 0], np.arange(5) / 5, rtol=1e-6)
-    np.testing.assert_allclose(found.vectors["step"][1, :3, 0], np.arange(3) / 5, rtol=1e-6)
+    steps = (found.vectors["step"][..., 0].double() * encoder.std[-1] + encoder.mean[-1]).numpy()
+    np.testing.assert_allclose(steps[0], np.arange(5) / 5, atol=1e-6)
+    np.testing.assert_allclose(steps[1, :3], np.arange(3) / 5, atol=1e-6)
     assert "step" not in encoder.shapes  # nothing has to be observed for it
 
 

@@ -108,7 +108,7 @@ BRANCHES = {
     },
     "hidden": [7],
 }
-SMALL = {"camera": {"resize": [7, 6], "frames": 2}, "built_in": ("step",)}
+SMALL = {"camera": {"resize": [7, 6]}, "built_in": ("step",)}
 BOTH = ("options", "control")
 FITS = {
     "linear": make("linear", options="most_likely"),
@@ -117,7 +117,7 @@ FITS = {
     "per_timestep": make("per_timestep", steps=30),
     "bins": make("mlp", bins=4),
     "angles and quaternions": make("mlp", turns=True),
-    "conv": make("conv", camera={"crop": [1, 2, 7, 9], "resize": [6, 8], "frames": 3}, options="sample"),
+    "conv": make("conv", camera={"crop": [1, 2, 7, 9], "resize": [6, 8]}, options="sample"),
     "hybrid": make("mlp", (2, 3), BOTH, control="sample"),
     "σ of the state": make("mlp", (2, 3), BOTH, std={"learn": True, "per_state": True}, control="sample"),
     "three levels": make("mlp", (2, 3, 2), BOTH),

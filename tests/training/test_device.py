@@ -75,7 +75,7 @@ def spec_of(level: dict[str, Any], **training: Any) -> Spec:
     own = {"epochs": 3, "batch_size": 3, "average": 0.5, "layerwise": False}
     return small_spec(
         demonstrations={"path": "unused.hdf5", "valid_fraction": 0.2},
-        observations=["pose", {"key": "camera", "augment": {"shift": 1}}],
+        observations=["pose", {"key": "camera", "shift": 1}],
         control={"std": {"learn": True}},
         hierarchy={"levels": [{"count": 2, **level}], "meta_policy": LINEAR},
         training=own | training,

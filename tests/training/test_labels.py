@@ -220,7 +220,6 @@ def recognised():
 
     demos = numbered(map(one, phases))
     spec = labelled(counts=(3,), training={"seed": 1, "epochs": 2}, recogniser=RECOGNISER)
-    spec = ddco_pyro.spec.with_overrides(spec, {"observations": [{"key": "state", "standardize": False}]})
     return demos, make_trainer(spec, demos, None)
 
 
