@@ -186,7 +186,7 @@ BASELINES = {"Gaussian HMM": "hmm", "change points": "change_points"}
 USUAL: dict[str, Any] = {
     "control.power": 1.0,
     "control.parts": [],
-    "training.window": 0,
+    "training.starts": ["vq_controls"],
     "training.optimizer.ridge": {"cross_validated": True},
 }
 """What the paper's likelihood is, with small ridges."""
