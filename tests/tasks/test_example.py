@@ -10,7 +10,7 @@ from ddco_tasks.example_network import Radial
 
 import ddco_pyro
 from ddco_pyro.model.networks import Inputs, InputShape
-from ddco_pyro.simulation.episodes import play
+from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.spec import load_spec
 
 SPEC = Path(__file__).parents[2] / "specs" / "example.yaml"
@@ -23,7 +23,7 @@ def test_the_spec_fits_and_acts(cache: Path, tmp_path: Path) -> None:
     trunk = found.hierarchy.levels[0].trunk
     assert isinstance(trunk.module, Radial)
     assert (trunk.features, trunk.module.width) == (32, 2.0)
-    (episode,) = play(task, found.controller(), [0])
+    episode = run_episode(task, found.controller(), 0)
     assert len(episode.record) > 0
 
 

@@ -189,7 +189,7 @@ def test_the_objective_has_the_ridges_log_prior(demos, tmp_path):
     networks = [("policy", level.policy.network), ("gate", level.termination), ("gate", model.meta_policy.network)]
     squares = [(name, float(network.layers[-1].weight.detach().double().square().sum())) for name, network in networks]
     biases = 1e-6 * sum(float(network.layers[-1].bias.detach().double().square().sum()) for _, network in networks)
-    value = float(log_likelihood(model.tabulate(batch), batch.lengths).sum())
+    value = float(log_likelihood(model.tabulate(batch), batch.lengths).detach().sum())
     value -= 0.5 * (sum(ridge[name] * square for name, square in squares) + biases)
     assert trainer.objective == pytest.approx(value / batch.steps, abs=1e-5)
 
