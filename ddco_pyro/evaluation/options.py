@@ -200,7 +200,7 @@ class Finding:
         start = START.get(self.kind)
         if start is None or training.labels or {start, "vq_controls"} & {*training.starts}:
             return ADVICE[self.kind]
-        return f"{ADVICE[self.kind]} Or start from clusters, too (training.starts: {start})."
+        return f"{ADVICE[self.kind]} Or start from clusters, too (training.starts: [{start}])."
 
     def options(self, names: Sequence[str]) -> str:
         """The option, or the two options that act alike, by the names of a level's choices."""
@@ -316,7 +316,7 @@ def unlabelled_start(training: TrainingSpec) -> list[tuple[str, str]]:
     if training.labels is None or not blind:
         return []
     text = f"training.starts: {listed(blind)} numbers options in the order of time, whatever training.labels say."
-    return [(text, "Start from what labelled steps say of the others (training.starts: vq_controls).")]
+    return [(text, "Start from what labelled steps say of the others (training.starts: [vq_controls]).")]
 
 
 def degeneracies(metrics: Metrics, spec: Spec, names: Mapping[str, Sequence[str]]) -> list[tuple[str, str]]:
@@ -352,7 +352,7 @@ def _less_than_equal_parts(found: Agreement, levels: Sequence[str]) -> Iterator[
                 f"Equal parts of each demonstration agree better with labels/{labels} than options of level “{level}” "
                 f"do: normalised mutual information {number(other.nmi)} against {number(own.nmi)}, {part}.",
                 "Equal parts know nothing but the time. Observe what tells the labels apart, start from some of them "
-                "(training.labels), or start from equal parts (training.starts: equal_parts).",
+                "(training.labels), or start from equal parts (training.starts: [equal_parts]).",
             )
 
 
