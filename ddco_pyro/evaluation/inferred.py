@@ -221,9 +221,9 @@ class Segment(NamedTuple):
 
     A segment ends with a new choice, which may be the same option.
 
-    :param option: the choice, 1 to k; 0 where the caller emits the control.
-    :param start: the first step.
-    :param steps: how many steps.
+    :ivar option: the choice, 1 to k; 0 where the caller emits the control.
+    :ivar start: the first step.
+    :ivar steps: how many steps.
     """
 
     demonstration: str
