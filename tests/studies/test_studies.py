@@ -28,7 +28,7 @@ from ddco_pyro.fitting.fitted import load
 from ddco_pyro.jobs import Workers
 from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.spec import SpecError
-from studies import cells, declaration, labelling, statistics
+from studies import cells, declaration, statistics
 from studies.__main__ import told
 from studies.cells import Folder
 from studies.declaration import Study
@@ -581,65 +581,6 @@ def test_cells_of_an_earlier_table_are_not_done(made, done, tmp_path):
     table.write_text(re.sub(r"(?m)^.*,flat,\d+,1,.*\n", "", table.read_text()))
     folder = made(kept=[{"table": "table.csv"}])
     assert {(cell.method, cell.seed) for cell in folder.state().missing} == {("flat", 1)}
-
-
-def edited(shown, command):
-    """By hand, what a page shows after a command, without a model."""
-    at = command.get("boundary", command.get("step"))
-    place = next(n for n, (_, start, stop) in enumerate(shown) if start <= at < stop)
-    option, start, stop = shown[place]
-    if command["do"] == "name":
-        return [*shown[:place], (command["option"], start, stop), *shown[place + 1 :]]
-    if command["do"] == "split":
-        assert start < command["step"] < stop
-        return [*shown[:place], (option, start, at), (option, at, stop), *shown[place + 1 :]]
-    before, begun, _ = shown[place - 1]
-    assert at == start
-    assert begun < command["to"] < stop
-    return [*shown[: place - 1], (before, begun, command["to"]), (option, command["to"], stop), *shown[place + 1 :]]
-
-
-def test_a_simulated_person_makes_every_segment_right_with_the_planned_number_of_commands():
-    """One after another, each the first of a new plan; boundaries may be off by the slack."""
-    rng = np.random.default_rng(0)
-    for slack in (0, 1):
-        for _ in range(200):
-            shown, wanted = (labelling.runs_of(rng.integers(1, 4, 12)[np.sort(rng.integers(0, 12, 12))]) for _ in "ab")
-            number, left = len(labelling.plan(shown, wanted, slack)), labelling.plan(shown, wanted, slack)
-            while left:
-                shown, number = edited(shown, left[0]), number - 1
-                left = labelling.plan(shown, wanted, slack)
-                assert len(left) <= number
-            truth = np.concatenate([[option] * (stop - start) for option, start, stop in wanted])
-            found = np.concatenate([[option] * (stop - start) for option, start, stop in shown])
-            off = np.flatnonzero(found != truth)
-            edges = np.array([start for _, start, _ in wanted[1:]])
-            assert all(np.min(np.abs(edges - step - 0.5)) <= slack for step in off)
-
-
-@pytest.mark.parametrize(
-    ("shown", "wanted", "commands"),
-    [
-        ([(1, 0, 5), (2, 5, 9)], [(1, 0, 6), (2, 6, 9)], []),  # within the slack
-        ([(1, 0, 5), (2, 5, 9)], [(1, 0, 7), (2, 7, 9)], [{"do": "move", "boundary": 5, "to": 7}]),
-        ([(1, 0, 5), (2, 5, 9)], [(1, 0, 9)], [{"do": "name", "option": 1, "step": 5}]),
-        ([(1, 0, 9)], [(1, 0, 4), (2, 4, 9)], [{"do": "split", "step": 4}, {"do": "name", "option": 2, "step": 4}]),
-        ([(1, 0, 9)], [(labelling.OPEN, 0, 9)], [{"do": "open", "step": 0}]),
-    ],
-)
-def test_a_simulated_person_counts_as_by_hand(shown, wanted, commands):
-    assert labelling.plan(shown, wanted, 1) == commands
-
-
-def test_a_target_is_reached_where_it_stays_reached():
-    curve = [{"edits": edits, "right": right} for edits, right in ((0, 0.0), (9, 0.96), (12, 0.7), (16, 0.95), (17, 1))]
-    assert (labelling.reached(curve, 0.95), labelling.reached(curve[:3], 0.95)) == (16, None)
-    truth = [np.array([-1, 0, 0, 1, 1, -1]), np.array([0, 0, 1, 1])]
-    scratch = [{"edits": 0, "right": 0}, {"edits": 7, "right": 0.5}, {"edits": 10, "right": 1}]
-    assert labelling.from_scratch(truth) == scratch  # three boundaries, two names, two new labels; then one and two
-    halves = labelling.from_equal_parts(truth[1:] * 2, 0)  # a boundary, two names, two new labels; and two acceptances
-    assert [values["edits"] for values in halves] == [0, 6, 7]
-    assert [values["right"] for values in halves] == [0, 1, 1]
 
 
 @pytest.mark.parametrize(
