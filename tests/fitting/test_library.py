@@ -337,17 +337,6 @@ def test_pieces_say_what_the_whole_says(in_memory: ddco_pyro.Fit, monkeypatch: p
         np.testing.assert_array_equal(own, row[: len(own)])
 
 
-def compare(ours: object, theirs: object) -> None:
-    assert type(ours) is type(theirs)
-    if isinstance(ours, dict):
-        assert ours.keys() == theirs.keys()
-    if isinstance(ours, dict | list):
-        for key in ours if isinstance(ours, dict) else range(len(ours)):
-            compare(ours[key], theirs[key])
-    else:
-        assert ours == (pytest.approx(theirs, rel=1e-5, abs=1e-6) if isinstance(ours, float) else theirs)
-
-
 # --- what is read -----------------------------------------------------------------------------------------------------
 
 
@@ -391,6 +380,3 @@ def test_check_reads_no_observations(commanded: Path, reads: Counter) -> None:
     """The controls are read: which are constant, or take two values, is part of what it says."""
     assert call("check", commanded / "spec.yaml").status == 0
     assert reads == {name: 1.0 for name in everything(commanded / "demos.hdf5") if name.endswith("/actions")}
-
-
-# --- how often a fit builds a model -----------------------------------------------------------------------------------

@@ -14,6 +14,7 @@ import torch
 import yaml
 from command_line import call
 from elsewhere import THERE, Device, Elsewhere
+from killing import Interrupting
 from planted import small_spec
 from random_demonstrations import numbered
 
@@ -168,16 +169,11 @@ def test_of_several_gpus_each_process_has_its_own(monkeypatch: pytest.MonkeyPatc
 def test_a_run_goes_on_where_it_was_begun(demos: Demonstrations, tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     """On the same kind of device bit for bit; on another it is refused before a bit is trained."""
     spec = spec_of(DROPPING, starts=["random"])
-
-    def stop(event: Any) -> None:
-        if type(event).__name__ == "EpochEnded" and event.epoch == 2:
-            raise KeyboardInterrupt
-
     on(monkeypatch, THERE)
     with Device():
         whole = ddco_pyro.fit(spec, demos, tmp_path / "whole")
         with pytest.raises(KeyboardInterrupt):
-            ddco_pyro.fit(spec, demos, tmp_path / "killed", on_event=stop)
+            ddco_pyro.fit(spec, demos, tmp_path / "killed", on_event=Interrupting(2))
     on(monkeypatch, torch.device("cpu"))
     with pytest.raises(OtherDevice, match=r"restart-0.safetensors: was trained on meta, and networks are on cpu here"):
         ddco_pyro.fit(spec, demos, tmp_path / "killed")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 import user_networks
+from killing import Interrupting
 from planted import make_spec, make_trainer, small_spec
 from random_demonstrations import numbered, of_states
 from sklearn.metrics import normalized_mutual_info_score
@@ -14,7 +15,7 @@ import ddco_pyro
 from ddco_pyro.drawing import words
 from ddco_pyro.evaluation import effort
 from ddco_pyro.evaluation.verdicts import verdict
-from ddco_pyro.events import EpochEnded, RestartDiverged, RestartStopped
+from ddco_pyro.events import RestartDiverged, RestartStopped
 from ddco_pyro.inference import log_likelihood, segment
 from ddco_pyro.metrics import Training
 from ddco_pyro.spec import with_overrides
@@ -79,18 +80,6 @@ def test_two_processes_give_the_same_bits_also_where_one_had_begun(undisturbed, 
     interrupted(make_trainer(spec, demos, tmp_path, Interrupting(5 * 3 + 2)))
     trainer = make_trainer(spec, demos, tmp_path, jobs=2)
     assert_same(trainer, trainer.run().state_dict(), tmp_path, undisturbed)
-
-
-class Interrupting:
-    """Ctrl-C at so many epochs."""
-
-    def __init__(self, epochs):
-        self.left = epochs
-
-    def __call__(self, event):
-        self.left -= isinstance(event, EpochEnded)
-        if self.left == 0:
-            raise KeyboardInterrupt
 
 
 def interrupted(trainer):
