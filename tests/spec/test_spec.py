@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -457,6 +458,33 @@ def test_keys_that_are_not_text_are_refused() -> None:
         parse_spec({**SMALL, "selection": {"grid": {3: [1]}}})
     with pytest.raises(SpecError, match=r"^3: a key must be text"):
         parse_spec({**SMALL, 3: 4})  # type: ignore[dict-item]
+
+
+def places(node: Any) -> Iterator[tuple[Any, Any]]:
+    """Every part of plain data, as what holds it and its key there."""
+    for key in list(node) if isinstance(node, dict) else range(len(node)):
+        yield node, key
+        if isinstance(node[key], dict | list):
+            yield from places(node[key])
+
+
+ODD = (None, True, -1, 10**40, 1e-320, float("nan"), "", "x" * 9999, "a:b:c", "\0", [], [[]], [None], {}, {"a": {}})
+
+
+def test_an_odd_value_anywhere_is_read_or_refused_in_lines() -> None:
+    """Never a traceback; the value is written into each place of the example in turn."""
+    problems: list[str] = []
+    for number in range(len([*places(yaml.safe_load(EXAMPLE))])):
+        for value in ODD:
+            data = yaml.safe_load(EXAMPLE)
+            node, key = [*places(data)][number]
+            node[key] = value
+            try:
+                parse_spec(data)
+            except SpecError as error:
+                problems += error.problems
+    assert len(problems) > 300
+    assert not [problem for problem in problems if "\n" in problem]
 
 
 LEVELS = "hierarchy.levels"
