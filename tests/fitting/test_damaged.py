@@ -137,7 +137,7 @@ def test_what_is_removed_is_made_again(run: Path) -> None:
     [
         ("rollouts.csv", b"method,seed,success\nddco,x,1\n", "compare"),
         ("rollouts.csv", b"a\n1\n", "compare"),
-        ("rollouts.csv", b"\xff\xfe", "report"),
+        ("rollouts.csv", b"\xff\xfe", "compare"),
         ("history.csv", b"restart,stage,epoch,train,tune\n0,joint,1,x,1\n", "report"),
         ("history.csv", b"a\n1\n", "report"),
         ("history.csv", b"\xff\xfe\n1", "report"),
@@ -149,6 +149,7 @@ def test_a_damaged_table(run: Path, monkeypatch: pytest.MonkeyPatch, name: str, 
     (run / "videos" / "ddco-1000.mp4").touch()  # a film, whose outcome is in the table
     (run / name).write_bytes(content)
     refused(run, COMMANDS[command], run / name, "")
+    assert call("report", run).err.startswith(f"ddco-pyro: {run / name}: is damaged: ")
 
 
 # --- selections -------------------------------------------------------------------------------------------------------

@@ -231,5 +231,5 @@ def test_an_interrupt_saves_and_ends_with_one_line(run, file, tmp_path):
             process.terminate()
             said, err = process.communicate(timeout=HANGS)
     assert (process.returncode, err) == (0, "")
-    assert re.fullmatch(rf"Ctrl-C saves the labels and ends\n{out}: labels/skill, 5 of \d+ steps\n", said)
+    assert re.fullmatch(rf"{out}: labels/skill, 5 of \d+ steps", said.splitlines()[-1])
     assert Demonstrations.read(out)[0].labels["skill"][:6].tolist() == [2] * 5 + [-1]

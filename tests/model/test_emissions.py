@@ -10,12 +10,11 @@ import pytest
 import torch
 from hierarchies import make_batch, make_hierarchy
 from oracle import brute_force
-from pyro.infer import Predictive
 from scipy import special, stats
 
 from ddco_pyro.inference import log_likelihood
-from ddco_pyro.inference.engines import compare_engines, enumerated
-from ddco_pyro.model.ahmm import Acting, ahmm
+from ddco_pyro.inference.engines import compare_engines
+from ddco_pyro.model.ahmm import ahmm
 from ddco_pyro.model.emissions import Binary, Categorical, Clipped, Gaussian, Hurdle, Product
 from ddco_pyro.model.emissions.clipped import log_ndtr
 from ddco_pyro.model.emissions.student import Student, student_control
@@ -60,16 +59,6 @@ def test_controls_are_drawn_from_who_acts(counts):
     assert checked > len(batch)
 
 
-def test_predictive_draws_whole_demonstrations():
-    outputs, _, chain = said((3,))
-    pyro.set_rng_seed(0)
-    draws = Predictive(ahmm, num_samples=50)(chain, outputs.emissions)
-    number, steps, _, size = outputs.emissions[0].shape
-    assert all(draws[f"a_{t}"].shape == (50, number, size) for t in range(steps))
-    nearest = (draws["a_0"].unsqueeze(-2) - outputs.emissions[0].mean[:, 0]).abs() / outputs.emissions[0].std
-    assert nearest.amax(-1).amin(-1).median() < 3
-
-
 def test_a_control_can_be_conditioned_on():
     """With every control given the program has the likelihood of the tables; with one changed, that of the changed."""
     outputs, batch, chain = said((2,), ("options",))
@@ -80,23 +69,6 @@ def test_a_control_can_be_conditioned_on():
     conditioned = pyro.condition(ahmm, data=given)
     value = -elbo.loss(conditioned, lambda *_: None, chain, outputs.emissions)
     assert value == pytest.approx(float(log_likelihood(outputs.tables(actions), batch.lengths).sum()), rel=1e-5)
-
-
-@pytest.mark.parametrize("counts", [(), (3,), (2, 2)])
-def test_the_program_scores_what_the_tables_hold(counts):
-    outputs, batch, _ = said(counts, ("options", "control") if counts else ("control",))
-    outputs, actions = outputs.map(torch.Tensor.double), batch.actions.double()
-    tables = outputs.tables(actions)
-    by_emissions = enumerated(tables, batch.lengths, outputs.emissions, actions)
-    torch.testing.assert_close(by_emissions, enumerated(tables, batch.lengths), rtol=1e-12, atol=0)
-
-
-def test_who_cannot_be_does_not_act():
-    """Below a choice 0 there is nothing but choice 0."""
-    outputs, batch, _ = said((2, 2))
-    steps = tuple(emission.steps()[0] for emission in outputs.emissions)
-    choices = (torch.ones(len(batch), dtype=torch.int64), torch.zeros(len(batch), dtype=torch.int64))
-    assert (Acting(steps, choices).log_prob(batch.actions[:, 0]) == -torch.inf).all()
 
 
 # --- kinds ------------------------------------------------------------------------------------------------------------

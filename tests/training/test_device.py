@@ -215,23 +215,3 @@ def test_a_gpu_gives_the_same_bits_again(demos: Demonstrations, network: str) ->
     torch.cuda.manual_seed(8)
     for name, values in weights(ddco_pyro.fit(spec, demos)).items():
         np.testing.assert_array_equal(values, first[name], err_msg=name)
-
-
-@gpu
-def test_a_chunk_drops_the_same_in_both_passes_on_a_gpu(demos: Demonstrations, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The gradient of chunks that are computed twice is that of the same chunks, all kept."""
-    fit = ddco_pyro.fit(spec_of(DROPPING, epochs=1, device="cuda"), demos)
-    part = 3 * fit.hierarchy.step_bytes / torch.cuda.get_device_properties(0).total_memory
-    monkeypatch.setattr("ddco_pyro.model.hierarchy.PART_OF_A_GPU", part)
-    model = fit.hierarchy.train()
-    inputs = model.encoder.inputs([demos[6].observations])
-
-    def gradient() -> torch.Tensor:
-        torch.manual_seed(3)
-        model.zero_grad()
-        sum(tensor.square().sum() for tensor in model(inputs).tensors()).backward()
-        return torch.cat([p.grad.flatten().cpu() for p in model.parameters() if p.grad is not None])
-
-    again = gradient()
-    monkeypatch.setattr("ddco_pyro.model.hierarchy.checkpoint", lambda call, *arguments, **_: call(*arguments))
-    torch.testing.assert_close(again, gradient())

@@ -246,23 +246,6 @@ def test_a_restart_that_diverges_ends_there_and_is_not_the_best(demos, tmp_path,
     assert all(torch.equal(model[name], value) for name, value in made.states["best"].items())
 
 
-def test_where_those_that_are_left_diverge_the_stopped_ones_go_on(demos, tmp_path, monkeypatch):
-    def train(data, restart, until, checkpoint=None, on_event=None):
-        now = restart.progress
-        now.epoch, now.sounded, now.done = 1, [0.0, -1.0, -2.0][now.restart], until is None
-        if until is None:
-            now.diverged = "why" if now.restart == 0 else None
-            now.objective, now.ended = (-np.inf if now.restart == 0 else -1.0 * now.restart), [ENDED]
-        restart.states = {} if now.diverged else {"best": data.hierarchy(now.restart).state_dict()}
-        return restart
-
-    monkeypatch.setattr(restarting, "train", train)
-    trainer = make_trainer(diverging(1, starts=["random"] * 3), demos, tmp_path)
-    trainer.run()
-    assert trainer.best == 1
-    assert not trainer.stopped
-
-
 @pytest.mark.parametrize("restarts", [1, 3])
 def test_where_all_diverge_the_trajectory_is_named(demos, tmp_path, monkeypatch, restarts):
     monkeypatch.setattr(user_networks.Diverging, "forward", lambda self, inputs: _nan_in_training(self, inputs))
@@ -321,17 +304,3 @@ def test_a_hierarchy_is_no_less_likely_in_training_than_its_mixture(seed, monkey
     went_on = [one.start for one in restarts.each[1:]]
     assert (went_on == []) == (broken.objective <= restarting.ROUNDING)
     assert set(went_on) <= {restarting.BESIDE}
-
-
-def test_options_whose_every_psi_is_almost_one_are_as_likely_as_the_mixture(tmp_path):
-    """So that going on from the mixture cannot end below it by more than that."""
-    spec = contains(["vq"])
-    demos = memoryless(0)
-    fit = ddco_pyro.fit(spec, demos)
-    trainer = make_trainer(spec, demos, tmp_path)
-    model, mixture, batch = trainer.data.hierarchy(0), fit.baselines["mixture"].hierarchy, trainer.data.train
-    model.load_state_dict(model.state_dict() | mixture.state_dict())
-    model.begin_terminations(restarting.ALMOST_ALWAYS)
-    with torch.no_grad():
-        ours, theirs = (log_likelihood(one.tabulate(batch), batch.lengths).sum() for one in (model, mixture))
-    assert abs(float(ours - theirs)) / batch.steps < 0.004
