@@ -93,22 +93,6 @@ def test_a_recogniser_of_the_past_is_evidence_at_every_step(watched):
     assert value == pytest.approx(float(alone), rel=1e-5)
 
 
-def test_a_monitor_with_a_recogniser_sees_the_past_alone(watched):
-    hierarchy, demos = watched
-    demo, steps = demos[0], 6
-    later = np.arange(len(demo)) >= steps
-    other = replace(
-        demo,
-        observations={"state": np.where(later[:, None], 7.0, demo.observations["state"])},
-        actions=np.where((np.arange(len(demo)) >= steps - 1)[:, None], 9.0, demo.actions),
-    )
-    ours, theirs = (beliefs(hierarchy, one)[0] for one in (demo, other))
-    for one, same in zip(ours[:steps], theirs[:steps], strict=True):
-        for level, again in zip(one, same, strict=True):
-            np.testing.assert_array_equal(level, again)
-    assert any(np.abs(a - b).max() > 1e-3 for a, b in zip(ours[-1], theirs[-1], strict=True))
-
-
 PLANTED = [(1, 6), (2, 3), (3, 4)]
 """Phases, each with its number of steps."""
 

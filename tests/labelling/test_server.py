@@ -90,16 +90,14 @@ OUTSIDE = [
     "/etc/passwd",
     "static/app.js",
     "index.html",
-]
-OUTSIDE += [
     "server.py",
+    ".",
+    "page.css\x00",
     "demo/-1",
     "demo/0/picture/x",
     "demo/0/../0",
     "export/../state",
     "export/..%2f",
-    "page.css\0",
-    ".",
 ]
 
 

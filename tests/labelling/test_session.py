@@ -500,11 +500,6 @@ def test_what_is_closed_is_saved_and_left_to_others(begin, tmp_path):
     assert begin().state()["demos"][0]["labelled"] == 10
 
 
-def test_a_format_that_is_none_is_refused(begin, tmp_path):
-    with pytest.raises(BadInput, match="csv"):
-        begin().export("xls", tmp_path)
-
-
 @pytest.mark.usefixtures("undecided")
 def test_without_a_run_one_is_fitted_for_its_proposals_alone_and_used_again(demos, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

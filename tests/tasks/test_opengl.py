@@ -58,14 +58,6 @@ def test_without_opengl_libraries_one_line_names_the_packages(cause: str, script
     assert f"apt-get install {PACKAGES}" in advice(cause)
 
 
-@pytest.mark.slow
-def test_without_a_driver_one_line_names_the_packages() -> None:
-    for command in ((sys.executable, "tasks/opengl.py"), (COMMAND, "check", "specs/needle.yaml")):
-        found = ended(*command, **NO_DRIVER)
-        assert found.returncode == 1
-        assert found.stderr.splitlines()[-1].endswith(advice("EGL has no device that starts"))
-
-
 @pytest.mark.parametrize("own", [{}, NO_DRIVER | {"MUJOCO_GL": "osmesa"}, NO_DRIVER | {"DISPLAY": ":0"}], ids=str)
 def test_where_the_tasks_can_draw_nothing_is_said(own: dict[str, str]) -> None:
     """Another renderer, or a display, is taken to work."""
