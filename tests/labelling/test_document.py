@@ -1,5 +1,6 @@
 """The document of a person's labels and its journal, against the list of all its states."""
 
+import resource
 from contextlib import nullcontext
 
 import numpy as np
@@ -172,3 +173,19 @@ def test_a_file_that_is_no_journal_stays_as_it_is(tmp_path, content, line):
     with pytest.raises(Damaged, match=f"line {line} is none of a journal of labels; move it away"):
         Journal(path, empty(), "option")
     assert path.read_bytes() == content
+
+
+def test_an_edit_that_a_full_disk_cuts_is_not_made(tmp_path):
+    """With a limit of the size of files."""
+    path, document, before = tmp_path / "labels.journal", empty(), resource.getrlimit(resource.RLIMIT_FSIZE)
+    journal = Journal(path, document, "option")
+    content = path.read_bytes()
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(content) + 20, before[1]))
+    try:
+        with pytest.raises(OSError, match="No space left on device"):
+            journal.edit([("paint", "demo_0", 0, 6, 2)])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert path.read_bytes() == content
+    assert (document.labels["demo_0"] == FREE).all()
+    journal.close()

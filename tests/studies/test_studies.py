@@ -484,16 +484,6 @@ def test_the_commit_of_the_code_is_that_of_library_and_study(tmp_path, monkeypat
         assert cells.commit_of(study) == first
 
 
-def test_cells_of_init_depend_on_its_template(made, monkeypatch, tmp_path):
-    folder = made(spec="init")
-    cell = folder.cells("test")[0]
-    depends = folder.depends(cell)
-    (tmp_path / "other.j2").write_text(cells.TEMPLATE.read_text() + "# more\n")
-    assert folder.depends(cell) == depends
-    monkeypatch.setattr(cells, "TEMPLATE", tmp_path / "other.j2")
-    assert folder.depends(cell) != depends
-
-
 def test_the_best_point_on_development_seeds_is_tested(made):
     """With σ of 50 every method explains the demonstrations worse than with 0.5. Options have a grid of their own."""
     methods = {

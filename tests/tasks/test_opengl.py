@@ -9,7 +9,6 @@ import pytest
 from ddco_tasks.opengl import PACKAGES, advice
 
 ROOT = Path(__file__).parents[2]
-COMMAND = Path(sys.executable).with_name("ddco-pyro")
 NO_DRIVER = {"__EGL_VENDOR_LIBRARY_DIRS": "/nowhere"}
 LIBRARIES = {
     "libEGL.so.1 cannot be loaded": ("libEGL",),

@@ -246,6 +246,23 @@ def test_a_restart_that_diverges_ends_there_and_is_not_the_best(demos, tmp_path,
     assert all(torch.equal(model[name], value) for name, value in made.states["best"].items())
 
 
+def test_where_those_that_are_left_diverge_the_stopped_ones_go_on(demos, tmp_path, monkeypatch):
+    def train(data, restart, until, checkpoint=None, on_event=None):
+        now = restart.progress
+        now.epoch, now.sounded, now.done = 1, [0.0, -1.0, -2.0][now.restart], until is None
+        if until is None:
+            now.diverged = "why" if now.restart == 0 else None
+            now.objective, now.ended = (-np.inf if now.restart == 0 else -1.0 * now.restart), [ENDED]
+        restart.states = {} if now.diverged else {"best": data.hierarchy(now.restart).state_dict()}
+        return restart
+
+    monkeypatch.setattr(restarting, "train", train)
+    trainer = make_trainer(diverging(1, starts=["random"] * 3), demos, tmp_path)
+    trainer.run()
+    assert trainer.best == 1
+    assert not trainer.stopped
+
+
 @pytest.mark.parametrize("restarts", [1, 3])
 def test_where_all_diverge_the_trajectory_is_named(demos, tmp_path, monkeypatch, restarts):
     monkeypatch.setattr(user_networks.Diverging, "forward", lambda self, inputs: _nan_in_training(self, inputs))
