@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import functools
 import json
-import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +15,6 @@ import pandas as pd
 import pytest
 import toy_task
 import yaml
-from killing import HANGS
 from random_demonstrations import numbered
 
 from ddco_pyro.data.demonstrations import Demonstrations
@@ -486,33 +482,6 @@ def test_the_commit_of_the_code_is_that_of_library_and_study(tmp_path, monkeypat
         assert cells.commit_of(study) == f"{first}-dirty"
         first = committed()
         assert cells.commit_of(study) == first
-
-
-def test_cells_of_init_depend_on_its_template(made, monkeypatch, tmp_path):
-    folder = made(spec="init")
-    cell = folder.cells("test")[0]
-    depends = folder.depends(cell)
-    (tmp_path / "other.j2").write_text(cells.TEMPLATE.read_text() + "# more\n")
-    assert folder.depends(cell) == depends
-    monkeypatch.setattr(cells, "TEMPLATE", tmp_path / "other.j2")
-    assert folder.depends(cell) != depends
-
-
-@pytest.mark.slow
-def test_a_killed_study_goes_on_with_what_is_done(made):
-    folder = made(demonstrations={**STUDY["demonstrations"], "counts": [6]})
-    command = [sys.executable, "-m", "studies", "run", folder.study.path, "--out", folder.path, "--jobs", "1"]
-    process = subprocess.Popen(list(map(str, command)), cwd=ROOT, start_new_session=True, stderr=subprocess.DEVNULL)
-    limit = time.monotonic() + HANGS
-    while not (kept := {path: path.read_bytes() for path in (folder.path / "cells").glob("*.json")}):
-        assert time.monotonic() < limit
-        time.sleep(0.05)
-    os.killpg(process.pid, signal.SIGKILL)
-    assert process.wait() == -signal.SIGKILL
-    assert len(kept) < 4
-    state = folder.run(HERE)
-    assert len(state.done) == 4
-    assert {path: path.read_bytes() for path in kept} == kept
 
 
 def test_the_best_point_on_development_seeds_is_tested(made):
