@@ -16,6 +16,7 @@ import h5py
 import numpy as np
 import torch
 from pydantic import ValidationError
+from sklearn.decomposition import PCA
 from torch.nn.functional import interpolate
 
 from ddco_pyro.data.checks import check, check_alike, problems_of_masks
@@ -164,24 +165,13 @@ class Projection:
 def principal_components(blocks: Sequence[np.ndarray], size: int, least: float = 0.0) -> Projection:
     """The ``size`` principal components of the rows of blocks [M, F], at least ``size`` in all.
 
-    The entry of each component that is largest in magnitude is positive.
-
     :param least: components with a smaller share of the first one's variance are left out.
     """
-    origin = blocks[0][0].astype(np.float64)  # near the mean, so that subtracting that loses little
-    number, total, products = sum(map(len, blocks)), np.zeros(len(origin)), np.zeros((len(origin), len(origin)))
-    for block in blocks:
-        rows = block - origin
-        total += rows.sum(0)
-        products += rows.T @ rows
-    offset = total / number
-    values, vectors = np.linalg.eigh(products - number * np.outer(offset, offset))
-    variance = values.clip(0)
-    size = min(size, max(1, int((variance >= least * variance[-1]).sum())))
-    kept = vectors[:, ::-1][:, :size].T
-    largest = np.take_along_axis(kept, np.abs(kept).argmax(1)[:, None], 1)
-    explained = float(variance[::-1][:size].sum() / variance.sum()) if variance.any() else 1.0
-    return Projection(origin + offset, kept * np.where(largest < 0, -1.0, 1.0), explained)
+    fitted = PCA(svd_solver="covariance_eigh").fit(np.concatenate(blocks).astype(np.float64))
+    variance = fitted.explained_variance_
+    size = min(size, max(1, int((variance >= least * variance[0]).sum())))
+    explained = float(variance[:size].sum() / variance.sum()) if variance.any() else 1.0
+    return Projection(fitted.mean_, fitted.components_[:size], explained)
 
 
 # --- encoders ---------------------------------------------------------------------------------------------------------
