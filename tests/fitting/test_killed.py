@@ -17,10 +17,10 @@ from ddco_pyro.spec import load_spec
 from ddco_pyro.training.data import demonstrations
 
 COMMANDS = {
-    "collect": "collect toy.yaml --out demos.hdf5 --set demonstrations.count=40 --allow-code",
+    "collect": "collect toy.yaml --out collected.hdf5 --set demonstrations.count=40 --allow-code",
     "fit": "fit toy.yaml --out out --resume --allow-code --set training.epochs=100 --set compare_with=[flat]",
     "select": "select grid.yaml --out out --jobs 2 --resume",
-    "segment": "segment run toy.hdf5 --in-place --csv out.csv --html out.html",
+    "segment": "segment run toy.hdf5 --in-place --csv out.csv --html out.html --allow-code",
     "rollout": "rollout run --episodes 40 --jobs 2 --allow-code",
 }
 

@@ -7,6 +7,7 @@ import threading
 import time
 
 import pytest
+from killing import alive
 
 from ddco_pyro.events import EpochEnded, TrainingBegan
 from ddco_pyro.labelling.background import Background
@@ -45,14 +46,6 @@ def training(folder, epochs=10, stop=True):
         return os.getpid(), "colorsys" in sys.modules
 
     return train
-
-
-def alive(pid):
-    try:
-        with open(f"/proc/{pid}/stat") as file:
-            return file.read().split()[2] != "Z"
-    except OSError:
-        return False
 
 
 def test_work_says_how_far_it_is_and_ends_at_once_when_it_is_cancelled(background, tmp_path):

@@ -33,6 +33,14 @@ def killed(arguments: Sequence[object], folder: Path, cache: Path, seconds: floa
     return True
 
 
+def alive(process: int) -> bool:
+    """Whether there is such a process; one that has ended, and waits for somebody to notice, is none."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except (ProcessLookupError, FileNotFoundError):
+        return False
+
+
 class Interrupting:
     """Ctrl-C at the end of so many epochs."""
 

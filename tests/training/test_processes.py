@@ -13,13 +13,13 @@ import sys
 import time
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from unittest import mock
 
 import numpy as np
 import pytest
 import torch
 from command_line import Ended, call
+from killing import alive
 from planted import small_spec
 from random_demonstrations import of_states
 
@@ -98,14 +98,6 @@ def whole(demos, tmp_path_factory):
 def assert_same_run(folder, run):
     for name in ("spec.yaml", "model.safetensors", "history.csv", "checkpoints/restart-0.safetensors"):
         assert (folder / name).read_bytes() == (run / name).read_bytes(), name
-
-
-def alive(process):
-    """Whether there is such a process, which is not a zombie."""
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except (ProcessLookupError, FileNotFoundError):
-        return False
 
 
 def assert_ends(process, seconds):
