@@ -10,40 +10,30 @@ import pandas as pd
 import pytest
 from command_line import call
 
-from ddco_pyro.data.annotations import Labelled, LabelTable
+from ddco_pyro.data.annotations import LabelTable
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.data.sources import Recording
+from ddco_pyro.data.importing import Choice, import_demonstrations
 from ddco_pyro.errors import BadInput
 
 
-class Held:
-    """A source in memory with demonstrations of these lengths."""
+def labels(lengths, path, known=None, **said):
+    """Names of labels by label name; the name of each step by demonstration, empty where nothing is said; notes.
 
-    format, masks, files = "robomimic", {}, ()
-
-    def __init__(self, lengths, frequency=10.0, attributes=None):
-        self._lengths, self.frequency, self.attributes = lengths, frequency, attributes or {}
-        self.names = tuple(lengths)
-
-    def recording(self, name):
-        return Recording.of(name, {}, np.zeros((self._lengths[name], 2)))
-
-
-def labels(source, path, **said):
-    """Names of labels by label name; the name of each step by demonstration, empty where nothing is said; notes."""
-    found = Labelled(source, LabelTable(path, **said))
-    names = json.loads(found.attributes["label_names"])
-    return (
-        names,
-        {
-            demo: {
-                key: [names[key][label] if label >= 0 else "" for label in column.array()]
-                for key, column in found.recording(demo).labels.items()
-            }
-            for demo in source.names
-        },
-        found.notes,
-    )
+    :param lengths: steps of each demonstration by its name.
+    :param known: the names of labels that the source has.
+    """
+    source, out = path.with_name("source.hdf5"), path.with_name("labelled.hdf5")
+    each = (Demonstration(name, {"x": np.zeros((n, 1))}, np.zeros((n, 2))) for name, n in lengths.items())
+    attributes = {"control_frequency": 10.0, "label_names": json.dumps(known or {})}
+    Demonstrations(tuple(each), attributes=attributes).write(source)
+    notes = import_demonstrations(source, out, choice=Choice(labels=LabelTable(path, **said))).notes
+    demos = Demonstrations.read(out)
+    names = json.loads(demos.attributes["label_names"])
+    found = {
+        demo.name: {key: [names[key][at] if at >= 0 else "" for at in steps] for key, steps in demo.labels.items()}
+        for demo in demos
+    }
+    return names, found, list(notes)
 
 
 ROWS = [
@@ -79,7 +69,7 @@ def test_any_table(tmp_path, kind, names, scale, said):
     else:
         table.to_csv(path, sep={"a.csv": ",", "a.tsv": "\t", "a.txt": ";"}[kind], index=False, encoding="utf-8-sig")
     columns = dict(zip(("demonstration", "label", "start", "stop"), table, strict=True))
-    found = labels(Held({"demo_0": 3, "demo_1": 8}), path, columns=columns, **said)
+    found = labels({"demo_0": 3, "demo_1": 8}, path, columns=columns, **said)
     assert found == (
         {"skill": ["reach", "grasp"]},
         {"demo_1": {"skill": STEPS}, "demo_0": {"skill": ["reach", "reach", ""]}},
@@ -92,8 +82,8 @@ def test_labels_that_differ_by_case_or_blanks_alone_are_one(tmp_path):
     names = ["Grasp", "grasp ", "grasp", "grasp", "Pick Up", "pickup", "PLACE"]
     table = pd.DataFrame({"demonstration": "demo_0", "label": names, "start": range(7), "stop": range(1, 8)})
     table.to_csv(tmp_path / "a.csv", index=False)
-    source = Held({"demo_0": 7}, attributes={"label_names": '{"label": ["control", "place"]}'})
-    known, found, notes = labels(source, tmp_path / "a.csv", unit="steps")
+    source = {"label": ["control", "place"]}
+    known, found, notes = labels({"demo_0": 7}, tmp_path / "a.csv", source, unit="steps")
     assert known == {"label": ["control", "place", "grasp", "Pick Up"]}
     assert found["demo_0"]["label"] == ["grasp"] * 4 + ["Pick Up"] * 2 + ["place"]
     assert notes == [
@@ -116,7 +106,7 @@ skill\twho\tFile Name\tFile Path
 def test_elan(tmp_path, left_out):
     """Tab-delimited text of multiple files: a column for each tier, and times in several formats."""
     (tmp_path / "elan.txt").write_text(ELAN.replace(left_out, "Duration - other") if left_out else ELAN)
-    names, found, notes = labels(Held({"demo_0": 3, "demo_1": 8}), tmp_path / "elan.txt")
+    names, found, notes = labels({"demo_0": 3, "demo_1": 8}, tmp_path / "elan.txt")
     assert (names, notes) == ({"skill": ["reach", "grasp"], "who": ["left hand"]}, [])
     assert found["demo_1"] == {"skill": STEPS, "who": [*[""] * 4, *["left hand"] * 2, "", ""]}
     assert found["demo_0"] == {"skill": [""] * 3, "who": [""] * 3}
@@ -156,7 +146,7 @@ def tabular(events):
 def test_boris(tmp_path, name, text, modified):
     """Aggregated events, and events as START and STOP; a modifier tells two states apart and makes no label."""
     (tmp_path / name).write_text(text, encoding="utf-8")
-    names, found, notes = labels(Held({"demo_0": 14, "demo_1": 2}), tmp_path / name)
+    names, found, notes = labels({"demo_0": 14, "demo_1": 2}, tmp_path / name)
     assert names == {"behavior": ["reach", "grasp"], "left": ["grasp"]}
     assert found["demo_0"]["behavior"] == [*["reach"] * 8, *["grasp"] * 3, "", "", ""]
     assert found["demo_0"]["left"] == [*[""] * 10, *["grasp"] * 3, ""]
@@ -172,7 +162,7 @@ def test_an_event_without_its_other_is_named_and_nothing_else_is_lost(tmp_path):
         (5.1, "left", "grasp", "", "STOP"), (5.2, "left", "reach", "", "START"), (5.3, "left", "grasp", "", "START"),
     ]  # fmt: skip
     (tmp_path / "a.tsv").write_text(tabular([*orphans, *EVENTS]))
-    _, found, notes = labels(Held({"demo_0": 14}), tmp_path / "a.tsv")
+    _, found, notes = labels({"demo_0": 14}, tmp_path / "a.tsv")
     assert found["demo_0"]["behavior"] == [*["reach"] * 8, *["grasp"] * 3, "", "", ""]
     assert found["demo_0"]["left"] == [*[""] * 10, *["grasp"] * 3, ""]
     assert notes[2:] == [
@@ -213,7 +203,7 @@ REGIONS = [series("reach", 0, 3), series("grasp", 3, 5), series("", 6, 6)]
 def test_label_studio(tmp_path, regions, unit, said, data):
     """Time series, whose ends are inclusive, frames of a video from 1 on, and audio; a task may have no region."""
     (tmp_path / "a.csv").write_text(exported((data[1], regions), ("demo_0", []), key=data[0]))
-    found = labels(Held({"demo_0": 2, "demo_1": 9}), tmp_path / "a.csv", unit=unit, columns={"demonstration": data[0]})
+    found = labels({"demo_0": 2, "demo_1": 9}, tmp_path / "a.csv", unit=unit, columns={"demonstration": data[0]})
     assert found[1] == {"demo_0": {"label": ["", ""]}, "demo_1": {"label": said}}
 
 
@@ -256,7 +246,7 @@ REACH = ("demo_1", "reach", 0.1, 0.4)
 def test_what_does_not_fit_is_refused_in_one_line(tmp_path, text, more, said):
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(BadInput) as refused:
-        Labelled(Held({"demo_1": 12}), LabelTable(tmp_path / "a.csv", **more))
+        labels({"demo_1": 12}, tmp_path / "a.csv", **more)
     assert said in str(refused.value)
     assert str(refused.value).startswith(f"--labels {tmp_path / 'a.csv'}: ")
     assert "\n" not in str(refused.value)

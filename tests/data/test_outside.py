@@ -56,21 +56,6 @@ def test_nothing_is_written_before_all_headers_are_known(tmp_path: Path) -> None
     assert list(tmp_path.iterdir()) == [tmp_path / "in"]
 
 
-def test_a_minari_episode_that_is_not_whole(tmp_path: Path) -> None:
-    pytest.importorskip("minari")
-    from ddco_pyro.data.sources.minari import Minari
-
-    class Storage:
-        total_episodes, metadata = 2, {}
-
-    with h5py.File(tmp_path / "main_data.hdf5", "w") as file:
-        for index in range(2):
-            file[f"episode_{index}/infos/one"] = 1.0
-        file.create_dataset("episode_1/actions", (9, 2), "f8", chunks=(4, 2))[:4] = 1.0
-    with pytest.raises(DemonstrationsError, match=r"episode_1/actions claims 144 bytes, but the file holds 64"):
-        Minari(tmp_path, Storage(), ()).recording("demo_1")
-
-
 # --- memory -----------------------------------------------------------------------------------------------------------
 
 
