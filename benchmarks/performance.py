@@ -38,7 +38,7 @@ from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.tables import Tables, complete
 from ddco_pyro.spec import Spec, load_spec, parse_spec, with_overrides
-from ddco_pyro.training.data import demonstrations, parts
+from ddco_pyro.training.data import demonstrations, train_and_valid
 from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.restarts import Trainer
 
@@ -289,7 +289,7 @@ def em() -> Iterator[Row]:
     """
     with tempfile.TemporaryDirectory() as folder:
         spec = load_spec(initial_spec(Path(folder)))
-        train, tune = parts(spec, demonstrations(spec))["train"].split(spec.training.tune_fraction, spec.seed)
+        train, tune = train_and_valid(spec, demonstrations(spec))["train"].split(spec.training.tune_fraction, spec.seed)
         traces = {}
         for name in ("em", "adam"):
             trace: list[tuple[float, float]] = []

@@ -7,7 +7,7 @@ import importlib
 import math
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any
@@ -19,11 +19,13 @@ from pydantic import ValidationError
 from sklearn.decomposition import PCA
 from torch.nn.functional import interpolate
 
-from ddco_pyro.data.checks import check, check_alike, problems_of_masks
-from ddco_pyro.data.hdf5 import DemonstrationsError, opened
-from ddco_pyro.data.sources import Column, Recording, refuse_foreign
-from ddco_pyro.data.sources.recording import of_array
-from ddco_pyro.data.sources.robomimic import Robomimic, open_robomimic, robomimic_file, write_recording
+from ddco_pyro.data.arrays import Observed, blocks, is_picture
+from ddco_pyro.data.demonstration import Demonstration, check
+from ddco_pyro.data.division import problems_of_masks
+from ddco_pyro.data.errors import DemonstrationsError
+from ddco_pyro.data.hdf5 import opened
+from ddco_pyro.data.sources import Source, open_source, refuse_foreign
+from ddco_pyro.data.sources.robomimic import robomimic_file, write_demonstration
 from ddco_pyro.errors import BadInput, nearest
 from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
 from ddco_pyro.spec.base import Count, Items, Model
@@ -287,12 +289,12 @@ def encode(
     if out.exists():
         raise BadInput(f"{out}: is there already; remove it, or choose another --out")
     refuse_foreign(path)
-    with open_robomimic(path) as source:
-        recordings = {own: source.recording(own) for own in source.names}
-        training = _checked(source, recordings, observation)
-        if key in recordings[source.names[0]].observations:
+    with open_source(path, "robomimic") as source:
+        demos = {own: source.read(own) for own in source.names}
+        training = _checked(source, demos, observation)
+        if key in demos[source.names[0]].observations:
             raise DemonstrationsError(f"obs/{key} is there already; choose another name with --as")
-        pictures = {own: recording.observations[observation] for own, recording in recordings.items()}
+        pictures = {own: demo.observations[observation] for own, demo in demos.items()}
         backbone = Backbone(encoder, allow_code)
         number = backbone.try_out(next(_batches(pictures[training[0]])))
         steps = sum(pictures[own].shape[0] for own in training)
@@ -301,8 +303,8 @@ def encode(
         if size is not None and size > steps:
             raise BadInput(f"--size {size}: there are {steps} training pictures; take at most as many")
         features = dict[str, np.ndarray]()
-        for own, column in pictures.items():
-            features[own] = np.concatenate([backbone(batch) for batch in _batches(column)])
+        for own, array in pictures.items():
+            features[own] = np.concatenate([backbone(batch) for batch in _batches(array)])
             if (there := features[own].shape[1]) != number:
                 raise BadInput(
                     f"encoder {encoder!r} gives {there} features in {own}, and {number} in {training[0]}; it has to "
@@ -324,32 +326,31 @@ def encode(
         )
         made = Encoder(about, backbone, projection)
         with robomimic_file(out, source.attributes, source.masks) as data, opened(path) as before:
-            for own, whole in recordings.items():
-                seen = {other: column for other, column in whole.observations.items() if other != observation}
-                seen[key] = of_array(made.reduced(features[own]))
-                write_recording(data, replace(whole, observations=seen))
+            for own, demo in demos.items():
+                seen = {other: array for other, array in demo.observations.items() if other != observation}
+                seen[key] = made.reduced(features[own])
+                write_demonstration(data, Demonstration.stored(**{**vars(demo), "observations": seen}))
             if ENCODERS in before:
                 before.copy(ENCODERS, data.file)
             made.write(data.file.create_group(f"{ENCODERS}/{key}"))
     return made
 
 
-def _checked(source: Robomimic, recordings: Mapping[str, Recording], key: str) -> tuple[str, ...]:
+def _checked(source: Source, demos: Mapping[str, Demonstration], key: str) -> tuple[str, ...]:
     """The names of the training demonstrations.
 
     :raises DemonstrationsError: the observation is missing or no picture, or the demonstrations are refused or differ.
     """
-    first = recordings[source.names[0]]
+    first = demos[source.names[0]]
     if key not in first.observations:
-        known = [name for name, column in first.observations.items() if column.image]
+        known = [name for name, array in first.observations.items() if is_picture(array)]
         there = ", ".join(known) or "none"
         raise DemonstrationsError(f"there is no observation {key!r}{nearest(key, known)}; pictures are: {there}")
-    for name, recording in recordings.items():
-        check(recording)
-        check_alike(recording, first)
-        column = recording.observations[key]
-        if not column.image or not math.prod(column.shape[1:]):
-            had = f"{column.dtype} {[*column.shape]}"
+    for name, demo in demos.items():
+        check(demo, first)
+        array = demo.observations[key]
+        if not is_picture(array) or not math.prod(array.shape[1:]):
+            had = f"{array.dtype} {[*array.shape]}"
             raise DemonstrationsError(
                 f"{name}: obs/{key} is {had}; pictures are uint8 [steps, height, width, channels]"
             )
@@ -362,7 +363,7 @@ def _checked(source: Robomimic, recordings: Mapping[str, Recording], key: str) -
     return training
 
 
-def _batches(pictures: Column) -> Iterator[np.ndarray]:
+def _batches(pictures: Observed) -> Iterator[np.ndarray]:
     """Pictures in order, [M, H, W, C] with M at most :data:`AT_ONCE`."""
-    for block in pictures.blocks():
+    for block in blocks(pictures):
         yield from (block[start : start + AT_ONCE] for start in range(0, len(block), AT_ONCE))

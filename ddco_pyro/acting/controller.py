@@ -11,8 +11,8 @@ import torch
 from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
-from ddco_pyro.data.checks import NUMBERS, usable
-from ddco_pyro.data.controls import number
+from ddco_pyro.data.arrays import NUMBERS, usable
+from ddco_pyro.data.demonstration import number
 from ddco_pyro.errors import BadInput, check_whole
 from ddco_pyro.inference.logspace import arrive
 from ddco_pyro.model.ahmm import Acting, Tabulated, choose

@@ -13,9 +13,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
-from ddco_pyro.data.checks import LARGEST
+from ddco_pyro.data.arrays import LARGEST
 from ddco_pyro.data.controls import described, notes
-from ddco_pyro.data.hdf5 import printable
+from ddco_pyro.data.errors import printable
 from ddco_pyro.drawing import words
 from ddco_pyro.drawing.page import Table
 from ddco_pyro.evaluation import effort, verdicts

@@ -70,7 +70,7 @@ def inspect(
     if against is not None:
         _compare_annotators(file, against, tolerance, as_json)
         return
-    from ddco_pyro.data.hdf5 import DemonstrationsError
+    from ddco_pyro.data.errors import DemonstrationsError
     from ddco_pyro.data.inspection import inspect as look
     from ddco_pyro.data.starting import starting_spec
 

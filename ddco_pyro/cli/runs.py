@@ -290,7 +290,7 @@ def _missing_labels(fit: Fit, source: Source) -> str:
     names = fit.spec.demonstrations.label_names
     if not names:
         return "the run's spec has no demonstrations.labels"
-    if any(name in source.recording(demo).labels for demo in chosen_names(source, fit) for name in names):
+    if any(name in source.read(demo).labels for demo in chosen_names(source, fit) for name in names):
         return ""
     return f"the demonstrations have no {', '.join(f'labels/{name}' for name in names)}"
 

@@ -13,15 +13,15 @@ from typing import Any
 
 import numpy as np
 
+from ddco_pyro.data.arrays import same
 from ddco_pyro.data.controls import difference
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.data.pictures import same
 from ddco_pyro.errors import BadInput, path_of
 from ddco_pyro.evaluation.agreement import UNMATCHED
 from ddco_pyro.fitting.fitted import Fit, load
 from ddco_pyro.metrics import Training, read_successes
 from ddco_pyro.statistics import paired, paired_difference, rate
-from ddco_pyro.training.data import parts
+from ddco_pyro.training.data import train_and_valid
 
 __all__ = ["CompareError", "Comparison", "Row", "compare"]
 
@@ -158,7 +158,7 @@ def _shared(fits: Sequence[Fit]) -> list[Demonstrations]:
 
     :raises CompareError: they differ, or the runs score other dimensions of the control.
     """
-    own = [parts(fit.spec, fit.demonstrations).get("valid") for fit in fits]
+    own = [train_and_valid(fit.spec, fit.demonstrations).get("valid") for fit in fits]
     shared: list[Demonstrations] = []
     for fit, demos in zip(fits, own, strict=True):
         if demos is None:

@@ -6,16 +6,15 @@ import json
 import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 from urllib.parse import unquote, urlsplit
 
 import numpy as np
 import pandas as pd
 
-from ddco_pyro.data.hdf5 import Attribute
-from ddco_pyro.data.sources import Recording, Source
-from ddco_pyro.data.sources.recording import BOUNDARY, LABEL_NAMES, UNKNOWN, label_names, of_array
+from ddco_pyro.data.labels import UNKNOWN, label_names
+from ddco_pyro.data.sources import Source
 from ddco_pyro.errors import BadInput, nearest
 
 ROLES = ("demonstration", "label", "start", "stop")
@@ -43,60 +42,60 @@ class LabelTable:
     rate: float | None = None
 
 
-class Labelled:
-    """A source whose recordings have the labels of a table; those of the same name are replaced.
+@dataclass(frozen=True)
+class TableLabels:
+    """The labels that a table gives to demonstrations.
 
-    Steps of which the table says nothing are -1. Labels keep the numbers that their names have in the source.
+    :param labels: for labels by name and demonstrations by name, the label of each step [T]; -1 where none is said.
+    :param names: the names of labels 0, 1, ... of the table and of the source, as the attribute ``label_names``.
+    :param notes: a line for each thing in the table that is left out, or read in another way.
+    """
 
-    :ivar counts: for labels by name, the number of demonstrations in which a step is named.
-    :ivar notes: a line for each thing in the table that is left out, or read in another way.
+    labels: Mapping[str, Mapping[str, np.ndarray]]
+    names: str
+    notes: list[str]
+
+
+def labels_of_table(table: LabelTable, source: Source) -> TableLabels:
+    """The labels that a table gives to the demonstrations of a source, whose names of labels keep their numbers.
 
     :raises BadInput: the table cannot be read, or does not fit the demonstrations.
     """
-
-    def __init__(self, source: Source, table: LabelTable) -> None:
-        self._source, self.frequency = source, table.rate or source.frequency
-        self.format, self.names, self.masks, self.files = source.format, source.names, source.masks, source.files
-        self._labels: dict[str, dict[str, np.ndarray]] = {}
-        names = label_names(source.attributes)
-        try:
-            said, unit, self.notes = _segments(_read(table.path), table.columns)
-            rows = _in_steps(said, table.unit or unit, self.frequency)
-            rows["demonstration"] = [_demonstration(name, self.names) for name in rows["demonstration"]]
-            for labels, of_labels in rows.groupby("labels", sort=False):
-                if labels in ("", ".", "..") or "/" in labels:
-                    raise BadInput(f"{labels!r} cannot be a name of labels; give it another one")
-                known = names.get(labels, [])
-                spelled = _spelling(of_labels["label"], known)
-                if others := [f"{name!r} as {to!r}" for name, to in spelled.items() if name != to]:
-                    self.notes.append(f"labels/{labels}: read {', '.join(others)}, since case or blanks alone differ")
-                names[labels] = list(dict.fromkeys([*known, *spelled.values()]))
-                numbers = {label: names[labels].index(name) for label, name in spelled.items()}
-                self._labels[labels] = {
-                    demo: _painted(f"{demo}: {labels}", of_demo, numbers, source.recording(demo).actions.shape[0])
-                    for demo, of_demo in of_labels.groupby("demonstration", sort=False)
-                }
-        except BadInput as error:
-            raise BadInput(f"--labels {table.path}: {error}") from None
-        self.counts = {labels: len(each) for labels, each in self._labels.items()}
-        self.attributes: Mapping[str, Attribute] = {**source.attributes, LABEL_NAMES: json.dumps(names)}
-
-    def recording(self, name: str) -> Recording:
-        """One recording, with its labels."""
-        recording = self._source.recording(name)
-        unknown = np.full(recording.actions.shape[0], UNKNOWN, np.int16)
-        stale = {f"{labels}{end}" for labels in self._labels for end in ("", BOUNDARY)}
-        kept = {key: column for key, column in recording.labels.items() if key not in stale}
-        given = {labels: of_array(each.get(name, unknown)) for labels, each in self._labels.items()}
-        return replace(recording, labels={**kept, **given})
+    names, found = label_names(source.attributes), dict[str, dict[str, np.ndarray]]()
+    try:
+        rows, unit, notes = _segments(_read(table.path), table.columns)
+        rows = _in_steps(rows, table.unit or unit, source.frequency)
+        rows["demonstration"] = [_demonstration(name, source.names) for name in rows["demonstration"]]
+        for labels, of_labels in rows.groupby("labels", sort=False):
+            if labels in ("", ".", "..") or "/" in labels:
+                raise BadInput(f"{labels!r} cannot be a name of labels; give it another one")
+            known = names.get(labels, [])
+            spelled = _spelling(of_labels["label"], known)
+            if others := [f"{name!r} as {to!r}" for name, to in spelled.items() if name != to]:
+                notes.append(f"labels/{labels}: read {', '.join(others)}, since case or blanks alone differ")
+            names[labels] = list(dict.fromkeys([*known, *spelled.values()]))
+            numbers = {label: names[labels].index(name) for label, name in spelled.items()}
+            found[labels] = {
+                demo: _painted(f"{demo}: {labels}", of_demo, numbers, len(source.read(demo)))
+                for demo, of_demo in of_labels.groupby("demonstration", sort=False)
+            }
+    except BadInput as error:
+        raise BadInput(f"--labels {table.path}: {error}") from None
+    return TableLabels(found, json.dumps(names), notes)
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------
 
-Said = tuple[pd.DataFrame, str | None, list[str]]
-"""Segments, their unit (None where the table does not say it), and a line for each thing that is left out. A segment is
-a row with ``demonstration``, ``labels`` (their name), ``label``, ``start``, ``stop``, and ``last``: whether the step of
-``stop`` is a part of it."""
+COLUMNS = {
+    "demonstration": ("File Name", "Observation id"),
+    "label": ("Behavior",),
+    "start": ("Begin Time - msec", "Begin Time - ss.msec", "Start (s)"),
+    "stop": ("End Time - msec", "End Time - ss.msec", "Stop (s)"),
+}
+"""The columns of ELAN's tab-delimited text and of BORIS' aggregated events, by role."""
+
+TIERS_BESIDE = ("Begin Time - ", "End Time - ", "Duration - ", "File ")
+"""How the columns of ELAN's text begin that are no tiers."""
 
 
 def _read(path: Path) -> pd.DataFrame:
@@ -116,86 +115,76 @@ def _read(path: Path) -> pd.DataFrame:
         raise BadInput(f"cannot be read as a table, or is damaged: {' '.join(str(error).split())}") from None
 
 
-def _segments(table: pd.DataFrame, columns: Mapping[str, str]) -> Said:
-    for name in columns.values():
+def _segments(table: pd.DataFrame, said: Mapping[str, str]) -> tuple[pd.DataFrame, str | None, list[str]]:
+    """Segments, the unit of their times (None where the table does not say it), and a line for each thing left out.
+
+    A segment is a row with ``demonstration``, ``labels`` (their name), ``label``, ``start``, ``stop``, and ``last``,
+    which says whether the step of ``stop`` is a part of it.
+
+    :param said: the columns by role that the user named.
+    """
+    for name in said.values():
         if name not in table:
             raise BadInput(f"has no column {name!r}{nearest(name, table)}; there is: {', '.join(table)}")
-    mark = next((mark for mark in TOOLS if mark in table), "") if columns.keys() <= {"demonstration"} else ""
-    needed = ROLES[:1] if mark else ROLES
-    columns = {**{role: role for role in ROLES if role in table}, **columns}
-    if mark and TOOLS[mark][0] in table:
-        columns.setdefault("demonstration", TOOLS[mark][0])
-    if missing := ",".join(f"{role}=COLUMN" for role in needed if role not in columns):
+    known = {role: next((name for name in (role, *COLUMNS[role]) if name in table), "") for role in ROLES}
+    columns = {role: name for role, name in {**known, **said}.items() if name}
+    if "annotation_id" in table and "demonstration" in columns:
+        return _regions(table, columns["demonstration"]), None, []
+    tiers = [name for name in table if not name.startswith(TIERS_BESIDE)] if "File Name" in table else []
+    if tiers and "label" not in columns:  # ELAN has a column for each
+        table = table.melt([name for name in table if name not in tiers], tiers, "labels", "label")
+        columns["label"] = "label"
+    if missing := ",".join(f"{role}=COLUMN" for role in ROLES if role not in columns):
         raise BadInput(f"its columns are {', '.join(table)}; say what they are with --columns {missing}")
-    rows = pd.DataFrame({role: table[columns[role]] for role in needed})
-    if mark:
-        try:
-            return TOOLS[mark][1](rows.join(table.drop(columns=columns["demonstration"])))
-        except BadInput:
-            raise
-        except (KeyError, TypeError, ValueError) as error:
-            raise BadInput(f"is no table as its tool exports it, or is damaged: {error}") from None
+    rows = pd.DataFrame({role: table[columns[role]] for role in ROLES})
+    rows = rows.assign(labels=table["labels"] if tiers else columns["label"], last=False)
+    notes = list[str]()
+    if "Behavior type" in table:  # BORIS
+        rows, notes = _states(rows, table)
     words = {word for side in ("start", "stop") for word in re.split(r"[^a-z]+", columns[side].lower())}
     units = [unit for unit, its_words in UNITS.items() if its_words & words]
-    return rows.assign(labels=columns["label"], last=False), units[0] if len(units) == 1 else None, []
+    return rows, "seconds" if "ss" in words else units[0] if len(units) == 1 else None, notes
 
 
-def _elan(table: pd.DataFrame) -> Said:
-    """ELAN's tab-delimited text of multiple files, which has a column for each tier."""
-    form, unit = ("msec", "milliseconds") if "Begin Time - msec" in table else ("ss.msec", "seconds")
-    table = table.rename(columns={f"Begin Time - {form}": "start", f"End Time - {form}": "stop"})
-    fixed, others = ["demonstration", "start", "stop"], ("File Path", "Begin Time - ", "End Time - ", "Duration - ")
-    tiers = [name for name in table if name not in fixed and not name.startswith(others)]
-    return table.melt(fixed, tiers, "labels", "label").assign(last=False), unit, []
+def _states(rows: pd.DataFrame, table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
+    """The states among BORIS' events; labels are called as the subject, or ``behavior`` without one."""
+    states = table["Behavior type"] != "POINT"
+    rows = rows.assign(labels=table["Subject"].replace(["", "No focal subject"], "behavior"))[states]
+    if "Time offset (s)" in table:
+        before = _numbers(table[states], "Time offset (s)")
+        rows = rows.assign(**{side: _numbers(rows, side) - before for side in ("start", "stop")})
+    modified = (table.loc[states, [name for name in table if name.startswith("Modifier")]] != "").any(axis=1).sum()
+    notes = [f"left out {(~states).sum()} point events, which last no step"] if not states.all() else []
+    notes += [f"left out the modifiers of {modified} rows: a label is a behavior alone"] if modified else []
+    return rows, notes
 
 
-def _boris(table: pd.DataFrame) -> Said:
-    """BORIS' events or aggregated events; labels are called as the subject, or ``behavior`` without one."""
-    table = table.rename(columns={"Behavior": "label", "Start (s)": "start", "Stop (s)": "stop", "Time": "start"})
-    points = table["Behavior type"] == "POINT"
-    notes = [f"left out {points.sum()} point events, which last no step"] if points.any() else []
-    modifiers = [name for name in table if name.startswith("Modifier")]
-    table = table[~points].assign(labels=table["Subject"].replace(["", "No focal subject"], "behavior"), last=False)
-    if modified := int((table[modifiers] != "").any(axis=1).sum()):
-        notes.append(f"left out the modifiers of {modified} rows: a label is a behavior alone")
-    if "stop" not in table:  # a row for each START and each STOP
-        table = table.assign(start=_numbers(table, "start")).sort_values("start", kind="stable")
-        states = table.groupby(["demonstration", "labels", "label", *modifiers])
-        begins, after = table["Behavior type"] == "START", states["Behavior type"].shift(-1)
-        paired = begins & (after == "STOP")
-        for row in table[np.where(begins, ~paired, states["Behavior type"].shift() != "START")].to_dict("records"):
-            kind, other = ("START", "STOP") if row["Behavior type"] == "START" else ("STOP", "START")
-            what = f"{row['label']} in {row['demonstration']}, a {kind} at {row['start']:g} s"
-            notes.append(f"left out {what} without its {other}")
-        table = table.assign(stop=states["start"].shift(-1))[paired]
-    before = _numbers(table, "Time offset (s)") if "Time offset (s)" in table else 0
-    ends = {side: _numbers(table, side) - before for side in ("start", "stop")}
-    return table.assign(**ends), "seconds", notes
+def _regions(table: pd.DataFrame, demonstrations: str) -> pd.DataFrame:
+    """Segments of Label Studio's CSV: a column for each tag, whose cells list regions as JSON.
 
-
-def _label_studio(table: pd.DataFrame) -> Said:
-    """Label Studio's CSV: a column for each tag, whose cells list regions as JSON. Frames of videos count from 1."""
+    Frames of videos count from 1.
+    """
     rows = []
-    for labels in table:
-        for demo, cell in zip(table["demonstration"], table[labels], strict=True):
-            for region in json.loads(cell) if cell.startswith("[{") else ():
-                kind = next((kind for kind in ("timeserieslabels", "timelinelabels", "labels") if kind in region), None)
-                if kind and len(region[kind]) > 1:
-                    raise BadInput(f"{demo}: a region of {labels} has {len(region[kind])} labels; a step has one")
-                for part in region.get("ranges", [region]) if kind else ():
-                    start = part["start"] - ("ranges" in region)
-                    rows.append((demo, labels, "".join(region[kind]), start, part["end"], kind == "timeserieslabels"))
-    return pd.DataFrame(rows, columns=["demonstration", "labels", "label", "start", "stop", "last"]), None, []
+    try:
+        for labels in table.drop(columns=demonstrations):
+            for demo, cell in zip(table[demonstrations], table[labels], strict=True):
+                for region in json.loads(cell) if cell.startswith("[{") else ():
+                    kind = next((kind for kind in REGIONS if kind in region), None)
+                    if kind and len(region[kind]) > 1:
+                        raise BadInput(f"{demo}: a region of {labels} has {len(region[kind])} labels; a step has one")
+                    for part in region.get("ranges", [region]) if kind else ():
+                        start = part["start"] - ("ranges" in region)
+                        last = kind == "timeserieslabels"
+                        rows.append((demo, labels, "".join(region[kind]), start, part["end"], last))
+    except (KeyError, TypeError, ValueError) as error:
+        if isinstance(error, BadInput):
+            raise
+        raise BadInput(f"is no table as its tool exports it, or is damaged: {error}") from None
+    return pd.DataFrame(rows, columns=["demonstration", "labels", "label", "start", "stop", "last"])
 
 
-TOOLS = {
-    "Begin Time - msec": ("File Name", _elan),
-    "Begin Time - ss.msec": ("File Name", _elan),
-    "Behavior type": ("Observation id", _boris),
-    "annotation_id": ("demonstration", _label_studio),
-}
-"""What ELAN, BORIS and Label Studio export, by a column that other tables do not have: the column of demonstrations,
-and the reader."""
+REGIONS = ("timeserieslabels", "timelinelabels", "labels")
+"""Keys of a region's label in Label Studio, by what is labelled."""
 
 # --- segments ---------------------------------------------------------------------------------------------------------
 

@@ -9,7 +9,8 @@ from typing import Any, get_args
 
 import numpy as np
 
-from ddco_pyro.spec import DISCRETE, ControlSpec, Kind, PartSpec, SpecError
+from ddco_pyro.data.demonstration import number
+from ddco_pyro.spec import DISCRETE, ControlSpec, Kind, SpecError
 
 OFTEN = 0.01
 """A dimension often equals an extreme if more than this share of the steps does."""
@@ -43,6 +44,34 @@ def same(values: np.ndarray, value: np.ndarray | float) -> np.ndarray:
     return found
 
 
+RESOLUTION = 1e-9
+"""A dimension is treated as constant if its range is below RESOLUTION × its largest magnitude, or for coarser types
+:data:`LAST_PLACES` units in the last place."""
+
+LAST_PLACES = 4
+
+SETTLED = 256 * float(np.finfo(np.float32).eps)
+"""A dimension is treated as constant if its range is below SETTLED (3e-5) × the observation's largest magnitude, at
+most 1. Simulators round all components of a vector alike in every step: components of a quaternion at rest vary by 6e-7
+to 1.6e-5 in Meta-World's files. The bound of 1 is for mixed units, where one dimension may be in the thousands."""
+
+
+def rounding(low: np.ndarray, high: np.ndarray, dtype: np.dtype[Any]) -> np.ndarray:
+    """The largest range of each dimension that counts as rounding, [D]; wider dimensions vary.
+
+    :param low: the smallest value of each dimension of an observation [D]; ``high`` the largest. Values that are not
+        finite give NaN.
+    :param dtype: the type of the values in the file; whole numbers are not rounded.
+    """
+    sizes = np.maximum(np.abs(np.asarray(low, np.float64)), np.abs(np.asarray(high, np.float64)))
+    finite = np.isfinite(sizes)
+    if dtype.kind != "f":
+        return np.where(finite, 0.0, np.nan)
+    own = max(RESOLUTION, LAST_PLACES * float(np.finfo(dtype).eps)) * np.maximum(sizes, RESOLUTION)
+    largest = min(1.0, float(sizes.max(initial=0.0, where=finite)))
+    return np.where(finite, np.maximum(own, SETTLED * largest), np.nan)
+
+
 @dataclass(frozen=True)
 class ControlDimension:
     """Statistics of one control dimension over all steps of some demonstrations.
@@ -58,7 +87,7 @@ class ControlDimension:
     :param integer: whether the controls have an integer type.
     :param made_by: for ``minimum``, ``maximum`` and ``inside``: names of the few demonstrations (:data:`FEW`) without
         which the value would be rare. Such a value decides no kind.
-    :param strays: names of the few demonstrations without which the dimension would be constant or a switch.
+    :param exceptions: names of the few demonstrations without which the dimension would be constant or a switch.
     """
 
     number: int
@@ -73,7 +102,7 @@ class ControlDimension:
     together: tuple[int, ...] = ()
     integer: bool = False
     made_by: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    strays: tuple[str, ...] = ()
+    exceptions: tuple[str, ...] = ()
 
     @property
     def whole(self) -> bool:
@@ -123,7 +152,7 @@ class ControlDimension:
             return ""
         each = ((getattr(self, end), names) for end, names in self.made_by.items())
         common = [f"{number(value)} is common in {few(names)} alone" for value, names in each]
-        return "; ".join([*common, *([f"a switch without {few(self.strays)}"] if self.strays else [])])
+        return "; ".join([*common, *([f"a switch without {few(self.exceptions)}"] if self.exceptions else [])])
 
     @property
     def note(self) -> str:
@@ -139,18 +168,8 @@ class ControlDimension:
 
     def as_data(self) -> dict[str, Any]:
         """The main statistics as plain data."""
-        left_out = ("distinct", "together", "integer", "made_by", "strays")
+        left_out = ("distinct", "together", "integer", "made_by", "exceptions")
         return {key: value for key, value in asdict(self).items() if key not in left_out}
-
-
-def number(value: float) -> str:
-    """A value with as few digits as identify it in its type, single or double; never as minus zero."""
-    value = float(value) + 0.0
-    if value.is_integer() and abs(value) < 1e16:
-        return str(int(value))
-    with np.errstate(over="ignore"):
-        single = np.float32(value)
-    return str(single) if float(single) == value else str(value)
 
 
 def few(names: Sequence[str]) -> str:
@@ -181,7 +200,7 @@ class _Steps:
         """Number of steps at a value in each demonstration [N]."""
         return self._count(same(self.values, value))
 
-    def makers(self, value: float, often: float, least: int) -> np.ndarray:
+    def made_by(self, value: float, often: float, least: int) -> np.ndarray:
         """The few demonstrations without which a value is rare.
 
         :param often: share of the steps from which on the value is common.
@@ -195,7 +214,7 @@ class _Steps:
         )
         return np.flatnonzero(makes) if not rare and makes.sum() <= most_few(len(at)) else np.empty(0, dtype=int)
 
-    def strays(self) -> np.ndarray:
+    def exceptions(self) -> np.ndarray:
         """The few demonstrations without which the dimension would be constant or a switch."""
         two = (self.at_low + self.at_high == self.steps) | same(self.low, self.high)
         values, times = np.unique(np.concatenate([self.low[two], self.high[two]]), return_counts=True)
@@ -212,7 +231,7 @@ class _Steps:
         often = self.times >= max(FEWEST, ATOM * len(self.values))
         ends = np.array([self.low.min(), self.high.max()])
         values = [value for value in (self.distinct[often] + 0.0).tolist() if not same(ends, value).any()]  # no minus 0
-        key = {value: (len(self.makers(value, ATOM, FEWEST)) > 0, -int(self.at(value).sum())) for value in values}
+        key = {value: (len(self.made_by(value, ATOM, FEWEST)) > 0, -int(self.at(value).sum())) for value in values}
         return min(values, key=key.__getitem__, default=None)
 
 
@@ -235,9 +254,9 @@ def control_dimensions(controls: Mapping[str, np.ndarray]) -> tuple[ControlDimen
             continue
         low, high = float(steps.low.min()), float(steps.high.max())
         inside = steps.inside() if rows.shape[1] <= MOST_DIMENSIONS else None
-        places = {"minimum": steps.makers(low, OFTEN, 1), "maximum": steps.makers(high, OFTEN, 1)}
+        places = {"minimum": steps.made_by(low, OFTEN, 1), "maximum": steps.made_by(high, OFTEN, 1)}
         if inside is not None:
-            places["inside"] = steps.makers(inside, ATOM, FEWEST)
+            places["inside"] = steps.made_by(inside, ATOM, FEWEST)
             rests[index] = same(values, inside)
         dimensions[index] = ControlDimension(
             index,
@@ -251,7 +270,7 @@ def control_dimensions(controls: Mapping[str, np.ndarray]) -> tuple[ControlDimen
             at_inside=int(rests[index].sum()) if index in rests else 0,
             integer=integer,
             made_by={end: tuple(names[place] for place in makers) for end, makers in places.items() if len(makers)},
-            strays=tuple(names[place] for place in steps.strays()),
+            exceptions=tuple(names[place] for place in steps.exceptions()),
         )
     for index, rest in rests.items():
         together = (
@@ -397,8 +416,8 @@ def control_parts(spec: ControlSpec, dimensions: Sequence[ControlDimension]) -> 
     named = []
     for place, part in enumerate(spec.parts):
         own = [varying.pop(dimension) for dimension in part.dims if dimension in varying]
-        named += list(_parts(part.kind, own, f"control.parts.{place}", part))
-    return (*named, *_parts(spec.kind, list(varying.values()), "control", None))
+        named += list(_parts(part.kind, own, f"control.parts.{place}", part.name))
+    return (*named, *_parts(spec.kind, list(varying.values()), "control", ""))
 
 
 def refuse_unknown_dimensions(spec: ControlSpec, size: int) -> None:
@@ -407,124 +426,104 @@ def refuse_unknown_dimensions(spec: ControlSpec, size: int) -> None:
     :raises SpecError: it does.
     """
     for place, part in enumerate(spec.parts):
-        unknown = [dimension for dimension in part.dims if dimension >= size]
-        if unknown:
+        if unknown := [dimension for dimension in part.dims if dimension >= size]:
             raise SpecError(
                 f"control.parts.{place}.dims: there is no control dimension {unknown[0]}; the control has {size}, "
                 "counted from 0"
             )
 
 
-def _parts(
-    kind: str, dimensions: Sequence[ControlDimension], place: str, spec: PartSpec | None
-) -> Iterator[ControlPart]:
+def _parts(declared: str, dimensions: Sequence[ControlDimension], place: str, name: str) -> Iterator[ControlPart]:
     """One part for each kind among the dimensions.
 
     :param place: key path of the spec, for errors.
+    :param name: of the part in the spec; empty for all other dimensions.
     """
-    if kind == "categorical" and dimensions:
-        name, one_hot = spec.name if spec else kind, all(dim.values == (0.0, 1.0) for dim in dimensions)
-        if one_hot and len(dimensions) > 1:
-            dims = tuple(dim.number for dim in dimensions)
-            yield ControlPart(name, dims, "categorical", why=f"{len(dims)} discrete actions, as rows")
-        else:
-            yield from _actions(dimensions, place, name)
+    if declared == "categorical" and len(dimensions) > 1 and all(dim.values == (0.0, 1.0) for dim in dimensions):
+        dims = tuple(dim.number for dim in dimensions)
+        yield ControlPart(name or declared, dims, declared, why=f"{len(dims)} discrete actions, as rows")
         return
-    alone = len(dimensions) == 1
-    decided = {dim.number: _decided(dim, alone) if kind == "auto" else _declared(dim, kind) for dim in dimensions}
-    kinds = [each for each in KINDS if each in {kind for kind, _ in decided.values()}]
-    for each in kinds:
-        alike = [dim for dim in dimensions if decided[dim.number][0] == each]
-        name = each if spec is None else spec.name if len(kinds) == 1 else f"{spec.name} {each}"
-        if each == "categorical":
-            yield from (replace(part, why=decided[part.dims[0]][1]) for part in _actions(alike, place, name))
-            continue
-        exact = {dim.number: _exact(dim, place) for dim in alike if each == "hurdle"}
-        for own in _resting_together(alike) if exact else [alike]:
-            low, high = (), ()
-            if each in (*BOUNDED, *DISCRETE):
-                ends = [_ends(dim, each, place) for dim in own]
-                low, high = zip(*ends, strict=True)
-            why = "; ".join(dict.fromkeys(decided[dim.number][1] for dim in own))
-            numbers = tuple(dim.number for dim in own)
-            rests = tuple(exact[number] for number in numbers if exact)
-            yield ControlPart(name, numbers, each, low, high, why=why, exact=rests)
+    decided = {dim.number: _kind(dim, declared, len(dimensions) == 1) for dim in dimensions}
+    kinds = [kind for kind in KINDS if kind in {kind for kind, _ in decided.values()}]
+    for kind in kinds:
+        alike = [dim for dim in dimensions if decided[dim.number][0] == kind]
+        called = kind if not name else name if len(kinds) == 1 else f"{name} {kind}"
+        groups = [[dim] for dim in alike] if kind == "categorical" else [alike]
+        for own in _resting_together(alike, place) if kind == "hurdle" else groups:
+            bounds = [_ends(dim, kind, place, len(alike) == 1) for dim in own] if kind in (*BOUNDED, *DISCRETE) else []
+            yield ControlPart(
+                called if kind != "categorical" or len(groups) == 1 else f"{called} {own[0].number}",
+                tuple(dim.number for dim in own),
+                kind,
+                tuple(low for low, _ in bounds) if kind != "categorical" else (),
+                tuple(high for _, high in bounds) if kind != "categorical" else (),
+                own[0].distinct if kind == "categorical" else (),
+                "; ".join(dict.fromkeys(decided[dim.number][1] for dim in own)),
+                tuple(dim.inside or 0.0 for dim in own) if kind == "hurdle" else (),
+            )
 
 
-def _decided(dimension: ControlDimension, alone: bool) -> tuple[str, str]:
-    """The kind of a dimension under ``auto``, and the reason.
+def _kind(dim: ControlDimension, declared: str, alone: bool) -> tuple[str, str]:
+    """The kind of a dimension, and the reason: declared by the spec, or decided under ``auto``.
 
     :param alone: whether there is no other dimension.
     """
-    kind, why = _found(dimension, alone)
-    return kind, "; ".join(filter(None, (why, dimension.made)))
+    if declared == "categorical":
+        return declared, f"{len(dim.distinct)} discrete actions"
+    if declared != "auto":
+        unbounded = dim.atom and declared not in ("hurdle", *DISCRETE)
+        warning = f"; {dim.atom}, and options gain by collecting these steps, without any skill" if unbounded else ""
+        return declared, f"as declared{warning}"
+    kind, why = "gaussian", "varies freely"
+    if dim.values:
+        kind, why = "binary", f"takes two values, {number(dim.minimum)} and {number(dim.maximum)}"
+    elif dim.discrete:
+        kind, why = "categorical", f"takes {len(dim.distinct)} values of an integer type"
+    elif alone and dim.whole:
+        kind, why = "categorical", f"takes {len(dim.distinct)} whole numbers and is the only dimension"
+    elif dim.atom:
+        kind, why = "hurdle", dim.atom + ("; often at an extreme" if dim.extremes else "")
+    elif dim.extremes:
+        kind, why = "clipped", "often exactly at an extreme"
+    return kind, "; ".join(filter(None, (why, dim.made)))
 
 
-def _found(dimension: ControlDimension, alone: bool) -> tuple[str, str]:
-    if dimension.values:
-        return "binary", f"takes two values, {number(dimension.minimum)} and {number(dimension.maximum)}"
-    if dimension.discrete:
-        return "categorical", f"takes {len(dimension.distinct)} values of an integer type"
-    if alone and dimension.whole:
-        return "categorical", f"takes {len(dimension.distinct)} whole numbers and is the only dimension"
-    if dimension.atom:
-        return "hurdle", dimension.atom + ("; often at an extreme" if dimension.extremes else "")
-    if dimension.extremes:
-        return "clipped", "often exactly at an extreme"
-    return "gaussian", "varies freely"
+def _resting_together(dimensions: Sequence[ControlDimension], place: str) -> list[list[ControlDimension]]:
+    """Groups of dimensions that equal their commonest inside values in the same steps.
 
-
-def _declared(dimension: ControlDimension, kind: str) -> tuple[str, str]:
-    """A kind that the spec declares, with a warning where an atom makes the density unbounded."""
-    if not dimension.atom or kind in ("hurdle", *DISCRETE):
-        return kind, "as declared"
-    return kind, f"as declared; {dimension.atom}, and options gain by collecting these steps, without any skill"
-
-
-def _exact(dim: ControlDimension, place: str) -> float:
-    """The value of a ``hurdle`` dimension."""
-    if dim.inside is None:
-        raise SpecError(
-            f"{place}.kind: control dimension {dim.number} is at no value inside its range in "
-            f"{100 * ATOM:g} % of the steps; it is no hurdle"
-        )
-    return dim.inside
-
-
-def _resting_together(dimensions: Sequence[ControlDimension]) -> list[list[ControlDimension]]:
-    """Groups of dimensions that equal their commonest inside values in the same steps."""
+    :raises SpecError: a dimension has no such value.
+    """
     groups: list[list[ControlDimension]] = []
     for dim in dimensions:
-        own = next((own for own in groups if dim.number in own[0].together), None)
-        if own is None:
+        if dim.inside is None:
+            raise SpecError(
+                f"{place}.kind: control dimension {dim.number} is at no value inside its range in "
+                f"{100 * ATOM:g} % of the steps; it is no hurdle"
+            )
+        if (own := next((own for own in groups if dim.number in own[0].together), None)) is None:
             groups.append([dim])
         else:
             own.append(dim)
     return groups
 
 
-def _ends(dim: ControlDimension, kind: str, place: str) -> tuple[float, float]:
-    """The bounds of a dimension, or its two values."""
-    if kind == "binary":
-        if len(dim.values) != 2:
-            raise SpecError(f"{place}.kind: control dimension {dim.number} takes more than two values; it is no switch")
+def _ends(dim: ControlDimension, kind: str, place: str, alone: bool) -> tuple[float, float]:
+    """The bounds of a dimension, or its extreme values where it is discrete.
+
+    :raises SpecError: it takes other values than the kind has.
+    """
+    if kind == "categorical" and not dim.distinct:
+        raise SpecError(f"{place}.kind: control dimension {dim.number} takes more than {MOST_DISTINCT} values")
+    if kind == "categorical" and not alone and not all(value.is_integer() for value in dim.distinct):
+        raise SpecError(
+            f"{place}.kind: control dimension {dim.number} is not of whole numbers: discrete actions are such "
+            "dimensions, or rows with a single 1"
+        )
+    if kind == "binary" and len(dim.values) != 2:
+        raise SpecError(f"{place}.kind: control dimension {dim.number} takes more than two values; it is no switch")
+    if kind in DISCRETE:
         return dim.minimum, dim.maximum
     often = {name: value for name, value, _ in dim.extremes}
     if kind == "clipped" and not often:
         often = {"minimum": dim.minimum, "maximum": dim.maximum}
     return often.get("minimum", -math.inf), often.get("maximum", math.inf)
-
-
-def _actions(dimensions: Sequence[ControlDimension], place: str, name: str) -> Iterator[ControlPart]:
-    """A categorical part for each dimension."""
-    for dim in dimensions:
-        if not dim.distinct:
-            raise SpecError(f"{place}.kind: control dimension {dim.number} takes more than {MOST_DISTINCT} values")
-        if len(dimensions) > 1 and not all(value.is_integer() for value in dim.distinct):
-            raise SpecError(
-                f"{place}.kind: control dimension {dim.number} is not of whole numbers: discrete actions are such "
-                "dimensions, or rows with a single 1"
-            )
-        own = name if len(dimensions) == 1 else f"{name} {dim.number}"
-        why = f"{len(dim.distinct)} discrete actions"
-        yield ControlPart(own, (dim.number,), "categorical", values=dim.distinct, why=why)

@@ -1,102 +1,23 @@
-"""Demonstrations: checked, in memory except for pictures in files, read from and written to robomimic's layout."""
+"""Demonstrations ready for a fit: alike, in memory except for pictures in files, read from and written to HDF5."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from numbers import Real
 from pathlib import Path
-from typing import Any, overload
+from typing import overload
 
 import numpy as np
 
-from ddco_pyro.data.checks import (
-    check,
-    check_alike,
-    check_values,
-    divided,
-    problem_of_labels,
-    problems_of_masks,
-    unknown,
-)
-from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError
-from ddco_pyro.data.memory import needed, refuse_too_much
-from ddco_pyro.data.pictures import Observed, Pictures
-from ddco_pyro.data.sources import refuse_foreign
-from ddco_pyro.data.sources.recording import Recording
-from ddco_pyro.data.sources.robomimic import Robomimic, frequency_of, open_robomimic, robomimic_file, write_recording
+from ddco_pyro.data.demonstration import Attribute, Demonstration, check, needed
+from ddco_pyro.data.division import problems_of_masks, split_by_masks, unknown
+from ddco_pyro.data.errors import DemonstrationsError
+from ddco_pyro.data.memory import refuse_too_much
+from ddco_pyro.data.sources import open_source, refuse_foreign
+from ddco_pyro.data.sources.robomimic import frequency_of, robomimic_file, write_demonstration
 from ddco_pyro.errors import check_whole, path_of
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Demonstration:
-    """One demonstration of T steps, s_0 a_0 ... s_{T-1} a_{T-1}.
-
-    >>> demo = ddco_pyro.Demonstration("demo_0", {"place": np.zeros((10, 2))}, np.ones((10, 2)), {"phase": [0] * 10})
-    >>> len(demo), demo.actions.dtype, demo.labels["phase"].shape
-    (10, dtype('float64'), (10,))
-
-    :param observations: key to [T, ...]; uint8 stays, other numbers become float64. Pictures uint8 [T, C, H, W] or
-        [T, H, W] become [T, H, W, C]. Pictures in files are lazy :class:`~ddco_pyro.data.pictures.Pictures`.
-    :param actions: the controls [T, A], float64; whole numbers [T] or [T, A] become int64.
-    :param labels: ground-truth segments by name, [T] or [T, 1], int64.
-    :param attributes: facts about the demonstration, such as its seed.
-    :raises DemonstrationsError: no steps, unequal lengths, other values than numbers, or numbers that are NaN, infinite
-        or beyond :data:`ddco_pyro.data.checks.LARGEST`.
-    """
-
-    name: str
-    observations: Mapping[str, Observed]
-    actions: np.ndarray
-    labels: Mapping[str, np.ndarray] = field(default_factory=dict)
-    attributes: Mapping[str, Attribute] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.name, str) or not self.name or "/" in self.name:
-            raise DemonstrationsError(
-                f"{self.name!r} cannot be the name of a demonstration; it must be a text, not empty, without a /"
-            )
-        for what, arrays in (("observations", self.observations), ("labels", self.labels)):
-            if not isinstance(arrays, Mapping) or not all(isinstance(key, str) for key in arrays):
-                raise DemonstrationsError(f"{self.name}: {what} have to be a mapping of names to arrays [T, ...]")
-        recording = self.recording()
-        check(recording)
-        recording = recording.loaded()  # a file is read once
-        check_values(recording, f"repair it, or leave {self.name} out (demonstrations.exclude)")
-        observations = {key: _numbers(column.observed()) for key, column in recording.observations.items()}
-        labels = {}
-        for key, column in recording.labels.items():
-            if problem := problem_of_labels(column.shape[1:], column.dtype):
-                raise DemonstrationsError(f"{self.name}: labels/{key} {problem}")
-            labels[key] = column.array().astype(np.int64)
-        whole = recording.actions.dtype.kind in "iu"
-        object.__setattr__(self, "actions", recording.actions.array().astype(np.int64 if whole else np.float64))
-        object.__setattr__(self, "observations", observations)
-        object.__setattr__(self, "labels", labels)
-
-    def recording(self) -> Recording:
-        """The demonstration as a recording."""
-        return Recording.of(**vars(self))
-
-    def __len__(self) -> int:
-        return len(self.actions)
-
-    def __repr__(self) -> str:
-        return f"{self.name}: {len(self)} steps{_shapes(self)}"
-
-
-def _shapes(demo: Demonstration) -> str:
-    """The arrays of a demonstration, a line each."""
-    columns = dict(demo.recording().columns())
-    return "".join(f"\n  {place} {list(column.shape[1:])} {column.dtype}" for place, column in columns.items())
-
-
-def _numbers(values: Any) -> Observed:
-    if isinstance(values, Pictures):
-        return values
-    array = np.asarray(values)
-    return array if array.dtype == np.uint8 else array.astype(np.float64)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -129,9 +50,8 @@ class Demonstrations(Sequence[Demonstration]):
         if len(set(self.names)) < len(self):
             twice = next(name for name in self.names if self.names.count(name) > 1)
             raise DemonstrationsError(f"{twice}: there are two demonstrations of this name; rename one")
-        first = self.demonstrations[0].recording()
         for demo in self.demonstrations[1:]:
-            check_alike(demo.recording(), first)
+            check(demo, self.demonstrations[0])
         for problem in problems_of_masks(self.masks, self.names):
             raise DemonstrationsError(problem)
 
@@ -150,19 +70,18 @@ class Demonstrations(Sequence[Demonstration]):
         :param exclude: names of demonstrations that are not read and are removed from masks.
         :raises DemonstrationsError: the file cannot be read, lacks something asked for, or does not fit into memory.
         """
-        with _opened(path_of(path, "demonstrations")) as source:
-            recordings = list(_recordings(source, observations, labels, exclude))
-            bytes_read = needed((dict(recording.columns()) for recording in recordings), copies=0)
-            refuse_too_much(bytes_read, "reading it", "read only some observations, or scale pictures down")
-            read = tuple(Demonstration(**vars(recording)) for recording in recordings)
-            masks = {mask: tuple(name for name in names if name not in exclude) for mask, names in source.masks.items()}
-            return cls(read, masks, source.attributes)
+        with stored(path_of(path, "demonstrations"), observations, labels, exclude) as (found, masks, attributes):
+            refuse_too_much(
+                needed(found, copies=0), "reading it", "read only some observations, or scale pictures down"
+            )
+            read = tuple(Demonstration(**vars(demo)) for demo in found)
+            return cls(read, masks, attributes)
 
     def write(self, path: str | Path) -> None:
         """Write an HDF5 file, whole or not at all."""
         with robomimic_file(Path(path), self.attributes, self.masks) as data:
             for demo in self:
-                write_recording(data, demo.recording())
+                write_demonstration(data, demo)
 
     def __len__(self) -> int:
         return len(self.demonstrations)
@@ -181,7 +100,7 @@ class Demonstrations(Sequence[Demonstration]):
         fewest, most = min(self.lengths), max(self.lengths)
         steps = f"{most}" if fewest == most else f"{fewest} to {most}"
         masks = "".join(f"\n  mask/{mask}: {len(members)}" for mask, members in self.masks.items())
-        return f"{len(self)} demonstrations of {steps} steps{_shapes(self[0])}{masks}"
+        return f"{len(self)} demonstrations of {steps} steps{self[0].shapes}{masks}"
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -236,7 +155,7 @@ class Demonstrations(Sequence[Demonstration]):
             number = min(max(round(valid_fraction * len(self)), 1), len(self) - 1)
             drawn = np.random.default_rng(seed).permutation(len(self))[:number]
             masks = {"valid": tuple(self.names[index] for index in sorted(drawn))}
-        train, valid = divided(self.names, masks)
+        train, valid = split_by_masks(self.names, masks)
         return self.select(train), self.select(valid)
 
 
@@ -253,22 +172,30 @@ def bytes_of_a_fit(path: str | Path, observations: Sequence[str], exclude: Seque
 
     :raises DemonstrationsError: the file cannot be read, or lacks an observation.
     """
-    with _opened(Path(path)) as source:
-        return needed(dict(recording.columns()) for recording in _recordings(source, observations, (), exclude))
+    with stored(Path(path), observations, (), exclude) as (found, *_):
+        return needed(found)
 
 
-def _opened(path: Path) -> AbstractContextManager[Robomimic]:
+Stored = tuple[list[Demonstration], dict[str, tuple[str, ...]], Mapping[str, Attribute]]
+"""Demonstrations as their file stores them, the masks, and the attributes of the file."""
+
+
+@contextmanager
+def stored(
+    path: Path, observations: Sequence[str] | None, labels: Sequence[str] | None, exclude: Sequence[str]
+) -> Iterator[Stored]:
+    """The demonstrations of an HDF5 file, open, without the excluded ones; no observation is read.
+
+    :raises DemonstrationsError: the file cannot be read, or lacks something asked for.
+    """
     if path.is_file():
         refuse_foreign(path)
-    return open_robomimic(path)
-
-
-def _recordings(
-    source: Robomimic, observations: Sequence[str] | None, labels: Sequence[str] | None, exclude: Sequence[str]
-) -> Iterator[Recording]:
-    for name in exclude:
-        if name not in source.names:
-            raise DemonstrationsError(f"demonstrations.exclude: {unknown(name, source.names)}")
-    if set(exclude) == set(source.names):
-        raise DemonstrationsError("demonstrations.exclude: leaves every demonstration out; keep some")
-    return (source.recording(name, observations, labels) for name in source.names if name not in exclude)
+    with open_source(path, "robomimic") as source:
+        for name in exclude:
+            if name not in source.names:
+                raise DemonstrationsError(f"demonstrations.exclude: {unknown(name, source.names)}")
+        if set(exclude) == set(source.names):
+            raise DemonstrationsError("demonstrations.exclude: leaves every demonstration out; keep some")
+        demos = [source.read(name, observations, labels) for name in source.names if name not in exclude]
+        masks = {mask: tuple(name for name in names if name not in exclude) for mask, names in source.masks.items()}
+        yield demos, masks, source.attributes

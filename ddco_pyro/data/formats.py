@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import NamedTuple
-
-TRAJECTORY, EPISODE = re.compile(r"traj_(\d+)"), re.compile(r"episode_(\d+)\.(?:hdf5|h5)")
-"""Names of ManiSkill's groups, and of ACT's files."""
 
 
 class Format(NamedTuple):
     """A format of demonstrations.
 
-    :param reader: the source's class or context manager in :mod:`ddco_pyro.data.sources`, ``module:name``. A module
-        imports its own library, which need not be installed for other formats.
+    :param reader: opens a :class:`~ddco_pyro.data.sources.Source`, a context manager ``module:function`` in
+        :mod:`ddco_pyro.data.sources`. A module imports its own library, which need not be installed for other formats.
     :param fits: whether a path has the format; also given the names at the top of an HDF5 file, else none.
     :param text: the path in words, such as ``the folder of a Minari dataset``.
     :param sign: what tells a folder of this format, in words.
@@ -37,7 +33,7 @@ def _minari(path: Path, names: Collection[str]) -> bool:
 
 def _act(path: Path, names: Collection[str]) -> bool:
     return {"action", "observations"} <= {*names} or (
-        path.is_dir() and any(EPISODE.fullmatch(one.name) for one in path.iterdir())
+        path.is_dir() and any(one.suffix in (".hdf5", ".h5") for one in path.glob("episode_*"))
     )
 
 
@@ -57,13 +53,13 @@ FORMATS = {
         parts=True,
     ),
     "maniskill": Format(
-        "hdf5_layouts:ManiSkill",
-        lambda path, names: any(TRAJECTORY.fullmatch(name) for name in names),
+        "maniskill:open_maniskill",
+        lambda path, names: any(name.startswith("traj_") for name in names),
         "an HDF5 file of ManiSkill",
     ),
-    "act": Format("hdf5_layouts:Act", _act, "the folder of ACT's episodes", "episode_0.hdf5"),
+    "act": Format("act:open_act", _act, "the folder of ACT's episodes", "episode_0.hdf5"),
     "jigsaws": Format(
-        "jigsaws:Jigsaws",
+        "jigsaws:open_jigsaws",
         lambda path, names: (path / "kinematics" / "AllGestures").is_dir(),
         "the folder of a task of JIGSAWS",
         "kinematics/AllGestures",

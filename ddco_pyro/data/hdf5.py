@@ -1,4 +1,4 @@
-"""HDF5 files: reading with one-line errors about missing or damaged parts, and writing that survives a full disk."""
+"""HDF5 files: lazy arrays, one-line errors about missing or damaged parts, and writing that survives a full disk."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import os
 import re
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from functools import partial
 from pathlib import Path
 from shlex import quote
 from typing import Any, Literal
@@ -15,24 +16,14 @@ from typing import Any, Literal
 import h5py
 import numpy as np
 
+from ddco_pyro.data.arrays import LazyArray, block_steps, channels_last, turned
+from ddco_pyro.data.demonstration import Attribute
+from ddco_pyro.data.errors import DemonstrationsError
+from ddco_pyro.data.memory import refuse_too_much
 from ddco_pyro.errors import BadInput, Failed, nearest
-
-Attribute = float | int | str | bool
 
 DAMAGE = (OSError, RuntimeError, ValueError, TypeError, KeyError, MemoryError)
 """The errors of h5py about damaged files."""
-
-
-class DemonstrationsError(BadInput):
-    """Unusable demonstrations: one line with the file, the demonstration and the key."""
-
-    def __str__(self) -> str:
-        return printable(super().__str__())
-
-
-def printable(text: str) -> str:
-    """A text as one line without control characters, which names in a file can contain."""
-    return "".join(character if character.isprintable() else repr(character)[1:-1] for character in text)
 
 
 @contextmanager
@@ -42,28 +33,25 @@ def opened(path: str | Path) -> Iterator[h5py.File]:
     :raises DemonstrationsError: the file is missing, not HDF5, or damaged.
     """
     if os.path.exists(path) and not os.path.isfile(path):
-        raise DemonstrationsError(f"{path}: is no regular file; name an HDF5 file")
+        raise DemonstrationsError(f"{path}: is no regular file; name an HDF5 file", located=True)
     try:
         with h5py.File(path, "r") as file:
             yield file
     except DemonstrationsError as error:
-        raise DemonstrationsError(f"{path}: {error}") from None
+        raise error if error.located else DemonstrationsError(f"{path}: {error}", located=True) from None
     except (BadInput, Failed):
         raise
     except FileNotFoundError:
-        raise DemonstrationsError(f"{path}: there is no such file; check the path") from None
+        raise DemonstrationsError(f"{path}: there is no such file; check the path", located=True) from None
     except DAMAGE as error:
         text = " ".join(str(error).split())
-        raise DemonstrationsError(f"{path}: cannot be read as HDF5, or is damaged: {text}") from error
+        raise DemonstrationsError(f"{path}: cannot be read as HDF5, or is damaged: {text}", located=True) from error
 
 
-class _Disk(io.RawIOBase):
+class _Disk(io.FileIO):
     """A file that stops writing at the first error and keeps it in ``error``: HDF5 may crash when a write fails."""
 
-    def __init__(self, path: Path, mode: Literal["w+", "r+"]) -> None:
-        super().__init__()
-        self._file = io.FileIO(path, mode)
-        self.error: OSError | None = None
+    error: OSError | None = None
 
     def write(self, data: Any) -> int:
         """Write all data."""
@@ -71,7 +59,7 @@ class _Disk(io.RawIOBase):
         size = len(rest)
         while rest and self.error is None:
             try:
-                rest = rest[self._file.write(rest) :]
+                rest = rest[super().write(rest) :]
             except OSError as error:
                 self.error = error
         return size
@@ -79,30 +67,17 @@ class _Disk(io.RawIOBase):
     def readinto(self, buffer: Any) -> int:
         """Read the file, with zeros in place of data that could not be written."""
         view = memoryview(buffer).cast("B")
-        done = self._file.readinto(view) or 0
+        done = super().readinto(view) or 0
         view[done:] = bytes(len(view) - done)
         return len(view)
-
-    def seek(self, offset: int, whence: int = 0) -> int:
-        """Move to an offset."""
-        return self._file.seek(offset, whence)
-
-    def tell(self) -> int:
-        """The current offset."""
-        return self._file.tell()
 
     def truncate(self, size: int | None = None) -> int:
         """Change the size of the file."""
         try:
-            return self._file.truncate(size) if self.error is None else 0
+            return super().truncate(size) if self.error is None else 0
         except OSError as error:
             self.error = error
             return 0
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-        super().close()
 
 
 @contextmanager
@@ -125,28 +100,62 @@ def natural(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
-DEEPEST = 32
-"""Deepest nesting of groups."""
-
 PACKED, SMALL = 5_000, 10**9
 """Most bytes that a filtered dataset claims for each stored byte (deflate reaches 1032), or in all."""
 
 
-def datasets(group: h5py.Group, where: str = "", depth: int = 1) -> list[str]:
+def lazy(dataset: h5py.Dataset, where: str, steps: int | None = None) -> LazyArray:
+    """A dataset as a lazy array; pictures have their channels last.
+
+    Each pass opens the file: a folder can have more files than may be open.
+
+    :param where: name in errors, such as ``demo_0: obs/camera``.
+    :param steps: of the array, the first ones of the dataset; all if None.
+    """
+    path = os.path.abspath(dataset.file.filename)  # absolute for readers in another folder
+    read = partial(_blocks, path, dataset.name, where, dataset.shape, dataset.dtype)
+    shape = channels_last(dataset.shape, dataset.dtype)
+    return LazyArray((shape[0] if steps is None else steps, *shape[1:]), dataset.dtype, read, where, path)
+
+
+def _blocks(
+    path: str, place: str, where: str, shape: tuple[int, ...], dtype: np.dtype, start: int, stop: int
+) -> Iterator[np.ndarray]:
+    with opened(path) as file:
+        dataset = file.get(place)
+        if (getattr(dataset, "shape", None), getattr(dataset, "dtype", None)) != (shape, dtype):
+            raise DemonstrationsError(f"{where} has changed since it was looked at; do the same again")
+        at_once = block_steps(shape[1:], dtype)
+        for first in range(start, stop, at_once):
+            yield turned(values_of(dataset, where, slice(first, min(first + at_once, stop))))
+
+
+def values_of(dataset: h5py.Dataset, where: str, steps: slice = slice(None)) -> np.ndarray:
+    """Values of a dataset, in memory.
+
+    :raises DemonstrationsError: they are damaged, or take more memory than is free.
+    """
+    if steps == slice(None):
+        refuse_too_much(dataset.nbytes, where, "divide the episode")
+    try:
+        return np.asarray(dataset[steps])
+    except DAMAGE as error:
+        raise DemonstrationsError(f"{where} cannot be read ({error}); the file may be damaged") from error
+
+
+def datasets(group: h5py.Group, where: str = "", above: tuple[Any, ...] = ()) -> list[str]:
     """The names of all datasets below a group; keys of dm_control contain ``/``.
 
-    :raises DemonstrationsError: there is a link, or groups are nested too deeply.
+    :param above: the groups above this one.
+    :raises DemonstrationsError: there is a link, or a group lies in itself.
     """
     names: list[str] = []
     for name in group:
         item = member(group, name, h5py.HLObject, where)
         if isinstance(item, h5py.Group):
-            if depth == DEEPEST:
-                raise DemonstrationsError(
-                    f"{where[:40]}: its groups go in a circle, or are nested more than {DEEPEST} deep; write it again "
-                    "with fewer"
-                )
-            names += [f"{name}/{below}" for below in datasets(item, f"{where}{name}/", depth + 1)]
+            if item in (*above, group):
+                raise DemonstrationsError(f"{where}{name}: its groups go in a circle; write it again without that")
+            names += [f"{name}/{below}" for below in datasets(item, f"{where}{name}/", (*above, group))]
         elif isinstance(item, h5py.Dataset):
             names.append(name)
     return sorted(names)
@@ -181,11 +190,6 @@ def _elsewhere(what: str, file: h5py.File) -> DemonstrationsError:
         f"{what}, which is not read; where you trust it, write all into one file: "
         f"h5repack --merge -l CONTI {quote(file.filename)} whole.hdf5"
     )
-
-
-def named(group: h5py.Group, key: str) -> bool:
-    """Whether a group has a link of this name, possibly broken."""
-    return group.get(key, getlink=True) is not None
 
 
 def member(group: h5py.Group, key: str, kind: type, where: str) -> Any:

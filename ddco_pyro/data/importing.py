@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
-import h5py
 import numpy as np
 
-from ddco_pyro.data.annotations import Labelled, LabelTable
-from ddco_pyro.data.checks import NUMBERS, check, check_alike, check_values, reading
-from ddco_pyro.data.hdf5 import DemonstrationsError
+from ddco_pyro.data.annotations import LabelTable, labels_of_table
+from ddco_pyro.data.arrays import NUMBERS, LazyArray, Observed, is_picture, network_input
+from ddco_pyro.data.demonstration import Demonstration, check, check_values
+from ddco_pyro.data.errors import DemonstrationsError
+from ddco_pyro.data.labels import BOUNDARY, LABEL_NAMES, UNKNOWN
 from ddco_pyro.data.pictures import resized
-from ddco_pyro.data.sources import Column, Recording, Source, open_source
+from ddco_pyro.data.sources import Source, open_source
 from ddco_pyro.data.sources.metadata import FREQUENCY
-from ddco_pyro.data.sources.robomimic import robomimic_file, write_recording
+from ddco_pyro.data.sources.robomimic import robomimic_file, write_demonstration
 from ddco_pyro.errors import BadInput, nearest
-
-OnRecording = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -70,11 +70,11 @@ def import_demonstrations(
     out: Path,
     form: str | None = None,
     choice: Choice = Choice(),
-    on_recording: OnRecording = lambda done, total: None,
+    on_demonstration: Callable[[int, int], None] = lambda done, total: None,
 ) -> Imported:
     """Write the demonstrations of a file or folder into ``out``, whole or not at all.
 
-    Memory holds one block of an array at a time.
+    Memory holds one demonstration at a time, of pictures a block.
 
     :raises DemonstrationsError: the source cannot be read, or a demonstration cannot be used.
     :raises BadInput: ``out`` exists, or the table of labels does not fit.
@@ -82,82 +82,62 @@ def import_demonstrations(
     if out.exists():
         raise BadInput(f"{out}: is there already; choose another --out, or remove it")
     with open_source(source, form, choice.actions) as whole:
-        labelled = Labelled(whole, choice.labels) if choice.labels else None
-        chosen = labelled or whole
-        masks: dict[str, tuple[str, ...]] = {}
-        rate = choice.hz or chosen.frequency
-        about = {**chosen.attributes, **({FREQUENCY: rate} if rate else {})}
-        about |= {"source": Path(source).name, "source_format": chosen.format}
+        table, counts, notes = None, dict[str, int](), list[str]()
+        if choice.labels:
+            whole = replace(whole, frequency=choice.labels.rate or whole.frequency)
+            table = labels_of_table(choice.labels, whole)
+            whole = replace(whole, read=partial(_labelled, whole, table.labels))
+            counts, notes = {labels: len(each) for labels, each in table.labels.items()}, table.notes
+        names, masks, rate = _names(whole, choice), dict[str, tuple[str, ...]](), choice.hz or whole.frequency
+        about = {**whole.attributes, **({FREQUENCY: rate} if rate else {})}
+        about |= {LABEL_NAMES: table.names} if table else {}
+        about |= {"source": Path(source).name, "source_format": whole.format}
+        if not choice.skip_broken:  # before pictures are decoded
+            _check_all(whole, names, choice)
+        first: Demonstration | None = None
+        left_out = dict[str, str]()
         with robomimic_file(out, about, masks) as data:
-            left_out, unread = _write(chosen, choice, data, on_recording)
-            if not len(data):
-                why = next(iter(left_out.values()))
+            for number, name in enumerate(names):
+                try:
+                    demo = _usable(whole, name, choice, first)
+                    check_values(demo, pictures=choice.skip_broken)
+                    write_demonstration(data, demo)
+                except DemonstrationsError as error:
+                    if not choice.skip_broken:
+                        raise _advised(error, whole, names, choice) from None
+                    left_out[name] = str(error)
+                else:
+                    notes = notes if first else [*_unread(whole.read(name), demo.observations), *notes]
+                    first = first or demo
+                on_demonstration(number + 1, len(names))
+            if first is None:
+                why = next(iter(left_out.values()), "there is none")
                 raise DemonstrationsError(f"{source}: none of its demonstrations can be used: {why}")
-            names = tuple(name for name in chosen.names if name in data)
-            present = set(names)
-            for mask, members in chosen.masks.items():
-                if imported := tuple(name for name in members if name in present):
-                    masks[mask] = imported
-    if labelled is None:
-        return Imported(out, names, left_out, unread)
-    return Imported(out, names, left_out, (*unread, *labelled.notes), labelled.counts)
+            written = tuple(name for name in whole.names if name in data)
+            kept = {mask: tuple(name for name in members if name in data) for mask, members in whole.masks.items()}
+            masks |= {mask: members for mask, members in kept.items() if members}
+    return Imported(out, written, left_out, tuple(notes), counts)
 
 
-def _write(
-    source: Source, choice: Choice, data: h5py.Group, on_recording: OnRecording
-) -> tuple[dict[str, str], tuple[str, ...]]:
-    """Write all demonstrations; the reason for each that is left out, and the observations that are not read."""
-    names = _names(source, choice)
-    left_out: dict[str, str] = {}
-    unread: tuple[str, ...] = ()
-    if not choice.skip_broken:
-        _check_headers(source, names, choice)
-    first: Recording | None = None
-    for number, name in enumerate(names):
-        try:
-            recording = _usable(source, name, choice, first)
-            check_values(recording, pictures=choice.skip_broken)
-            write_recording(data, recording)
-            unread = unread if first else tuple(_unread(source.recording(name), recording))
-            first = first or recording
-        except DemonstrationsError as error:
-            if not choice.skip_broken:
-                raise _refused(source, names, choice, error) from None
-            left_out[name] = str(error)
-        on_recording(number + 1, len(names))
-    return left_out, unread
+def _usable(source: Source, name: str, choice: Choice, first: Demonstration | None = None) -> Demonstration:
+    """The chosen part of a demonstration, which is usable as far as is known without reading lazy values."""
+    demo = _chosen(source, name, choice)
+    check(demo, first)
+    return demo
 
 
-def _unread(whole: Recording, chosen: Recording) -> Iterator[str]:
-    """A line for each observation that networks cannot read, and for each video that is not chosen."""
-    for key, column in whole.observations.items():
-        _, why = reading(column.shape[1:], column.dtype)
-        if why:
-            yield f"networks do not read obs/{key}: it {why}"
-        elif column.video and key not in chosen.observations:
-            yield f"obs/{key} is a video, left out without --videos"
-
-
-def _usable(source: Source, name: str, choice: Choice, first: Recording | None = None) -> Recording:
-    """The chosen part of a demonstration, which is usable by its headers, beside the first one."""
-    recording = _chosen(source.recording(name), choice, source.frequency)
-    check(recording)
-    check_alike(recording, first or recording)
-    return recording
-
-
-def _check_headers(source: Source, names: Sequence[str], choice: Choice) -> None:
-    """Refuse unusable demonstrations by their headers, before anything is written."""
-    first: Recording | None = None
+def _check_all(source: Source, names: tuple[str, ...], choice: Choice) -> None:
+    """Refuse the first demonstration that cannot be used beside the others; no lazy value is read."""
+    first: Demonstration | None = None
     try:
         for name in names:
-            recording = _usable(source, name, choice, first)
-            first = first or recording
+            demo = _usable(source, name, choice, first)
+            first = first or demo
     except DemonstrationsError as error:
-        raise _refused(source, names, choice, error) from None
+        raise _advised(error, source, names, choice) from None
 
 
-def _refused(source: Source, names: Sequence[str], choice: Choice, error: DemonstrationsError) -> DemonstrationsError:
+def _advised(error: DemonstrationsError, source: Source, names: tuple[str, ...], choice: Choice) -> DemonstrationsError:
     """The error, with the advice to leave demonstrations out where one of them can be used."""
     for name in names:
         with suppress(DemonstrationsError):
@@ -178,25 +158,55 @@ def _names(source: Source, choice: Choice) -> tuple[str, ...]:
     return tuple(name for name in source.names if name in members)
 
 
-def _chosen(recording: Recording, choice: Choice, frequency: float | None) -> Recording:
-    """A recording with the chosen observations, scaled, at the chosen rate."""
-    known = recording.observations
-    names = {column.named or key: key for key, column in known.items()}
-    keys = names | {key: key for key in known}
+def _labelled(source: Source, labels: Mapping[str, Mapping[str, np.ndarray]], name: str) -> Demonstration:
+    """A demonstration with the labels of a table, in place of those of the same name."""
+    demo = source.read(name)
+    stale = {f"{key}{end}" for key in labels for end in ("", BOUNDARY)}
+    given = {key: each.get(name, np.full(len(demo), UNKNOWN, np.int16)) for key, each in labels.items()}
+    kept = {key: values for key, values in demo.labels.items() if key not in stale}
+    return Demonstration.stored(name, demo.observations, demo.actions, {**kept, **given}, demo.attributes)
+
+
+def _unread(demo: Demonstration, chosen: Mapping[str, Observed]) -> Iterator[str]:
+    """A line for each observation that networks cannot read, and for each video that is not chosen."""
+    for key, array in demo.observations.items():
+        if why := network_input(array.shape[1:], array.dtype)[1]:
+            yield f"networks do not read obs/{key}: it {why}"
+        elif isinstance(array, LazyArray) and array.video and key not in chosen:
+            yield f"obs/{key} is a video, left out without --videos"
+
+
+def _chosen(source: Source, name: str, choice: Choice) -> Demonstration:
+    """A demonstration with the chosen observations, scaled, at the chosen rate."""
+    demo = source.read(name)
+    known = demo.observations
+    keys = {**dict.fromkeys(known), **{given: key for given, key in source.given.items() if key in known}}
     for key in choice.observations:
         if key not in keys:
             raise DemonstrationsError(
-                f"{recording.name}: there is no observation {key!r}{nearest(key, keys)}; there is: {', '.join(names)}"
+                f"{name}: there is no observation {key!r}{nearest(key, keys)}; there is: {', '.join(known)}"
             )
-    wanted = [keys[key] for key in choice.observations] or [
-        key for key, column in known.items() if column.dtype.kind in NUMBERS and (choice.videos or not column.video)
-    ]
+    videos = {key for key, array in known.items() if isinstance(array, LazyArray) and array.video}
+    usual = [key for key in known if known[key].dtype.kind in NUMBERS and (choice.videos or key not in videos)]
+    wanted = [keys[key] or key for key in choice.observations] or usual
     if not wanted:
-        why = "; ".join(_unread(recording, replace(recording, observations={}))) or "there is none"
-        raise DemonstrationsError(f"{recording.name}: has no observation that can be used: {why}")
-    observations = {key: _scaled(known[key], choice.image_size) for key in wanted}
-    recording = replace(recording, observations=observations)
-    return recording if choice.hz is None else _slower(recording, _frames(frequency, choice.hz))
+        why = "; ".join(_unread(demo, {})) or "there is none"
+        raise DemonstrationsError(f"{name}: has no observation that can be used: {why}")
+    observations = {key: known[key] for key in wanted}
+    actions: Observed = demo.actions
+    labels: Mapping[str, Observed] = demo.labels
+    if choice.image_size:
+        observations = {key: _scaled(array, choice.image_size) for key, array in observations.items()}
+    if choice.hz is not None:
+        frames = _frames(source.frequency, choice.hz)
+        actions = _slower(actions, frames)
+        observations = {key: _slower(array, frames) for key, array in observations.items()}
+        labels = {key: _slower(array, frames) for key, array in labels.items()}
+    return Demonstration.stored(name, observations, actions, labels, demo.attributes)
+
+
+NEARLY = 0.01
+"""How far the rate may be from a whole part of the source's."""
 
 
 def _frames(frequency: float | None, hz: float) -> int:
@@ -210,43 +220,24 @@ def _frames(frequency: float | None, hz: float) -> int:
     return frames
 
 
-NEARLY = 0.01
-"""How far the rate may be from a whole part of the source's."""
+def _slower(array: Observed, frames: int) -> Observed:
+    """Of each so many frames the mean, or the middle one of pictures and whole numbers."""
+    steps = len(array) // frames
+    if isinstance(array, LazyArray) and is_picture(array):
+
+        def read(start: int, stop: int) -> Iterator[np.ndarray]:
+            middle = frames // 2
+            for block in array.read(start * frames, stop * frames):
+                yield block[middle % frames :: frames]
+                middle -= len(block)
+
+        return replace(array, shape=(steps, *array.shape[1:]), read=read)
+    rows = np.asarray(array)[: steps * frames].reshape(steps, frames, *array.shape[1:])
+    return rows.mean(1, dtype=np.float64).astype(array.dtype) if array.dtype.kind == "f" else rows[:, frames // 2]
 
 
-def _slower(recording: Recording, frames: int) -> Recording:
-    def slower(column: Column) -> Column:
-        def reduced(rows: np.ndarray) -> np.ndarray:
-            steps = rows.reshape(-1, frames, *rows.shape[1:])
-            if rows.dtype.kind == "f":
-                return steps.mean(1, dtype=np.float64).astype(rows.dtype)
-            middle: np.ndarray = steps[:, frames // 2]
-            return middle
-
-        def blocks() -> Iterator[np.ndarray]:
-            left = np.empty((0, *column.shape[1:]), column.dtype)
-            for block in column.blocks():
-                rows = np.concatenate([left, block])
-                whole = len(rows) - len(rows) % frames
-                left = rows[whole:]
-                if whole:
-                    yield reduced(rows[:whole])
-
-        return replace(column, shape=(column.shape[0] // frames, *column.shape[1:]), blocks=blocks, kept=None)
-
-    def each(columns: Mapping[str, Column]) -> dict[str, Column]:
-        return {key: slower(column) for key, column in columns.items()}
-
-    actions, observations = slower(recording.actions), each(recording.observations)
-    return replace(recording, actions=actions, observations=observations, labels=each(recording.labels))
-
-
-def _scaled(column: Column, size: tuple[int, int] | None) -> Column:
-    if size is None or not column.image or column.shape[1:3] == size:
-        return column
-
-    def blocks() -> Iterator[np.ndarray]:
-        for block in column.blocks():
-            yield resized(block, size)
-
-    return Column((column.shape[0], *size, column.shape[3]), column.dtype, blocks, named=column.named)
+def _scaled(array: Observed, size: tuple[int, int]) -> Observed:
+    if not is_picture(array) or array.shape[1:3] == size:
+        return array
+    change = partial(resized, size=size)
+    return array.mapped((*size, array.shape[3]), change) if isinstance(array, LazyArray) else change(array)

@@ -12,20 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from ddco_pyro.data.checks import (
-    LARGEST,
-    NUMBERS,
-    check_division,
-    check_shape,
-    check_steps,
-    divided,
-    problem_of_controls,
-    problem_of_labels,
-    problems_of_masks,
-    reading,
-    rounding,
-    usable,
-)
+from ddco_pyro.data.arrays import LARGEST, NUMBERS, LazyArray, Observed, blocks, network_input, usable
+from ddco_pyro.data.coincidences import Copies, Jumps, Leaks
 from ddco_pyro.data.controls import (
     FEWEST,
     MOST_DIMENSIONS,
@@ -34,16 +22,20 @@ from ddco_pyro.data.controls import (
     control_parts,
     described,
     few,
-    listed,
     most_few,
     notes,
+    rounding,
     same,
 )
-from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError
-from ddco_pyro.data.pictures import blocks
-from ddco_pyro.data.sources import Column, Source, open_source
-from ddco_pyro.data.sources.recording import UNKNOWN, label_names
+from ddco_pyro.data.demonstration import Attribute, problem_of, unlike
+from ddco_pyro.data.division import check_division, problems_of_masks
+from ddco_pyro.data.errors import DemonstrationsError
+from ddco_pyro.data.labels import UNKNOWN, label_names
+from ddco_pyro.data.sources import Source, open_source
 from ddco_pyro.spec import ControlSpec
+
+WIDEST = 10_000
+"""Largest array, in numbers per step, of which a demonstration is read at once, and compared with controls."""
 
 
 @dataclass
@@ -91,7 +83,7 @@ class Field:
     @property
     def image(self) -> bool:
         """Whether a step is a picture, uint8 [H, W, C]."""
-        return reading(self.shape, self.dtype)[0] == "picture"
+        return network_input(self.shape, self.dtype)[0] == "picture"
 
     @property
     def numeric(self) -> bool:
@@ -101,9 +93,7 @@ class Field:
     @property
     def problem(self) -> str:
         """The problem with the shape or type, in words; empty without a problem."""
-        if self.place.startswith("obs/"):
-            return reading(self.shape, self.dtype)[1]
-        return (problem_of_controls if self.place == "actions" else problem_of_labels)(self.shape, self.dtype)
+        return problem_of(self.place, self.shape, self.dtype)
 
     @property
     def constant(self) -> list[int]:
@@ -112,7 +102,7 @@ class Field:
 
     @property
     def rounding(self) -> list[int]:
-        """Dimensions of an observation that vary by :func:`~ddco_pyro.data.checks.rounding` alone."""
+        """Dimensions of an observation that vary by :func:`~ddco_pyro.data.controls.rounding` alone."""
         if not self.place.startswith("obs/") or not self.numeric:
             return []
         spread = self.maximum.astype(np.float64) - self.minimum
@@ -268,72 +258,6 @@ def inspect(path: str | Path, form: str | None = None, exclude: Sequence[str] = 
         return _Inspector(source, tuple(exclude)).inspection(Path(path))
 
 
-@dataclass
-class _Turns:
-    """Jumps of single numbers of a vector by a turn, and of quaternions to their negative, from step to step.
-
-    :param jumps: for each turn, the number of steps [D] in which a number changes by nearly that much; ``between``
-        where it changes by a quarter of a turn or more.
-    :param unit: whether each four numbers [D - 3] have always been a unit quaternion; ``flips`` counts changes of sign.
-    :param names: of the demonstrations with any jump or flip.
-    """
-
-    jumps: np.ndarray
-    between: np.ndarray
-    unit: np.ndarray
-    flips: np.ndarray
-    names: list[str] = field(default_factory=list)
-    first: np.ndarray | None = None
-
-    @classmethod
-    def of(cls, size: int) -> _Turns:
-        """Of a vector of so many numbers, before any step."""
-        four = max(size - 3, 0)
-        empty = np.zeros((len(TURNS), size), int)
-        return cls(empty, empty.copy(), np.ones(four, dtype=bool), np.zeros(four, int))
-
-    def add(self, rows: np.ndarray, name: str) -> None:
-        """Add a demonstration [T, D]; it may begin with another sign than the first one."""
-        values = rows.astype(np.float64)
-        pairs = values if self.first is None else np.concatenate([self.first, values])
-        self.first = values[:1] if self.first is None else self.first
-        with np.errstate(invalid="ignore", over="ignore"):
-            if len(self.unit):
-                self.unit &= (np.abs(_fours(values * values) - 1) < UNIT).all(0)
-            changes = np.abs(np.diff(values, axis=0))
-            jumps = np.stack([(changes > NEARLY * turn).sum(0) for turn in TURNS.values()])
-            self.between += np.stack([(changes > turn / 4).sum(0) for turn in TURNS.values()]) - jumps
-            flips = (_fours(pairs[1:] * pairs[:-1]) < -NEARLY).sum(0) if len(self.unit) else self.flips * 0
-        self.jumps += jumps
-        self.flips += flips
-        if jumps.any() or (flips > 0)[self.unit].any():
-            self.names.append(name)
-
-    @property
-    def quaternions(self) -> list[int]:
-        """The first number of each unit quaternion that flips its sign."""
-        firsts: list[int] = []
-        for place in np.flatnonzero(self.unit & (self.flips > 0)).tolist():
-            firsts += [place] if not firsts or place >= firsts[-1] + 4 else []
-        return firsts
-
-    def angles(self, low: np.ndarray, high: np.ndarray) -> dict[str, list[int]]:
-        """Numbers within ``low`` and ``high`` [D] that jump by a turn and never by half of one, by the unit."""
-        taken = {first + place for first in self.quaternions for place in range(4)}
-        wrapping = {}
-        for (unit, turn), jumps, between in zip(TURNS.items(), self.jumps, self.between, strict=True):
-            spread = high.astype(np.float64) - low
-            wraps = (jumps > 0) & (10 * between <= jumps) & (spread >= NEARLY * turn) & (spread <= 1.02 * turn)
-            wrapping[unit] = [place for place in np.flatnonzero(wraps).tolist() if place not in taken]
-        return wrapping
-
-
-def _fours(products: np.ndarray) -> np.ndarray:
-    """Sums [T, D - 3] of each four neighbouring numbers [T, D]."""
-    sums: np.ndarray = np.lib.stride_tricks.sliding_window_view(products, 4, axis=1).sum(-1)
-    return sums
-
-
 class _Inspector:
     """One pass over all arrays of a source, which feeds every statistic."""
 
@@ -344,8 +268,8 @@ class _Inspector:
         self.attributes: dict[str, Mapping[str, Attribute]] = {}
         self.problems: dict[tuple[str, str], list[str]] = {}  # messages by kind and subject
         self.controls: dict[str, np.ndarray] = {}
-        self.coincidences = _Coincidences()
-        self.turns: dict[str, _Turns] = {}
+        self.copies, self.leaks = Copies(), Leaks()
+        self.jumps: dict[str, Jumps] = {}
 
     def inspection(self, path: Path) -> Inspection:
         """Read everything."""
@@ -359,7 +283,7 @@ class _Inspector:
             except DemonstrationsError as error:
                 self._problem("unreadable", str(error), re.sub(r"\d+", "", str(error).removeprefix(name)))
                 unreadable.append(name)
-                self.coincidences.digests.pop(name, None)
+                self.copies.digests.pop(name, None)
                 self.controls.pop(name, None)
         for name, there in places.items():
             for place in (place for place in fields if place not in there):
@@ -372,6 +296,11 @@ class _Inspector:
             messages[0] if len(messages) == 1 else f"{messages[0]}; the first of {len(messages)} such"
             for messages in self.problems.values()
         )
+        ends = {place: (fields[place].minimum, fields[place].maximum) for place in self.jumps}
+        turns = {
+            place: (tuple(jumps.angles(*ends[place])["2π"]), tuple(jumps.quaternions))
+            for place, jumps in self.jumps.items()
+        }
         return Inspection(
             path=path,
             format=source.format,
@@ -381,9 +310,13 @@ class _Inspector:
             frequency=source.frequency,
             problems=[*kinds, *_problems_of_division(source, names, masks), *_problems(fields, self.lengths)],
             control=dimensions,
-            coincidences=(*self.coincidences.notes(masks, varying), *self._jumps()),
-            turns={place: self._turning(place) for place in self.turns if any(self._turning(place))},
-            leaks=tuple(p for p, array in fields.items() if self.coincidences.leaks(p, varying, array.constant)),
+            coincidences=(
+                *self.copies.notes(masks),
+                *self.leaks.notes(varying, list(self.copies.digests)),
+                *(note for place, jumps in self.jumps.items() for note in jumps.notes(place, *ends[place])),
+            ),
+            turns={place: each for place, each in turns.items() if any(each)},
+            leaks=tuple(place for place, array in fields.items() if self.leaks.whole(place, varying, array.constant)),
             excluded=exclude,
             unreadable=tuple(unreadable),
             odd=self._odd(dimensions),
@@ -405,34 +338,11 @@ class _Inspector:
         if len(others) <= most_few(len(self.lengths)):
             reasons |= dict.fromkeys(others, "all commands are the same")
         for dimension in dimensions:
-            for name in () if dimension.values else dimension.strays:
+            for name in () if dimension.values else dimension.exceptions:
                 reasons.setdefault(
                     name, f"control dimension {dimension.number} has further values there, and is a switch elsewhere"
                 )
         return {name: reasons[name] for name in self.lengths if name in reasons}
-
-    def _turning(self, place: str) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """The angles in radians and the quaternions of an array that jump."""
-        array, turns = self.fields[place], self.turns[place]
-        return tuple(turns.angles(array.minimum, array.maximum)["2π"]), tuple(turns.quaternions)
-
-    def _jumps(self) -> Iterator[str]:
-        """A line for the angles of an array that jump by a turn, and for its quaternions that change their sign."""
-        for place, turns in self.turns.items():
-            where, seen = f"the first in {few(turns.names[:1])}", place != "actions"
-            for unit, numbers in turns.angles(self.fields[place].minimum, self.fields[place].maximum).items():
-                remedy = f"with angles: {numbers} beside its key networks read sine and cosine" if seen else "unwrap it"
-                if seen and unit != "2π":
-                    remedy = f"store radians; {remedy}"
-                if numbers:
-                    jump = f"jump{'s' * (len(numbers) == 1)} by {unit} as an angle"
-                    yield f"{place}: {listed(numbers)} {jump}, {where}: {remedy}"
-            if numbers := turns.quaternions:
-                remedy = f"with quaternions: {numbers} beside its key networks read products, the same for q and −q"
-                yield (
-                    f"{place}: {listed([first + part for first in numbers for part in range(4)])} change sign as a "
-                    f"quaternion, {where}: {remedy if seen else 'give all rotations one sign'}"
-                )
 
     def _name_labels(self) -> None:
         try:
@@ -442,53 +352,47 @@ class _Inspector:
         except DemonstrationsError as error:
             self._problem("names", str(error), "labels")
 
-    def _read(self, name: str) -> set[str]:
+    def _read(self, name: str) -> Collection[str]:
         """Read a demonstration; the places of its arrays."""
-        recording = self.source.recording(name)
-        steps = self.lengths[name] = recording.actions.shape[0] if recording.actions.shape else 0
-        self.attributes[name] = recording.attributes
-        self.coincidences.digests[name] = hashlib.sha256()
-        for place, column in recording.columns():
-            try:
-                check_steps(name, place, column, steps)
-                none, shape = np.zeros(0), tuple(column.shape[1:])
-                array = self.fields.setdefault(place, Field(place, shape, column.dtype, none, none))
-                check_shape(f"{name}: {place}", column, array.shape, "the first")
-            except DemonstrationsError as error:
-                self._problem("shape", str(error), place)
-            else:
-                array.demonstrations += 1
-                array.video = array.video or column.video
-                if not column.video and column.dtype.kind in NUMBERS:
-                    self._read_column(array, column, name)
-        return {place for place, _ in recording.columns()}
-
-    def _read_column(self, array: Field, column: Column, name: str) -> None:
-        """Feed an array to every statistic: in blocks, and whole if its steps are narrow."""
-        place, step = array.place, 0
-        whole = column.array() if place == "actions" or math.prod(array.shape) <= WIDEST else None
-        first = np.zeros((0, 0))
-        label, digest = place.startswith("labels/"), self.coincidences.digests[name]
-        if not label:
-            digest.update(place.encode())
-        for block in column.blocks() if whole is None else blocks(whole):
-            if not len(block):
+        demo = self.source.read(name)
+        self.lengths[name], self.attributes[name] = len(demo), demo.attributes
+        self.copies.digests[name] = hashlib.sha256()
+        arrays = demo.arrays()
+        for place, array in arrays.items():
+            field = self.fields.get(place) or Field(place, array.shape[1:], array.dtype, np.zeros(0), np.zeros(0))
+            if problem := unlike(array, len(demo), field.shape, "the first"):
+                self._problem("shape", f"{name}: {place} {problem}", place)
                 continue
+            self.fields[place] = field
+            field.demonstrations += 1
+            field.video = field.video or (isinstance(array, LazyArray) and array.video)
+            if not field.video and field.numeric:
+                self._read_array(field, array, name)
+        return arrays.keys()
+
+    def _read_array(self, field: Field, array: Observed, name: str) -> None:
+        """Feed an array to every statistic: in blocks, and whole if its steps are narrow."""
+        narrow = field.place == "actions" or math.prod(field.shape) <= WIDEST
+        array, step, first = np.asarray(array) if narrow else array, 0, np.zeros((0, 0))
+        label, digest = field.place.startswith("labels/"), self.copies.digests[name]
+        if not label:
+            digest.update(field.place.encode())
+        for block in blocks(array):
             values = block.reshape(len(block), -1)
             first = first if step else values[:1].copy()
             if not label:
                 digest.update(np.ascontiguousarray(values).tobytes())
-            array.add(values, name, step, first)
+            field.add(values, name, step, first)
             step += len(values)
-        if label or whole is None or not step:
+        if label or not step or not isinstance(array, np.ndarray):
             return
-        values = whole.reshape(len(whole), -1)
-        if place == "actions":
-            self.controls[name] = whole
-        elif not array.image and name in self.controls:
-            self.coincidences.compare(place, values, self.controls[name].reshape(len(self.controls[name]), -1))
-        if array.dtype.kind == "f" and values.shape[1] <= MOST_DIMENSIONS:
-            self.turns.setdefault(place, _Turns.of(values.shape[1])).add(values, name)
+        values = array.reshape(len(array), -1)
+        if field.place == "actions":
+            self.controls[name] = array
+        elif not field.image and name in self.controls:
+            self.leaks.add(field.place, values, self.controls[name].reshape(len(values), -1))
+        if field.dtype.kind == "f" and values.shape[1] <= MOST_DIMENSIONS:
+            self.jumps.setdefault(field.place, Jumps(values.shape[1])).add(values, name)
 
     def _problem(self, kind: str, message: str, about: str) -> None:
         self.problems.setdefault((kind, about), []).append(message)
@@ -518,105 +422,3 @@ def _problems(fields: Mapping[str, Field], lengths: Mapping[str, int]) -> Iterat
     empty = [name for name, steps in lengths.items() if steps == 0]
     if empty:
         yield f"{', '.join(empty[:3])}{' ...' if len(empty) > 3 else ''}: no steps"
-
-
-# --- coincidences -----------------------------------------------------------------------------------------------------
-
-LOOKED_AT = 1000
-"""Steps of each demonstration in which observations are compared with controls."""
-
-WIDEST = 10_000
-"""Largest array, in numbers per step, of which a demonstration is read at once, and compared with controls."""
-
-TURNS = {"2π": 2 * math.pi, "360": 360.0}
-"""A turn in radians and in degrees, and what it is called."""
-
-NEARLY = 0.85
-"""A change of an angle by this part of a turn is a jump by a turn."""
-
-UNIT = 0.02
-"""The squared length of a unit quaternion is within this distance of 1."""
-
-SHIFTS = {0: "at the same step", 1: "of the next step", -1: "of the step before"}
-"""Steps by which a control follows the observation that equals it."""
-
-
-class _Coincidences:
-    """Copied demonstrations, and controls among the observations."""
-
-    def __init__(self) -> None:
-        self.digests: dict[str, Any] = {}  # by demonstration, of all its arrays but labels
-        self._equal: dict[str, np.ndarray] = {}  # by place, for each shift, [D, A]: whether they are always equal
-        self._compared: dict[str, np.ndarray] = {}  # number of compared steps, for each shift
-
-    def compare(self, place: str, rows: np.ndarray, commands: np.ndarray) -> None:
-        """Update which numbers of an observation [T, D] equal controls [T, A] of the same or a neighbouring step."""
-        rows = rows[:LOOKED_AT]
-        commands = commands[: len(rows)]
-        floats = [array.dtype for array in (rows, commands) if array.dtype.kind == "f"]
-        coarser = min(floats, key=lambda dtype: dtype.itemsize, default=np.dtype(np.float64))
-        with np.errstate(over="ignore"):
-            rows, commands = rows.astype(coarser), commands.astype(coarser)
-        shape = (len(SHIFTS), rows.shape[1], commands.shape[1])
-        equal = self._equal.setdefault(place, np.ones(shape, dtype=bool))
-        compared = self._compared.setdefault(place, np.zeros(len(SHIFTS), dtype=int))
-        for at, shift in enumerate(SHIFTS):
-            observed = rows[max(-shift, 0) : max(len(rows) - max(shift, 0), 0)]
-            ahead = commands[max(shift, 0) :][: len(observed)]
-            compared[at] += len(observed)
-            for dimension in np.flatnonzero(equal[at].any(0)):
-                equal[at, :, dimension] &= (observed == ahead[:, [dimension]]).all(0)
-
-    def notes(self, masks: Mapping[str, Sequence[str]], varying: Sequence[int]) -> list[str]:
-        """A line for each kind of coincidence, with a count and the first place."""
-        return [*self._copies(masks), *self._observed(varying)]
-
-    def leaks(self, place: str, varying: Sequence[int], still: Sequence[int]) -> bool:
-        """Whether an observation holds nothing but controls that are still to be predicted.
-
-        :param still: the constant dimensions of the observation.
-        """
-        if place not in self._equal:
-            return False
-        copied = [self._controls(place, shift, varying)[0] for shift in (0, 1)]
-        rest = set(range(self._equal[place].shape[1])) - set(still)
-        return bool(rest) and rest <= {*copied[0], *copied[1]}
-
-    def _controls(self, place: str, shift: int, varying: Sequence[int]) -> tuple[list[int], list[int]]:
-        """The dimensions of an observation that equal controls ``shift`` steps later, and those control dimensions."""
-        at = list(SHIFTS).index(shift)
-        if not self._compared[place][at]:
-            return [], []
-        equal = self._equal[place][at][:, list(varying)]
-        observed, controls = np.flatnonzero(equal.any(1)).tolist(), np.flatnonzero(equal.any(0)).tolist()
-        return observed, [varying[column] for column in controls]
-
-    def _observed(self, varying: Sequence[int]) -> Iterator[str]:
-        for place in self._equal:
-            for shift, when in SHIFTS.items():
-                observed, controls = self._controls(place, shift, varying)
-                if observed:
-                    effect = "tend to repeat it" if shift < 0 else "see what they have to predict"
-                    yield (
-                        f"{place}: {listed(observed)} = control {listed(controls)} {when}, in all {len(self.digests)} "
-                        f"demonstrations, the first {next(iter(self.digests))}: policies {effect}"
-                    )
-
-    def _copies(self, masks: Mapping[str, Sequence[str]]) -> Iterator[str]:
-        known: dict[bytes, str] = {}
-        each = [(known.setdefault(digest.digest(), name), name) for name, digest in self.digests.items()]
-        pairs = [(first, again) for first, again in each if first != again]
-        effect = "one of two that are the same may be trained on and the other held out"
-        if masks.keys() & {"train", "valid"}:
-            try:
-                valid = set(divided(list(self.digests), masks)[1])
-            except DemonstrationsError:
-                return  # reported as a problem
-            pairs = [pair for pair in pairs if (pair[0] in valid) != (pair[1] in valid)]
-            effect = "one of them is trained on and the other held out"
-        if pairs:
-            first, again = pairs[0]
-            yield (
-                f"{len(pairs)} of {len(self.digests)} demonstrations equal another one, the first {again}, which "
-                f"equals {first}: {effect}"
-            )

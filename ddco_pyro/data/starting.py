@@ -11,11 +11,12 @@ from typing import Any, NamedTuple
 import jinja2
 import numpy as np
 
-from ddco_pyro.data.checks import FEW, LEAST, check_division, with_values
 from ddco_pyro.data.controls import all_constant
-from ddco_pyro.data.hdf5 import DemonstrationsError, natural, printable
+from ddco_pyro.data.division import FEW, LEAST, check_division, with_values
+from ddco_pyro.data.errors import DemonstrationsError, printable
+from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.inspection import Field, Inspection, inspect
-from ddco_pyro.data.sources.recording import BOUNDARY
+from ddco_pyro.data.labels import BOUNDARY
 from ddco_pyro.errors import command
 from ddco_pyro.spec import parse_spec
 from ddco_pyro.spec.yaml import read_yaml

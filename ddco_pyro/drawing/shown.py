@@ -7,8 +7,8 @@ from itertools import takewhile
 
 import numpy as np
 
+from ddco_pyro.data.arrays import PICTURE_DIMENSIONS, LazyArray, Observed, is_picture
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.data.pictures import PICTURE_DIMENSIONS, Observed
 from ddco_pyro.data.sources import Source
 from ddco_pyro.spec import PathSpec
 
@@ -177,19 +177,25 @@ def pictures(demos: Sequence[Demonstration]) -> list[Observed]:
 
 
 def stored_pictures(source: Source, lengths: Mapping[str, int]) -> list[Observed]:
-    """The first pictures of each recording, which are read when shown, observed by a fit or not.
+    """The first pictures of each demonstration, which are read when shown, observed by a fit or not.
 
-    :param lengths: steps of each recording by name.
-    :returns: pictures in this order; empty where a recording has none or has other steps.
+    :param lengths: steps of each demonstration by name.
+    :returns: pictures in this order; empty where a demonstration has none or has other steps.
     """
     if not set(lengths) <= set(source.names):
         return []
-    columns = (source.recording(name).observations.values() for name in lengths)
-    lazy = (
-        next((column.kept for column in each if column.image and len(column.kept or ()) == steps), None)
-        for each, steps in zip(columns, lengths.values(), strict=True)
+    first = (
+        next(
+            (array for array in source.read(name).observations.values() if _stored(array) and len(array) == steps), None
+        )
+        for name, steps in lengths.items()
     )
-    return _all_or_none(lazy, len(lengths))
+    return _all_or_none(first, len(lengths))
+
+
+def _stored(array: Observed) -> bool:
+    """Whether an array has pictures that are stored as they are shown."""
+    return isinstance(array, LazyArray) and is_picture(array) and bool(array.file)
 
 
 def _all_or_none(arrays: Iterable[Observed | None], count: int) -> list[Observed]:

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from ddco_pyro.data.arrays import Observed
 from ddco_pyro.data.demonstrations import Demonstration
-from ddco_pyro.data.pictures import Observed
 from ddco_pyro.drawing.shown import frames, jpeg, positions, projection
 from ddco_pyro.spec import PathSpec
 

@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
+from ddco_pyro.data.labels import BOUNDARY, UNKNOWN, label_names
 from ddco_pyro.data.sources import open_source
-from ddco_pyro.data.sources.recording import BOUNDARY, UNKNOWN, label_names
 from ddco_pyro.drawing.page import Table
 from ddco_pyro.drawing.words import duration, number
 from ddco_pyro.errors import BadInput
@@ -352,14 +352,13 @@ def compare_annotators(first: str | Path, second: str | Path, tolerance: int) ->
 def _read(path: str | Path) -> tuple[dict[str, dict[str, np.ndarray]], dict[str, list[str]]]:
     """The labels of each demonstration of a file, and the names of labels 0, 1, ...."""
     with open_source(path) as source:
-        columns = {demo: source.recording(demo).labels for demo in source.names}
         labels = {
             demo: {
-                name: column.array()
-                for name, column in own.items()
-                if not name.endswith(BOUNDARY) and column.dtype.kind in "iub"
+                name: values
+                for name, values in source.read(demo).labels.items()
+                if not name.endswith(BOUNDARY) and values.dtype.kind in "iub"
             }
-            for demo, own in columns.items()
+            for demo in source.names
         }
         return labels, label_names(source.attributes)
 

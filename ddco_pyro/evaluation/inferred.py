@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ddco_pyro.data.checks import check_fitted
+from ddco_pyro.data.demonstration import check_fitted
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, not_demonstrations
 from ddco_pyro.data.memory import INFERENCE
 from ddco_pyro.inference.paths import Path, most_likely_path, sample_paths
@@ -305,7 +305,7 @@ def _read(demonstrations: Iterable[Demonstration], hierarchy: Hierarchy) -> Iter
     for demo in demonstrations:
         if not isinstance(demo, Demonstration):
             raise not_demonstrations(demo)
-        check_fitted(demo.recording(), hierarchy.encoder.shapes, hierarchy.scaling.size)
+        check_fitted(demo, hierarchy.encoder.shapes, hierarchy.scaling.size)
         yield demo
 
 

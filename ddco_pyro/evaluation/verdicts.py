@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ddco_pyro.data.checks import FEW
+from ddco_pyro.data.division import FEW
 from ddco_pyro.drawing.words import (
     capital,
     duration,

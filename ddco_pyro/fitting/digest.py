@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from ddco_pyro.data.arrays import LazyArray, Observed, blocks
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
-from ddco_pyro.data.pictures import Observed, Pictures, blocks
 from ddco_pyro.errors import BadInput
 from ddco_pyro.metrics import Record, read_record
 
@@ -98,9 +98,9 @@ def _sha256(arrays: Iterable[Observed]) -> str:
 
 def _file(arrays: Sequence[Observed]) -> list[int] | None:
     """Size, time and inode of the file with all of these pictures; None without such a file."""
-    paths = {array.path if isinstance(array, Pictures) else None for array in arrays}
+    paths = {array.file if isinstance(array, LazyArray) else "" for array in arrays}
     path = paths.pop()
-    if paths or path is None:
+    if paths or not path:
         return None
     state = os.stat(path)
     return [state.st_size, state.st_mtime_ns, state.st_ino]

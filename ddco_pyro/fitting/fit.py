@@ -18,7 +18,7 @@ from ddco_pyro.data.controls import measure
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import leftovers
 from ddco_pyro.data.hdf5 import natural
-from ddco_pyro.data.sources.recording import label_names
+from ddco_pyro.data.labels import label_names
 from ddco_pyro.errors import path_of
 from ddco_pyro.events import OnEvent, ignore
 from ddco_pyro.fitting.digest import record, recorded
@@ -40,7 +40,7 @@ from ddco_pyro.jobs import BackendError, Workers, run_all
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec, load_spec, with_overrides
 from ddco_pyro.training.data import demonstrations as read_demonstrations
-from ddco_pyro.training.data import dimensions, known_demonstrations, parts, refuse_unfit, seen
+from ddco_pyro.training.data import dimensions, known_demonstrations, refuse_unfit, seen, train_and_valid
 from ddco_pyro.training.labels import used
 from ddco_pyro.training.networks import Dimensions, check_models, model_name, parameters
 from ddco_pyro.training.optimizers import optimizer_of
@@ -174,7 +174,7 @@ def _fit_model(
     :param short: whether baselines may go to other processes; several long restarts share those among themselves.
     :param name: of the model in events.
     """
-    split, size = parts(spec, demos), Dimensions.of(demos)
+    split, size = train_and_valid(spec, demos), Dimensions.of(demos)
     checkpoints = folder / "checkpoints" if folder else None
     specs = {name: its for name, (its, _) in baselines.items()}
 

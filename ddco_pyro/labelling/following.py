@@ -8,8 +8,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from ddco_pyro.data.arrays import Observed
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.data.pictures import Observed
 from ddco_pyro.data.sources import open_source
 from ddco_pyro.drawing.shown import frames, jpeg, paths_of, stored_pictures
 from ddco_pyro.drawing.timeline import following

@@ -12,8 +12,8 @@ from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.labels import label_names
 from ddco_pyro.data.sources import Source
-from ddco_pyro.data.sources.recording import label_names
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.agreement import agreement
 from ddco_pyro.evaluation.inferred import Inferred, runs

@@ -24,7 +24,7 @@ from ddco_pyro.model.batch import encode
 from ddco_pyro.selection.small import lasting, overrides
 from ddco_pyro.spec import Spec, with_overrides
 from ddco_pyro.training.checkpoint import TrainingData
-from ddco_pyro.training.data import parts
+from ddco_pyro.training.data import train_and_valid
 from ddco_pyro.training.labels import Labels
 from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.optimizers import optimizer_of
@@ -205,7 +205,7 @@ ALONE = {"compare_with": [], "demonstrations.leave_one_out": False}
 def _longer(trained: Fit, factor: float, on_event: OnEvent = ignore) -> Fit:
     """A run's model, fitted again so that segments are about so many times as long."""
     spec, demos = trained.spec, trained.demonstrations
-    train = parts(spec, demos)["train"]
+    train = train_and_valid(spec, demos)["train"]
     half = float(np.mean([len(demo) for demo in train])) / 2  # a whole demonstration is no skill
     steps = min(factor * segments_of(trained.segment(train)[0]).median, half)
     found = lasting(spec, demos, steps, on_event)

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from ddco_pyro.data.controls import ControlPart, number, same
+from ddco_pyro.data.controls import ControlPart, same
+from ddco_pyro.data.demonstration import number
 from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
 from ddco_pyro.model.emissions import KINDS, Emission, Product
 from ddco_pyro.spec import ControlSpec, LearnedStd

@@ -8,9 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ddco_pyro.data.checks import reading, rounding
+from ddco_pyro.data.arrays import PICTURE_DIMENSIONS, LazyArray, Observed, network_input
+from ddco_pyro.data.controls import rounding
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.data.pictures import PICTURE_DIMENSIONS, Observed, Pictures, Transform, TransformError
+from ddco_pyro.data.pictures import Transform, TransformError
 from ddco_pyro.model.networks import Inputs, InputShape, ShapeError
 from ddco_pyro.model.networks.inputs import Frames
 from ddco_pyro.spec import STEP, ObservationSpec
@@ -26,7 +27,7 @@ class ObservationEncoder(nn.Module):
     differences appended, standardised.
 
     Mean and standard deviation are those of the demonstrations given to :meth:`fit`, and are kept with the model. A
-    dimension that varies by rounding alone (:func:`~ddco_pyro.data.checks.rounding`) is only centred, and so are
+    dimension that varies by rounding alone (:func:`~ddco_pyro.data.controls.rounding`) is only centred, and so are
     differences whose dimension does so within each demonstration. What moves later moves in its own units, not in
     multiples of a rounding.
 
@@ -55,7 +56,7 @@ class ObservationEncoder(nn.Module):
         self.shapes = {spec.key: tuple(shapes[spec.key]) for spec in specs if spec.key != STEP}
         kinds = {}
         for spec in specs:
-            kinds[spec.key], why = reading(tuple(shapes[spec.key]))
+            kinds[spec.key], why = network_input(tuple(shapes[spec.key]))
             if why:
                 raise ShapeError(f"observations: {spec.key!r} {why}")
         self.specs = tuple(spec for spec in specs if kinds[spec.key] == "vector")
@@ -242,7 +243,7 @@ def _seen_shape(spec: ObservationSpec, shapes: Shapes) -> tuple[int, ...]:
 
 
 def _as_pictures(values: Observed) -> Observed:
-    return values if isinstance(values, Pictures) else np.asarray(values)
+    return values if isinstance(values, LazyArray) else np.asarray(values)
 
 
 def padded(sequences: Sequence[np.ndarray]) -> Tensor:

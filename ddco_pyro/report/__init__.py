@@ -5,9 +5,9 @@ from __future__ import annotations
 from datetime import datetime
 from pathlib import Path
 
+from ddco_pyro.data.arrays import Observed
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
-from ddco_pyro.data.pictures import Observed
 from ddco_pyro.data.sources import open_source
 from ddco_pyro.drawing import words
 from ddco_pyro.drawing.figures import style

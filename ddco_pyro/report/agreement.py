@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.data.sources.recording import label_names
+from ddco_pyro.data.labels import label_names
 from ddco_pyro.drawing.page import Block, Section, Table, Text, footnote, note
 from ddco_pyro.drawing.words import capital, number, percent
 from ddco_pyro.evaluation.agreement import EXPLAINED, agreement_table, tolerances

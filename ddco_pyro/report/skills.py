@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ddco_pyro.data.arrays import Observed
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.data.pictures import Observed
 from ddco_pyro.drawing.colours import option_colour, option_rgb
 from ddco_pyro.drawing.diagrams import curves, transition_graph, typical_paths
 from ddco_pyro.drawing.figures import data_uri

@@ -16,7 +16,7 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection
 from torch import Tensor
 
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.data.sources.recording import label_names
+from ddco_pyro.data.labels import label_names
 from ddco_pyro.drawing.colours import add_legend, option_colour
 from ddco_pyro.drawing.figures import FAINT, INK, blank, save
 from ddco_pyro.drawing.page import Picture

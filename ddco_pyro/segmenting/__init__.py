@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ddco_pyro.data.checks import check_fitted
+from ddco_pyro.data.demonstration import check_fitted, needed
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.data.hdf5 import DemonstrationsError
-from ddco_pyro.data.memory import INFERENCE, needed, refuse_too_much
-from ddco_pyro.data.sources import Recording, Source, open_source
-from ddco_pyro.data.sources.recording import label_names
+from ddco_pyro.data.errors import DemonstrationsError
+from ddco_pyro.data.labels import label_names
+from ddco_pyro.data.memory import INFERENCE, refuse_too_much
+from ddco_pyro.data.sources import Source, open_source
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.evaluation.agreement import agreement as scores_of  # a module here has that name
 from ddco_pyro.evaluation.agreement import of_equal_lengths
@@ -24,7 +24,7 @@ from ddco_pyro.events import BaselineSegmented, DemonstrationsDone, OnEvent, ign
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Scores
 from ddco_pyro.segmenting import baselines
-from ddco_pyro.training.data import parts
+from ddco_pyro.training.data import train_and_valid
 
 __all__ = [
     "LevelLabels",
@@ -209,7 +209,7 @@ def beside_baselines(
     :param gripper: the control dimension whose changes divide demonstrations in the baseline ``gripper``.
     :raises BadInput: there is no such control dimension, or a package is not installed.
     """
-    train = parts(fit.spec, fit.demonstrations)["train"]
+    train = train_and_valid(fit.spec, fit.demonstrations)["train"]
     demos = Demonstrations(tuple(recorded(segmented, fit, source)))
     found, total = {}, len(segmented.counts) * len(baselines.BASELINES)
     for level, count in segmented.counts.items():
@@ -232,7 +232,7 @@ def beside_baselines(
 
 def recorded(segmented: Segmented, fit: Fit, source: Source) -> Iterator[Demonstration]:
     """The demonstrations of these segments in order, with the observations of the run's networks."""
-    return (_demonstration(source.recording(demo.name), fit) for demo in segmented.segments)
+    return (_demonstration(source.read(demo.name), fit) for demo in segmented.segments)
 
 
 def chosen_names(source: Source, fit: Fit) -> list[str]:
@@ -249,41 +249,37 @@ FOUND = 40
 def _demonstrations(
     source: Source, names: Sequence[str], fit: Fit, labels: dict[str, dict[str, np.ndarray]]
 ) -> Iterator[Demonstration]:
-    """Each recording as the run's networks observe it. Ground-truth labels go into ``labels``.
+    """Each demonstration as the run's networks observe it. Ground-truth labels go into ``labels``.
 
-    :raises DemonstrationsError: a recording cannot be used, or needs more memory than is allowed.
+    :raises DemonstrationsError: a demonstration cannot be used, or needs more memory than is allowed.
     """
     before = 0  # steps whose labels are in memory
     for name in names:
-        recording = source.recording(name)
-        _refuse_too_long(recording, fit, before)
+        found = source.read(name)
+        _refuse_too_long(found, fit, before)
         labels[name] = {
-            key: column.array()
-            for key, column in recording.labels.items()
-            if column.dtype.kind in "iub" and len(column.shape) == 1
+            key: values for key, values in found.labels.items() if values.dtype.kind in "iub" and values.ndim == 1
         }
-        demo = _demonstration(recording, fit)
+        demo = _demonstration(found, fit)
         before += len(demo)
         yield demo
 
 
-def _refuse_too_long(recording: Recording, fit: Fit, before: int) -> None:
-    known = recording.observations
-    seen = {f"obs/{key}": known[key] for key in fit.hierarchy.encoder.shapes if key in known}
-    steps = recording.actions.shape[0]
-    inferred = INFERENCE * steps + FOUND * fit.hierarchy.depth * (before + steps)
-    whole = needed([{"actions": recording.actions, **seen}]) + inferred
-    refuse_too_much(whole, f"{recording.name}: segmenting its {steps} steps", "divide it, or the file")
+def _refuse_too_long(demo: Demonstration, fit: Fit, before: int) -> None:
+    seen = {key: array for key, array in demo.observations.items() if key in fit.hierarchy.encoder.shapes}
+    inferred = INFERENCE * len(demo) + FOUND * fit.hierarchy.depth * (before + len(demo))
+    whole = needed([Demonstration.stored(demo.name, seen, demo.actions)]) + inferred
+    refuse_too_much(whole, f"{demo.name}: segmenting its {len(demo)} steps", "divide it, or the file")
 
 
-def _demonstration(recording: Recording, fit: Fit) -> Demonstration:
-    """A recording with the observations of the run's networks.
+def _demonstration(found: Demonstration, fit: Fit) -> Demonstration:
+    """A demonstration of a source with the observations of the run's networks.
 
     :raises DemonstrationsError: an observation is missing, or it or the control has another shape than in the fit.
     """
-    shapes, known = fit.hierarchy.encoder.shapes, recording.observations
-    check_fitted(recording, shapes, fit.hierarchy.scaling.size)
-    return Demonstration(recording.name, {key: known[key].observed() for key in shapes}, recording.actions.array())
+    shapes = fit.hierarchy.encoder.shapes
+    check_fitted(found, shapes, fit.hierarchy.scaling.size)
+    return Demonstration(found.name, {key: found.observations[key] for key in shapes}, found.actions)
 
 
 def of_piece(

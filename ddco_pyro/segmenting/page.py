@@ -11,10 +11,10 @@ from urllib.parse import quote
 
 import numpy as np
 
+from ddco_pyro.data.arrays import Observed
 from ddco_pyro.data.demonstrations import Demonstration
 from ddco_pyro.data.files import write_text
-from ddco_pyro.data.pictures import Observed
-from ddco_pyro.data.sources.recording import BOUNDARY
+from ddco_pyro.data.labels import BOUNDARY
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.drawing.page import Block, Cell, Page, Section, Table, Text, footnote, note
 from ddco_pyro.drawing.timeline import Lane, Runs, Timelines, Track, following

@@ -21,7 +21,7 @@ from ddco_pyro.events import EpochEnded, Event, LengthTried, OnEvent, ignore
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.metrics import Segments
 from ddco_pyro.spec import Spec, with_overrides
-from ddco_pyro.training.data import parts
+from ddco_pyro.training.data import train_and_valid
 
 FIRST, LEAST = 0.5, 0.005
 """The largest and the smallest power that are tried."""
@@ -116,7 +116,7 @@ def lasting(spec: Spec, demos: Demonstrations, steps: float | None, on_event: On
     """
     if spec.hierarchy is None or not spec.hierarchy.levels[0].lasts:
         raise BadInput("lengths of segments are of a spec whose lowest level has options that last")
-    some, sketch = _some(parts(spec, demos)["train"]), _sketch(spec)
+    some, sketch = _some(train_and_valid(spec, demos)["train"]), _sketch(spec)
 
     second = demos.frequency or STEPS_A_SECOND
     windows = [max(1, round(second / part)) for part in PARTS]
@@ -161,7 +161,7 @@ def heavy_tails(spec: Spec, demos: Demonstrations) -> tuple[int, ...]:
 
     Small fits to every other one of some training demonstrations predict the controls of the rest.
     """
-    some = _some(parts(spec, demos)["train"])
+    some = _some(train_and_valid(spec, demos)["train"])
     if len(some) < FEWEST:
         return ()
     train, rest = (Demonstrations(tuple(some[place] for place in range(first, len(some), 2))) for first in (0, 1))

@@ -9,10 +9,11 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ddco_pyro.data.demonstration import Attribute
 from ddco_pyro.data.demonstrations import DemonstrationsError
 from ddco_pyro.data.files import only_one
-from ddco_pyro.data.hdf5 import Attribute, attributes_of, opened
-from ddco_pyro.data.sources.robomimic import robomimic_file, write_recording
+from ddco_pyro.data.hdf5 import attributes_of, opened
+from ddco_pyro.data.sources.robomimic import robomimic_file, write_demonstration
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
 from ddco_pyro.simulation.episodes import run_episodes, summarize
@@ -97,7 +98,7 @@ def _record(
     with robomimic_file(path, attributes, {}) as data:
         for first in range(0, len(seeds), at_once):
             for episode in run_episodes(task_name, spec.supervisor, seeds[first : first + at_once], observed=observed):
-                write_recording(data, episode.record.recording())
+                write_demonstration(data, episode.record)
                 on_event(DemonstrationsDone(len(data), spec.count))
         attributes["supervisor"] = json.dumps(_summary(task, [attributes_of(group) for group in data.values()]))
 

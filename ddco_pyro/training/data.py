@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from ddco_pyro.data.checks import check, check_trained, reading, with_values
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError, bytes_of_a_fit
+from ddco_pyro.data.arrays import is_picture, network_input
+from ddco_pyro.data.demonstration import Demonstration, check
+from ddco_pyro.data.demonstrations import Demonstrations, bytes_of_a_fit, stored
+from ddco_pyro.data.division import check_trained, with_values
+from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.memory import refuse_too_much
-from ddco_pyro.data.sources.recording import Recording
-from ddco_pyro.data.sources.robomimic import open_robomimic
 from ddco_pyro.errors import nearest
 from ddco_pyro.events import OnEvent, ignore
 from ddco_pyro.simulation.collect import cache_path, collect
@@ -50,7 +50,7 @@ def dimensions(spec: Spec, demos: Demonstrations | None = None) -> Dimensions:
     return replace(size, constant=collected.constant, control=collected.control)
 
 
-def parts(spec: Spec, demos: Demonstrations) -> dict[str, Demonstrations]:
+def train_and_valid(spec: Spec, demos: Demonstrations) -> dict[str, Demonstrations]:
     """The demonstrations to train with, ``train``, and the held-out ones, ``valid``, where there are any.
 
     :raises DemonstrationsError: one part is empty, masks overlap, or masks hold out what ``leave_one_out`` trains with.
@@ -89,12 +89,11 @@ def refuse_unfit(spec: Spec, demos: Demonstrations) -> None:
     """
     for key in spec.observed:
         observed = demos[0].observations[key]
-        _, why = reading(observed.shape[1:], observed.dtype)
-        if why:
+        if why := network_input(observed.shape[1:], observed.dtype)[1]:
             raise DemonstrationsError(f"obs/{key} {why}")
     training = spec.training
     if training.tune_fraction > 0 or training.optimizer.name != "em" or spec.compare_with:  # or one is enough
-        check_trained(parts(spec, demos)["train"].names)
+        check_trained(train_and_valid(spec, demos)["train"].names)
 
 
 def in_file(spec: Spec) -> bool:
@@ -130,20 +129,21 @@ def outline(spec: Spec) -> Demonstrations:
     path = spec.demonstrations.file
     assert path is not None  # the demonstrations are in a file
     _refuse_what_cannot_be_read(spec, path)
-    controls = Demonstrations.read(path, (), _labels(spec), spec.demonstrations.exclude)
-    with open_robomimic(path) as source:
-        outlined = (_outlined(source.recording(demo.name, spec.observed, ()), demo) for demo in controls)
-        return _set_apart(spec, replace(controls, demonstrations=tuple(outlined)))
+    exclude = spec.demonstrations.exclude
+    controls = Demonstrations.read(path, (), _labels(spec), exclude)
+    with stored(path, spec.observed, (), exclude) as (found, *_):
+        outlined = [_outlined(demo, of) for demo, of in zip(controls, found, strict=True)]
+    return _set_apart(spec, replace(controls, demonstrations=tuple(outlined)))
 
 
-def _outlined(recording: Recording, demo: Demonstration) -> Demonstration:
-    check(recording)
-    kinds = {key: np.uint8 if column.image else np.float64 for key, column in recording.observations.items()}
-    shapes = {key: column.shape for key, column in recording.observations.items()}
-    outlined = copy(demo)  # zeros are not looked at, and need no memory
-    zeros = {key: np.broadcast_to(np.zeros((), kinds[key]), shape) for key, shape in shapes.items()}
-    object.__setattr__(outlined, "observations", zeros)
-    return outlined
+def _outlined(demo: Demonstration, found: Demonstration) -> Demonstration:
+    """A demonstration with zeros, which need no memory, in place of observations as they are found."""
+    check(found)
+    zeros = {
+        key: np.broadcast_to(np.zeros((), np.uint8 if is_picture(array) else np.float64), array.shape)
+        for key, array in found.observations.items()
+    }
+    return Demonstration.stored(**{**vars(demo), "observations": zeros})
 
 
 def seen(spec: Spec, demos: Demonstrations) -> Demonstrations:

@@ -12,7 +12,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.spec import Spec, SpecError
-from ddco_pyro.training.data import parts, tuning_split
+from ddco_pyro.training.data import train_and_valid, tuning_split
 from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.stages import Stage
 
@@ -77,7 +77,7 @@ def used(spec: Spec, demos: Demonstrations) -> Labels | None:
     """
     if spec.training.labels is None:
         return None
-    return Labels.of(spec, *tuning_split(spec, Dimensions.of(demos), parts(spec, demos)["train"]))
+    return Labels.of(spec, *tuning_split(spec, Dimensions.of(demos), train_and_valid(spec, demos)["train"]))
 
 
 def _distinct(labels: Iterable[np.ndarray]) -> tuple[int, ...]:

@@ -15,7 +15,7 @@ from sklearn.metrics import normalized_mutual_info_score
 import ddco_pyro
 from ddco_pyro.data.planted import PHASES, pick_and_place
 from ddco_pyro.spec import load_spec
-from ddco_pyro.training.data import parts
+from ddco_pyro.training.data import train_and_valid
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +117,7 @@ def test_the_skills_are_found_and_named(tmp_path: Path) -> None:
     ended = call("new", tmp_path / "mine.hdf5", "--out", tmp_path / "out")
     assert ended.status == 0, ended.err
     fit = ddco_pyro.load(tmp_path / "out" / "run")
-    held_out = parts(fit.spec, fit.demonstrations)["valid"]
+    held_out = train_and_valid(fit.spec, fit.demonstrations)["valid"]
     (segments,) = fit.segment(held_out)
     phases = np.concatenate([demo.labels["phase"] for demo in held_out])
     assert normalized_mutual_info_score(phases, np.concatenate(segments)) > 0.8

@@ -24,14 +24,14 @@ from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.report import write_report
 from ddco_pyro.spec import with_overrides
-from ddco_pyro.training.data import demonstrations, parts
+from ddco_pyro.training.data import demonstrations, train_and_valid
 
 SHORT = {"training.epochs": 1, "compare_with": []}
 
 
 @pytest.fixture(scope="module")
 def held_out(toy_spec, cache):
-    return parts(toy_spec, demonstrations(toy_spec))["valid"]
+    return train_and_valid(toy_spec, demonstrations(toy_spec))["valid"]
 
 
 @pytest.fixture(scope="module")
@@ -152,7 +152,7 @@ def test_the_list_leads_to_the_segments_in_the_report(toy_run, toy_spec, tmp_pat
 def test_demonstrations_may_be_held_out_in_another_order(folders, toy_spec, other, tmp_path):
     """A run that reads the same demonstrations from a file of its own, turned round, with masks."""
     demos = demonstrations(toy_spec)
-    split = parts(toy_spec, demos)
+    split = train_and_valid(toy_spec, demos)
     masks = {name: tuple(reversed(part.names)) for name, part in split.items()}
     Demonstrations(demos.demonstrations[::-1], masks).write(tmp_path / "own.hdf5")
     turned = other("turned", demonstrations__path=str(tmp_path / "own.hdf5"))

@@ -15,11 +15,10 @@ from hypothesis import strategies as st
 from odd_files.kinds import NUMBER, ROWS, arrays
 
 import ddco_pyro
-from ddco_pyro.data.checks import reading
+from ddco_pyro.data.arrays import network_input, turned
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
 from ddco_pyro.data.importing import import_demonstrations
 from ddco_pyro.data.inspection import inspect
-from ddco_pyro.data.pictures import turned
 from ddco_pyro.errors import BadInput
 
 
@@ -143,7 +142,7 @@ def test_networks_read_an_observation_or_every_command_says_why_not(
                 if not (alone and place == "obs/pose"):
                     file[f"data/demo_{n}/{place}"] = values
     seen = turned(made[0]["obs/odd"])
-    kind, why = reading(seen.shape[1:], seen.dtype)
+    kind, why = network_input(seen.shape[1:], seen.dtype)
     assert (kind == "") == (why != "")
     assert kind in ("", "vector" if len(seen.shape) < 4 else "picture")
     keys = ["odd"] if alone else ["pose", "odd"]

@@ -35,7 +35,7 @@ def demonstrations(controls: np.ndarray, cuts: list[int]) -> dict[str, np.ndarra
 @pytest.mark.parametrize("cuts", [[], [99], [60, 60, 150]])
 def test_each_dimension_is_described(cuts: list[int]) -> None:
     found = control_dimensions(demonstrations(controls(), cuts))
-    free, still, switch, seldom, twice, both = (replace(each, made_by={}, strays=()) for each in found)
+    free, still, switch, seldom, twice, both = (replace(each, made_by={}, exceptions=()) for each in found)
     assert (free.constant, free.values, free.extremes, free.note) == (False, (), (), "")
     assert (still.constant, still.values) == (True, (0.3,))
     assert (switch.constant, switch.values, switch.extremes) == (False, (0.0, 1.0), ())
@@ -196,5 +196,5 @@ def test_a_demonstration_without_which_a_dimension_would_be_a_switch_or_constant
     made = {f"demo_{n}": np.resize(others, 30)[:, None] for n in range(10)}
     made["demo_4"] = np.resize(odd, 30)[:, None]
     (found,) = control_dimensions(made)
-    assert found.strays == (("demo_4",) if named else ())
+    assert found.exceptions == (("demo_4",) if named else ())
     assert ("a switch without demo_4" in found.note) == (named and len({*others, *odd}) == 3)

@@ -15,7 +15,7 @@ from hypothesis.extra import numpy as hnp
 from odd_files.hdf5 import instead, spoil
 from random_demonstrations import demonstration, demonstrations
 
-from ddco_pyro.data.checks import LARGEST
+from ddco_pyro.data.arrays import LARGEST
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
 
 METAWORLD = Path(__file__).parents[3] / "shared" / "data" / "metaworld_pick_place.hdf5"
@@ -197,7 +197,7 @@ NAN = np.array([[0.0, 1.0], [2.0, np.nan], [0.0, 0.0], [0.0, 0.0]])
 REFUSED: list[tuple[str, Change, str]] = [
     ("no data", remove("data"), "data is missing; there is: mask"),
     ("data is an array", replace("data", [1]), "data has to be a group, not a dataset"),
-    ("no demonstrations", lambda file: file["data"].clear(), "the group 'data' holds no demonstrations"),
+    ("no demonstrations", lambda file: file["data"].clear(), "holds no demonstrations; at least one is needed"),
     ("no actions", remove("data/demo_1/actions"), "demo_1: actions is missing; there is: labels/phase, obs/camera"),
     ("group for actions", group_for_actions, "demo_1: actions has to be a dataset, not a group"),
     ("no obs", remove("data/demo_1/obs"), "demo_1: obs is missing; there is: actions, labels"),
@@ -209,7 +209,7 @@ REFUSED: list[tuple[str, Change, str]] = [
     ("num_samples", count_wrongly, "demo_1: actions has 4 steps, but num_samples is 7"),
     ("NaN", replace("data/demo_1/actions", NAN), "demo_1: actions is nan at step 1, index [1]; repair it"),
     ("infinite", replace("data/demo_1/obs/pose", np.full((4, 3), -np.inf)), "demo_1: obs/pose is -inf at step 0"),
-    ("text", replace("data/demo_1/actions", [["a"]] * 4), "demo_1: actions holds object, it has to hold real numbers"),
+    ("text", replace("data/demo_1/actions", [["a"]] * 4), "demo_1: actions holds text, not numbers"),
     ("complex", replace("data/demo_1/actions", np.ones((4, 2), complex)), "demo_1: actions holds complex128"),
     ("other obs shape", replace("data/demo_1/obs/pose", np.ones((4, 2))), "demo_1: obs/pose has shape"),
     ("other actions shape", replace("data/demo_1/actions", np.ones((4, 3))), "demo_1: actions has shape"),

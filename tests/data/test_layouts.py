@@ -13,7 +13,7 @@ from odd_files import layouts as odd
 from odd_files.hdf5 import instead
 
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.data.hdf5 import DemonstrationsError
+from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.importing import import_demonstrations
 from ddco_pyro.data.inspection import inspect
 from ddco_pyro.errors import command

@@ -12,7 +12,7 @@ from odd_files import lerobot as odd
 from odd_files import snapshot
 
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.data.hdf5 import DemonstrationsError
+from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.importing import Choice, import_demonstrations
 from ddco_pyro.data.inspection import inspect
 from ddco_pyro.fitting.fit import fit

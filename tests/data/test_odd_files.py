@@ -15,6 +15,7 @@ from odd_files import Row, lerobot, rows, snapshot
 
 MEMORY = 500 * 10**6
 ROWS = rows()
+TESTED = {*lerobot.PATHS, *lerobot.EPISODES_NOT_WHOLE}
 PROGRESS = re.compile(r"\w+: \d+/\d+|note: ")
 
 
@@ -62,21 +63,10 @@ def warm(toy_run, tmp_path_factory) -> Path:
 
 ELSEWHERE = ("atoms", "kinds", "layouts", "places")
 """Tables whose rows have tests of their own, beside the reader that they are about."""
-UNTRUSTED = {f"lerobot: {name}" for name in (*lerobot.PATHS, *lerobot.EPISODES_NOT_WHOLE)}
-ALIKE = {
-    "hdf5: external link to a demonstration", "hdf5: dangling link", "hdf5: chunks", "hdf5: 16 bits",
-    "lerobot: lerobot uncounted episode", "lerobot: lerobot uncounted frames", "lerobot: lerobot episode twice",
-    "lerobot: lerobot key twice", "lerobot: lerobot key below another",
-}  # fmt: skip
-"""Rows beside which another one is read in the same way."""
 
 
 @pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=pytest.mark.slow) if name.startswith(ELSEWHERE) or name in UNTRUSTED | ALIKE else name
-        for name in ROWS
-    ],
+    "name", [name for name in ROWS if not name.startswith(ELSEWHERE) and name.removeprefix("lerobot: ") not in TESTED]
 )
 @pytest.mark.usefixtures("undecided")  # but once, in ``warm``
 def test_an_odd_file(name: str, tmp_path: Path, warm: Path) -> None:

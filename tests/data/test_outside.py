@@ -16,10 +16,10 @@ from odd_files.hdf5 import ROWS, last_not_whole
 
 from ddco_pyro.data import memory
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.data.hdf5 import DemonstrationsError
+from ddco_pyro.data.errors import DemonstrationsError
 
 
-@pytest.mark.parametrize("kind", ["external storage", "virtual", "external link to a demonstration", "soft link"])
+@pytest.mark.parametrize("kind", ["external storage", "virtual", "external link to a demonstration"])
 def test_parts_elsewhere_are_refused(kind: str, tmp_path: Path, toy_run) -> None:
     odd = ROWS[kind]
     path = odd.make(tmp_path)

@@ -18,8 +18,9 @@ from odd_files.hdf5 import spoil
 
 import ddco_pyro
 from ddco_pyro.acting.controller import ObservationError, Window
+from ddco_pyro.data.arrays import LazyArray
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
-from ddco_pyro.data.pictures import Pictures, Transform, shift_into
+from ddco_pyro.data.pictures import Transform, shift_into
 from ddco_pyro.fitting.digest import digest
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.encoder import ObservationEncoder
@@ -76,7 +77,7 @@ def test_pictures_of_a_file_are_read_when_asked_for(kept: Path) -> None:
     read, made = Demonstrations.read(kept), demonstrations()
     for demo, original in zip(read, made, strict=True):
         pictures = demo.observations["camera"]
-        assert isinstance(pictures, Pictures)
+        assert isinstance(pictures, LazyArray)
         assert isinstance(demo.observations["pose"], np.ndarray)
         np.testing.assert_array_equal(pictures[3:6], original.observations["camera"][3:6])
         np.testing.assert_array_equal(pictures[-1], original.observations["camera"][-1])
@@ -187,7 +188,7 @@ def test_a_streamed_fit_is_that_in_memory(kept: Path, chunks: bool, monkeypatch:
         step_bytes = build_hierarchy(spec, Dimensions.of(demonstrations())).step_bytes
         monkeypatch.setattr("ddco_pyro.model.hierarchy.BYTES_AT_ONCE", 17 * step_bytes)
     streamed, whole = ddco_pyro.fit(spec), ddco_pyro.fit(spec, demonstrations())
-    assert isinstance(streamed.demonstrations[0].observations["camera"], Pictures)
+    assert isinstance(streamed.demonstrations[0].observations["camera"], LazyArray)
     assert bits(streamed) == bits(whole)
     numbers = [fit.metrics.model_dump(exclude={"seconds"}) for fit in (streamed, whole)]
     assert numbers[0] == numbers[1]

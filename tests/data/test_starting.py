@@ -13,7 +13,7 @@ import pytest
 import yaml
 from command_line import call
 from gripper import planted
-from odd_files.kinds import ROWS, drawn
+from odd_files.kinds import ROWS
 from random_demonstrations import demonstration, demonstrations, numbered
 from scipy import stats
 
@@ -24,7 +24,7 @@ from ddco_pyro.data.starting import starting_spec
 from ddco_pyro.report.likelihood import stds
 from ddco_pyro.spec import Spec, load_spec, with_overrides
 from ddco_pyro.training.data import demonstrations as read_demonstrations
-from ddco_pyro.training.data import outline, parts, seen
+from ddco_pyro.training.data import outline, seen, train_and_valid
 
 
 @pytest.fixture
@@ -342,7 +342,7 @@ def test_no_operator_is_on_both_sides(operators: str, held_out: set[int], path: 
     )
     spec = load_spec(tmp_path / "0.yaml")
     for demos in (read_demonstrations(spec), outline(spec), seen(spec, Demonstrations.read(path))):
-        train, valid = ([one.attributes["operator"] for one in part] for part in parts(spec, demos).values())
+        train, valid = ([one.attributes["operator"] for one in part] for part in train_and_valid(spec, demos).values())
         assert {*train} | {*valid} == {*operators}
         assert not {*train} & {*valid}
         assert (", ".join(sorted({*valid})), str(len(valid))) == said.groups()
@@ -412,20 +412,3 @@ def test_what_init_accepts_check_accepts(name: str, tmp_path: Path) -> None:
         assert re.search(says, said) or found.problems or found.leaks or all(d.constant for d in found.control)
     elif name in FITTED:
         fit(spec)
-
-
-@pytest.mark.parametrize("seed", [*range(12), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(12, 72))])
-@pytest.mark.usefixtures("undecided")
-def test_of_generated_files_too(seed: int, tmp_path: Path) -> None:
-    """What ``check`` accepts is fitted, in the slow ones."""
-    spec = started(drawn(tmp_path / "demos.hdf5", seed))
-    if spec and seed >= 12:
-        fit(spec)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name, row in ROWS.items() if row.says is None])
-def test_every_row_is_fitted(name: str, tmp_path: Path) -> None:
-    spec = started(ROWS[name].make(tmp_path))
-    assert spec is not None
-    fit(spec)

@@ -14,7 +14,7 @@ from ddco_pyro.evaluation import verdicts
 from ddco_pyro.metrics import Metrics
 from ddco_pyro.report import write_report
 from ddco_pyro.spec import parse_spec
-from ddco_pyro.training.data import parts
+from ddco_pyro.training.data import train_and_valid
 
 POLICY = {"network": "mlp", "hidden": [4]}
 
@@ -54,7 +54,7 @@ def test_a_baseline_of_the_models_own_kind_has_numbers_of_its_own(tmp_path):
     spec = make_spec(0.4, baseline={"kind": "flat", "policy": POLICY}, compare_with=[linear, linear])
     demos = demonstrations(10)
     run = ddco_pyro.fit(spec, demos, out=tmp_path / "run")
-    valid = parts(spec, demos)["valid"]
+    valid = train_and_valid(spec, demos)["valid"]
     steps = sum(valid.lengths)
     ours = run.log_likelihood(valid)
     assert list(run.metrics.comparison) == list(run.baselines) == ["flat_2", "flat_3"]

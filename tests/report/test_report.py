@@ -27,7 +27,7 @@ from ddco_pyro.simulation.episodes import Episode, summarize
 from ddco_pyro.simulation.film import write_film
 from ddco_pyro.spec import TrainingSpec, parse_spec
 from ddco_pyro.statistics import paired_difference
-from ddco_pyro.training.data import demonstrations, parts
+from ddco_pyro.training.data import demonstrations, train_and_valid
 
 LINEAR = {"network": "linear"}
 
@@ -135,7 +135,7 @@ def test_demonstrations_are_listed_worst_first_with_links_to_their_segments(labe
     found, page, demos = labelled
     values = found.log_likelihood(demos) / demos.lengths
     per_step = dict(zip(demos.names, values, strict=True))
-    valid = parts(found.spec, demos)["valid"].names
+    valid = train_and_valid(found.spec, demos)["valid"].names
     listed = rows_of(page)
     assert [name for name, *_ in listed] == sorted(demos.names, key=per_step.__getitem__)
     for name, link, held_out, numbers in listed:

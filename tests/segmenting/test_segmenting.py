@@ -36,7 +36,7 @@ from ddco_pyro.segmenting.formats import Asked
 from ddco_pyro.segmenting.formats.lerobot import Annotated
 from ddco_pyro.spec import ObservationSpec, parse_spec
 from ddco_pyro.training.data import demonstrations
-from ddco_pyro.training.data import parts as split_in_parts
+from ddco_pyro.training.data import train_and_valid as split_in_parts
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ import pytest
 from command_line import call
 from random_demonstrations import numbered
 
-from ddco_pyro.data.checks import rounding
+from ddco_pyro.data.controls import rounding
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.inspection import inspect
 from ddco_pyro.data.starting import starting_spec

@@ -1,53 +1,46 @@
-"""Sources of demonstrations: files and folders of several libraries (:mod:`ddco_pyro.data.formats`), one interface."""
+"""Sources of demonstrations: files and folders of several libraries (:mod:`ddco_pyro.data.formats`)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from pkgutil import resolve_name
 from shlex import quote
-from typing import Protocol
 
 import h5py
 
+from ddco_pyro.data.demonstration import Attribute, Demonstration
+from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.formats import FORMATS
-from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError
-from ddco_pyro.data.sources.recording import Column, Recording
 from ddco_pyro.errors import command, nearest, path_of
 
-__all__ = ["Column", "Recording", "Source", "open_source", "refuse_foreign"]
+__all__ = ["Source", "open_source", "refuse_foreign"]
 
 
-class Source(Protocol):
-    """A set of recordings, open for reading."""
+@dataclass(frozen=True)
+class Source:
+    """A file or folder of demonstrations, open for reading.
 
-    @property
-    def format(self) -> str:
-        """The name of its format."""
+    :param names: of the demonstrations, in order.
+    :param read: a demonstration by its name, as it is stored; lazy arrays can be read while the source is open.
+    :param files: the files of the source, whose sizes and times identify its contents.
+    :param masks: name of each mask (robomimic: filter key) to names of demonstrations.
+    :param frequency: control steps per second, Hz; None if unknown.
+    :param attributes: facts about the whole source.
+    :param given: the names that the source gives to observations with another key, and their keys.
+    :param format: the name of its format.
+    """
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the recordings, in order."""
-
-    @property
-    def masks(self) -> Mapping[str, tuple[str, ...]]:
-        """Name of each mask (robomimic: filter key) to names of recordings."""
-
-    @property
-    def frequency(self) -> float | None:
-        """Control steps per second, Hz; None if unknown."""
-
-    @property
-    def attributes(self) -> Mapping[str, Attribute]:
-        """Facts about the whole source."""
-
-    @property
-    def files(self) -> tuple[Path, ...]:
-        """The files of the source, whose sizes and times identify its contents."""
-
-    def recording(self, name: str) -> Recording:
-        """One recording; its arrays can be read while the source is open."""
+    names: tuple[str, ...]
+    read: Callable[..., Demonstration]
+    files: tuple[Path, ...]
+    masks: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    frequency: float | None = None
+    attributes: Mapping[str, Attribute] = field(default_factory=dict)
+    given: Mapping[str, str] = field(default_factory=dict)
+    format: str = ""
 
 
 @contextmanager
@@ -67,9 +60,10 @@ def open_source(path: str | Path, form: str | None = None, actions: Sequence[str
         several = " or ".join(about.text for about in FORMATS.values() if about.parts)
         raise DemonstrationsError(f"{path}: has the format {form}, with one control; --action is for {several}")
     reader = resolve_name(f"{__name__}.{FORMATS[form].reader}")
-    opened = reader(path, actions=actions) if FORMATS[form].parts else reader(path)
-    with opened if isinstance(opened, AbstractContextManager) else nullcontext(opened) as source:
-        yield source
+    with reader(path, actions) if FORMATS[form].parts else reader(path) as source:
+        if not source.names:
+            raise DemonstrationsError(f"{path}: holds no demonstrations; at least one is needed", located=True)
+        yield replace(source, format=form)
 
 
 # --- recognition ------------------------------------------------------------------------------------------------------
@@ -111,11 +105,13 @@ def _top_names(path: Path) -> frozenset[str]:
     """The names at the top of an HDF5 file; none of another file."""
     try:
         with h5py.File(path, "r") as file:
-            names = frozenset(file)
-            prepared = "env_args" in file["data"].attrs if _has_states_only(file.get("data")) else None
+            names, data = frozenset(file), file.get("data")
+            groups = data.values() if isinstance(data, h5py.Group) else ()
+            first = next((group for group in groups if isinstance(group, h5py.Group)), ())
+            bare, prepared = "states" in first and "obs" not in first, data is not None and "env_args" in data.attrs
     except (OSError, RuntimeError, ValueError, KeyError):
         return frozenset()
-    if prepared is not None:
+    if bare:
         scripts, name = "python -m robomimic.scripts", quote(str(path))
         before = "" if prepared else f"{scripts}.conversion.convert_robosuite --dataset {name} && "
         raise DemonstrationsError(
@@ -123,11 +119,3 @@ def _top_names(path: Path) -> frozenset[str]:
             f"{scripts}.dataset_states_to_obs --dataset {name} --output_name low_dim.hdf5"
         )
     return names
-
-
-def _has_states_only(data: object) -> bool:
-    """Whether the first demonstration in a group has simulator states and no observations."""
-    if not isinstance(data, h5py.Group):
-        return False
-    first = next((name for name in data if data.get(name, getclass=True) is h5py.Group), None)
-    return first is not None and "states" in data[first] and "obs" not in data[first]

@@ -14,16 +14,16 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
-from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError
-from ddco_pyro.data.sources.recording import LABEL_NAMES, Recording
-
-TRIALS = Path("kinematics", "AllGestures")
-"""The folder of trials in that of a task."""
+from ddco_pyro.data.demonstration import Attribute, Demonstration
+from ddco_pyro.data.errors import DemonstrationsError
+from ddco_pyro.data.labels import LABEL_NAMES
+from ddco_pyro.data.sources import Source
 
 WIDTH, ARM = 76, 19
 """Numbers of a frame, and of an arm in it."""
@@ -31,70 +31,64 @@ WIDTH, ARM = 76, 19
 HANDS = {"left": (0, 3), "right": (1, 2)}
 """The master and the instrument of each hand, by their place in a row."""
 
+PARTS = {"position": slice(3), "rotation": slice(3, 12), "gripper": slice(18, 19)}
+"""What is observed of an instrument, by its place in the numbers of an arm."""
+
 TRIAL = re.compile(r".*_(?P<surgeon>[A-Z])(?P<trial>\d{3})")
 
 
-class Jigsaws:
+@contextmanager
+def open_jigsaws(path: Path) -> Iterator[Source]:
     """The trials of one task.
 
     The control [14] is the motion of the surgeon's hands, which the robot repeats: for the left and the right hand
     velocity [3], angular velocity [3] and gripper angle of the master. Observations are position [3], rotation [9] and
     gripper angle [1] of each instrument. The instruments' velocities are left out: they are the control itself.
     ``labels/gesture`` is the place of a frame's gesture among those of the task, -1 for a frame without one.
+    Attributes are the surgeon's letter, the trial's number, the self-stated skill and the rating.
+
+    :raises DemonstrationsError: a transcription cannot be read; at reading a trial, its file cannot.
     """
+    trials = {f"demo_{n}": trial for n, trial in enumerate(sorted((path / "kinematics/AllGestures").glob("*.txt")))}
+    transcriptions = [path / "transcriptions" / trial.name for trial in trials.values()]
+    described = sorted(path.glob("meta_file_*.txt"))
+    segments = {place.name: _segments(place) for place in transcriptions if place.is_file()}
+    found = {gesture for each in segments.values() for *_, gesture in each}
+    gestures = sorted(found, key=lambda gesture: (len(gesture), gesture))  # G2 before G11
+    rows = [row.split() for place in described for row in place.read_text().splitlines()]
+    about = {row[0]: row[1:] for row in rows if len(row) > 2}
 
-    format = "jigsaws"
-    frequency: float | None = 30.0
-    masks: Mapping[str, tuple[str, ...]] = {}
-
-    def __init__(self, path: Path) -> None:
-        trials = sorted((path / TRIALS).glob("*.txt"))
-        self.names = tuple(f"demo_{number}" for number in range(len(trials)))
-        self._trials = dict(zip(self.names, trials, strict=True))
-        transcribed = {trial: path / "transcriptions" / trial.name for trial in trials}
-        self._transcriptions = {trial: place for trial, place in transcribed.items() if place.is_file()}
-        described = sorted(path.glob("meta_file_*.txt"))
-        rows = [row.split() for place in described for row in place.read_text().splitlines()]
-        self._about = {row[0]: row[1:] for row in rows if len(row) > 2}
-        self.files = (*trials, *self._transcriptions.values(), *described)
-        self._segments = {trial: _segments(place) for trial, place in self._transcriptions.items()}
-        found = {gesture for segments in self._segments.values() for *_, gesture in segments}
-        self._gestures = sorted(found, key=lambda gesture: (len(gesture), gesture))  # G2 before G11
-        self.attributes: Mapping[str, Attribute] = {LABEL_NAMES: json.dumps({"gesture": self._gestures})}
-
-    def recording(self, name: str) -> Recording:
-        """One trial, with its surgeon's letter, its number, the self-stated skill and the rating as attributes.
-
-        :raises DemonstrationsError: its file cannot be read.
-        """
-        trial = self._trials[name]
-        try:
-            rows = np.loadtxt(trial.read_text().splitlines(), ndmin=2) if trial.stat().st_size else np.empty((0, WIDTH))
-        except ValueError as error:
-            raise DemonstrationsError(f"{name}: {trial} is no table of numbers: {error}") from None
-        if rows.shape[1] != WIDTH or not len(rows):
-            width = f"has rows of {rows.shape[1]} numbers, where JIGSAWS has {WIDTH}" if rows.size else "is empty"
-            raise DemonstrationsError(f"{name}: {trial} {width}")
-        arms = rows.reshape(len(rows), -1, ARM)
+    def read(name: str) -> Demonstration:
+        trial = trials[name]
+        arms = _arms(trial, name)
         observations = {
-            f"{hand}_{key}": arms[:, place, part]
-            for hand, (_, place) in HANDS.items()
-            for key, part in {"position": slice(3), "rotation": slice(3, 12), "gripper": slice(18, 19)}.items()
+            f"{hand}_{key}": arms[:, place, part] for hand, (_, place) in HANDS.items() for key, part in PARTS.items()
         }
         control = np.concatenate([arms[:, place, 12:] for place, _ in HANDS.values()], axis=1)
-        gesture = np.full(len(rows), -1)
-        for first, last, label in self._segments.get(trial, ()):
-            gesture[first - 1 : last] = self._gestures.index(label)
-        labels = {"gesture": gesture} if self._gestures else {}
-        return Recording.of(name, observations, control, labels, self._facts(trial.stem))
-
-    def _facts(self, trial: str) -> dict[str, Attribute]:
-        facts: dict[str, Attribute] = {"file": trial}
-        if named := TRIAL.fullmatch(trial):
+        gesture = np.full(len(arms), -1)
+        for first, last, label in segments.get(trial.name, ()):
+            gesture[first - 1 : last] = gestures.index(label)
+        facts: dict[str, Attribute] = {"file": trial.stem}
+        if named := TRIAL.fullmatch(trial.stem):
             facts |= {"surgeon": named["surgeon"], "trial": int(named["trial"])}
-        if about := self._about.get(trial):
-            facts |= {"skill": about[0], "rating": float(about[1])}
-        return facts
+        if said := about.get(trial.stem):
+            facts |= {"skill": said[0], "rating": float(said[1])}
+        return Demonstration.stored(name, observations, control, {"gesture": gesture} if gestures else {}, facts)
+
+    files = (*trials.values(), *(place for place in transcriptions if place.is_file()), *described)
+    yield Source(tuple(trials), read, files, {}, 30.0, {LABEL_NAMES: json.dumps({"gesture": gestures})})
+
+
+def _arms(trial: Path, name: str) -> np.ndarray:
+    """The numbers of each arm in each frame, [T, 4, 19]."""
+    try:
+        rows = np.loadtxt(trial.read_text().splitlines(), ndmin=2) if trial.stat().st_size else np.empty((0, WIDTH))
+    except ValueError as error:
+        raise DemonstrationsError(f"{name}: {trial} is no table of numbers: {error}") from None
+    if rows.shape[1] != WIDTH or not len(rows):
+        width = f"has rows of {rows.shape[1]} numbers, where JIGSAWS has {WIDTH}" if rows.size else "is empty"
+        raise DemonstrationsError(f"{name}: {trial} {width}")
+    return rows.reshape(len(rows), -1, ARM)
 
 
 def _segments(path: Path) -> list[tuple[int, int, str]]:

@@ -9,9 +9,8 @@ import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
-from functools import lru_cache
-from itertools import pairwise
+from functools import lru_cache, partial
+from itertools import islice, pairwise
 from pathlib import Path
 from shlex import quote
 from typing import Any
@@ -19,11 +18,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ddco_pyro.data.hdf5 import Attribute, DemonstrationsError
-from ddco_pyro.data.pictures import block_steps, channels_last, turned
-from ddco_pyro.data.sources.metadata import check_links, filled, first_missing, inside, rate, stored_keys
-from ddco_pyro.data.sources.recording import LABEL_NAMES, Column, Recording, damaged, joined, of_array
-from ddco_pyro.data.sources.video import video_column
+from ddco_pyro.data.arrays import PICTURES, LazyArray, Observed, block_steps, channels_last, turned
+from ddco_pyro.data.demonstration import Attribute, Demonstration
+from ddco_pyro.data.errors import DemonstrationsError, damaged
+from ddco_pyro.data.labels import LABEL_NAMES
+from ddco_pyro.data.sources import Source
+from ddco_pyro.data.sources.metadata import check_links, filled, first_missing, inside, joined, rate, stored_keys
+from ddco_pyro.data.sources.video import frames_of_steps
 from ddco_pyro.errors import nearest
 
 try:
@@ -62,14 +63,13 @@ class LeRobot:
     in the order in which they first occur, and -1 marks steps before the first one.
 
     :param actions: features that are the control together, in this order; ``action`` if empty.
+    :raises DemonstrationsError: the dataset has another version, or is damaged.
     """
-
-    format = "lerobot"
 
     def __init__(self, folder: Path, actions: Sequence[str] = ()) -> None:
         self.folder = folder
         check_links(folder)
-        self.info: dict[str, Any] = _json(folder / "meta" / "info.json")
+        self.info = _info(folder / "meta" / "info.json")
         version = str(self.info.get("codebase_version", "of no version"))
         if not version.startswith(VERSION):
             raise DemonstrationsError(
@@ -79,7 +79,7 @@ class LeRobot:
         observed = [feature for feature in self.features if feature.startswith(OBSERVATION)]
         bare = [feature.removeprefix(OBSERVATION) for feature in observed]
         keys = stored_keys(folder, bare, [name.replace(".", "/") for name in bare])
-        self._keys = dict(zip(observed, keys, strict=True))
+        self.keys = dict(zip(observed, keys, strict=True))
         self._actions = tuple(actions) or (ACTION,)
         self._check_actions()
         if isinstance(template := self.info.get("video_path"), str):  # before anything is read
@@ -89,20 +89,23 @@ class LeRobot:
         if not self._episodes:
             raise DemonstrationsError(f"{folder}: meta/episodes holds no episodes; at least one is needed")
         self._missing = first_missing(folder, self.info.get("total_episodes"), self._episodes, "meta/episodes")
-        self.names = tuple(f"demo_{index}" for index in (*self._episodes, *self._missing))
-        self.frequency = rate({"fps": self.info.get("fps")})
-        self.masks = self._masks()
-        robot = self.info.get("robot_type")
-        self._subtasks, subtasks = self._annotations() if SUBTASK not in self.features else ({}, [])
-        named = {LABEL_NAMES: json.dumps({"subtask": subtasks})} if subtasks else {}
-        about = {"robot_type": robot} if isinstance(robot, str) else {}
-        self.attributes: Mapping[str, Attribute] = {**about, **named}
-        named_files = {self.data_file(index) for index in self._episodes}  # some may be missing
-        self.data_files = tuple(sorted(path.relative_to(folder) for path in named_files))
+        self._frequency = rate({"fps": self.info.get("fps")})
+        self._annotated, self._names = self._annotations() if SUBTASK not in self.features else ({}, [])
+        files = {self._path("data_path", index, "data") for index in self._episodes}  # some may be missing
+        self.data_files = tuple(sorted(path.relative_to(folder) for path in files))
         self._check_frames()
+
+    def source(self) -> Source:
+        """The episodes as demonstrations."""
+        folder, robot = self.folder, self.info.get("robot_type")
+        about: dict[str, Attribute] = {"robot_type": robot} if isinstance(robot, str) else {}
+        if self._names:
+            about[LABEL_NAMES] = json.dumps({"subtask": self._names})
         meta = sorted((folder / "meta").rglob("*.parquet"))
         more = (folder / path for path in (ANNOTATIONS, *self.data_files))
-        self.files = (folder / "meta" / "info.json", *meta, *(path for path in more if path.is_file()))
+        files = (folder / "meta" / "info.json", *meta, *(path for path in more if path.is_file()))
+        names = tuple(f"demo_{index}" for index in (*self._episodes, *self._missing))
+        return Source(names, self._read, files, self._masks(names), self._frequency, about, self.keys)
 
     def _check_actions(self) -> None:
         """Refuse features that do not exist as the control."""
@@ -120,21 +123,18 @@ class LeRobot:
     def _annotations(self) -> tuple[dict[int, list[tuple[int, int]]], list[str]]:
         """The subtasks of each annotated episode as (first step, number of its name), and the names."""
         path = self.folder / ANNOTATIONS
-        if not path.is_file() or self.frequency is None:
+        if not path.is_file() or self._frequency is None:
             return {}, []
-        names = dict[str, int]()
+        names, found = dict[str, int](), dict[int, list[tuple[int, int]]]()
         try:
-            found = {}
             for episode, noted in json.loads(path.read_text(encoding="utf-8"))["episodes"].items():
                 atoms = [atom for atom in noted.get("atoms", ()) if atom["style"] == "subtask" and atom["content"]]
-                atoms.sort(key=lambda atom: float(atom["timestamp"]))
-                found[int(episode)] = [
-                    (round(atom["timestamp"] * self.frequency), names.setdefault(str(atom["content"]), len(names)))
-                    for atom in atoms
-                ]
+                for atom in sorted(atoms, key=lambda atom: float(atom["timestamp"])):
+                    number = names.setdefault(str(atom["content"]), len(names))
+                    found.setdefault(int(episode), []).append((round(atom["timestamp"] * self._frequency), number))
         except (*_DAMAGE, AttributeError, OverflowError, RecursionError) as error:
             raise damaged(path, "", error) from error
-        return {episode: subtasks for episode, subtasks in found.items() if subtasks}, list(names)
+        return found, list(names)
 
     def _check_frames(self) -> None:
         """Refuse a dataset if neither its rows nor its episodes' lengths add up to ``total_frames``.
@@ -143,7 +143,7 @@ class LeRobot:
         """
         total, files = self.info.get("total_frames"), [self.folder / path for path in self.data_files]
         lengths = [length for row in self._episodes.values() if isinstance(length := row.get("length"), int)]
-        whole = len(lengths) == len(self.names) and all(path.is_file() for path in files)
+        whole = len(lengths) == len(self._episodes) and not self._missing and all(path.is_file() for path in files)
         if whole and isinstance(total, int) and total != sum(lengths):
             rows = sum(_count(file) for file in files)
             if total != rows:
@@ -151,14 +151,8 @@ class LeRobot:
                     f"{self.folder}: meta/info.json counts {total} frames, and {rows} are there; correct total_frames"
                 )
 
-    def data_file(self, index: int) -> Path:
-        """The parquet file of an episode's rows.
-
-        :raises DemonstrationsError: the file is outside the dataset's folder.
-        """
-        return self._path("data_path", index, "data")
-
     def _path(self, template: str, index: int, prefix: str, **more: str) -> Path:
+        """A file of an episode, in the dataset's folder, by a template of ``meta/info.json``."""
         try:
             numbers = {name: int(self._episodes[index][f"{prefix}/{name}"]) for name in ("chunk_index", "file_index")}
             path = filled(self.folder, str(self.info[template]), {**numbers, "episode_index": index, **more})
@@ -168,7 +162,7 @@ class LeRobot:
             raise damaged(self.folder, f"demo_{index}: {template}", error) from error
         return inside(self.folder, path)
 
-    def _masks(self) -> dict[str, tuple[str, ...]]:
+    def _masks(self, names: Sequence[str]) -> dict[str, tuple[str, ...]]:
         """The splits, such as ``train: "0:40"``, except splits of all episodes."""
         masks: dict[str, tuple[str, ...]] = {}
         splits = self.info.get("splits")
@@ -176,11 +170,11 @@ class LeRobot:
             start, _, stop = str(span).partition(":")
             if start.isdecimal() and stop.isdecimal():
                 members = [f"demo_{index}" for index in self._episodes if int(start) <= index < int(stop)]
-                if 0 < len(members) < len(self.names):
+                if 0 < len(members) < len(names):
                     masks["valid" if name in ("val", "validation") else name] = tuple(members)
         return masks
 
-    def recording(self, name: str) -> Recording:
+    def _read(self, name: str) -> Demonstration:
         """One episode.
 
         :raises DemonstrationsError: rows are missing, out of order or damaged, or their number is wrong.
@@ -190,30 +184,26 @@ class LeRobot:
             raise DemonstrationsError(f"{name} {self._missing[index]}")
         if index in self._twice:
             raise DemonstrationsError(f"{name}: meta/episodes names it twice; remove one of the two")
-        path = self.data_file(index)
+        path = self._path("data_path", index, "data")
         if not path.is_file():
             raise DemonstrationsError(f"{name}: {path} is missing; fetch the dataset again")
         try:
             rows = _Rows(path, index, name)
             self._check(rows, index)
-            observations = {key: self._column(rows, feature, index) for feature, key in self._keys.items()}
-            labels: dict[str, Any] = {"subtask": rows.vectors(SUBTASK, ())} if SUBTASK in rows.present else {}
-            if self._subtasks:
-                labels = {"subtask": self._labels(index, len(rows))}
-            controls = {key: rows.vectors(key, self.features[key]["shape"]).array() for key in self._actions}
+            observations = {key: self._observation(rows, feature, index) for feature, key in self.keys.items()}
+            labels = {"subtask": np.asarray(rows.numbers(SUBTASK, ()))} if SUBTASK in rows.present else {}
+            if self._annotated:
+                labels = {"subtask": np.full(len(rows), -1)}
+                for start, number in self._annotated.get(index, ()):
+                    labels["subtask"][max(start, 0) :] = number
+            controls = {key: np.asarray(rows.numbers(key, self.features[key]["shape"])) for key in self._actions}
         except _DAMAGE as error:
             raise damaged(self.folder, name, error) from error
-        actions = of_array(joined(controls, f"{self.folder}: {name}"))
-        return Recording.of(
-            name, observations, replace(actions, named=" + ".join(controls)), labels, self._facts(index)
-        )
-
-    def _labels(self, index: int, steps: int) -> np.ndarray:
-        """The number of the annotated subtask at each step [T]; -1 where there is none."""
-        labels = np.full(steps, -1)
-        for start, number in self._subtasks.get(index, ()):
-            labels[max(start, 0) :] = number
-        return labels
+        tasks = self._episodes[index].get("tasks")
+        about: dict[str, Attribute] = {"episode_index": index}
+        if isinstance(tasks, Sequence) and len(tasks):
+            about["task"] = "; ".join(map(str, tasks))
+        return Demonstration.stored(name, observations, joined(controls, f"{self.folder}: {name}"), labels, about)
 
     def _check(self, rows: _Rows, index: int) -> None:
         """Refuse an episode with a wrong number of rows, or with rows out of order."""
@@ -225,47 +215,38 @@ class LeRobot:
                 raise DemonstrationsError(
                     f"{rows.name}: {what} in meta/episodes is {length}, and {rows.path} has {there} rows of it"
                 )
-        for column, frequency in (("frame_index", 1.0), ("timestamp", self.frequency)):
+        for column, frequency in (("frame_index", 1.0), ("timestamp", self._frequency)):
             if column in rows.present and frequency:
-                times = rows.vectors(column, ()).array()
-                if problem := _problem_of_times(times.astype(float), frequency, column):
+                times = np.asarray(rows.numbers(column, ())).astype(float)
+                if problem := _problem_of_times(times, frequency, column):
                     raise DemonstrationsError(f"{rows.path}: {rows.name}: {problem}")
 
-    def _facts(self, index: int) -> dict[str, Attribute]:
-        tasks = self._episodes[index].get("tasks")
-        task = {"task": "; ".join(map(str, tasks))} if isinstance(tasks, Sequence) and len(tasks) else {}
-        return {"episode_index": index, **task}
-
-    def _column(self, rows: _Rows, key: str, index: int) -> Column:
-        kind = self.features[key]["dtype"]
-        if kind == "image":
-            return rows.images(key, self._size(key))
-        if kind == "video":
-            return self._video(rows, key, index)
-        return rows.vectors(key, self.features[key]["shape"])
-
-    def _video(self, rows: _Rows, key: str, index: int) -> Column:
-        """A column of a video, which is looked for when it is read."""
-        size = self._size(key)
-
-        def blocks() -> Iterator[np.ndarray]:
-            try:
-                path = self._path("video_path", index, f"videos/{key}", video_key=key)
-                start = float(self._episodes[index][f"videos/{key}/from_timestamp"])
-            except _DAMAGE as error:
-                raise damaged(self.folder, f"{rows.name}: {key}", error) from error
-            if not 0 <= start < _LONGEST:
-                raise DemonstrationsError(f"{rows.name}: {key} begins at second {start:g} of its video")
-            yield from video_column(path, rows.name, start, len(rows), size, self.frequency or 1.0).blocks()
-
-        return Column((len(rows), *size, 3), np.dtype(np.uint8), blocks, video=True, named=key)
-
-    def _size(self, key: str) -> tuple[int, int]:
-        """Height and width of an image, whose channels may come first."""
-        shape, names = list(self.features[key]["shape"]), list(self.features[key].get("names") or ())
+    def _observation(self, rows: _Rows, key: str, index: int) -> Observed:
+        about = self.features[key]
+        shape, names = list(about["shape"]), list(about.get("names") or ())
+        if about["dtype"] not in ("image", "video"):
+            return rows.numbers(key, shape)
         first = names[:1] in (["channels"], ["channel"]) or (not names and shape[0] in (1, 3))
         height, width = shape[1:] if first else shape[:2]
-        return int(height), int(width)
+        size, video = (int(height), int(width)), about["dtype"] == "video"
+        read = partial(self._frames, rows, key, index, size) if video else partial(rows.images, key, size)
+        return LazyArray((len(rows), *size, 3), PICTURES, read, key, video=video)
+
+    def _frames(
+        self, rows: _Rows, key: str, index: int, size: tuple[int, int], start: int, stop: int
+    ) -> Iterator[np.ndarray]:
+        """Frames of a video, which is looked for when it is read."""
+        try:
+            path = self._path("video_path", index, f"videos/{key}", video_key=key)
+            begin = float(self._episodes[index][f"videos/{key}/from_timestamp"])
+        except _DAMAGE as error:
+            raise damaged(self.folder, f"{rows.name}: {key}", error) from error
+        if not 0 <= begin < _LONGEST:
+            raise DemonstrationsError(f"{rows.name}: {key} begins at second {begin:g} of its video")
+        rate = self._frequency or 1.0
+        shown = frames_of_steps(path, rows.name, begin + start / rate, stop - start, rate, size)
+        while block := list(islice(shown, IMAGES_AT_ONCE)):
+            yield np.stack(block)
 
 
 def _problem_of_times(times: np.ndarray, frequency: float, column: str) -> str:
@@ -301,31 +282,29 @@ class _Rows:
     def __len__(self) -> int:
         return self.stop - self.start
 
-    def vectors(self, key: str, shape: Sequence[int] = (1,)) -> Column:
+    def numbers(self, key: str, shape: Sequence[int]) -> LazyArray:
         """A column of numbers or lists of numbers; ``shape`` is the shape of a step."""
-        size, dtype = math.prod(shape), self._dtype(key)
+        dtype: np.dtype[Any] = np.dtype(np.float32)  # where the column is missing, which its reading reports
+        if key in self.present:
+            kind = self.schema.field(key).type
+            while pyarrow.types.is_nested(kind) and hasattr(kind, "value_type"):
+                kind = kind.value_type
+            dtype = np.dtype(object) if pyarrow.types.is_nested(kind) else np.dtype(kind.to_pandas_dtype())
+        read = partial(self._numbers, key, tuple(shape), dtype)
+        return LazyArray(channels_last((len(self), *shape), dtype), dtype, read, key)
 
-        def blocks() -> Iterator[np.ndarray]:
-            at = 0
-            try:
-                for batch in self._batches(key, block_steps(tuple(shape), dtype)):
-                    yield turned(self._numbers(batch.column(0), size, key, at).reshape(len(batch), *shape))
-                    at += len(batch)
-            except _DAMAGE as error:
-                raise damaged(self.path, f"{self.name}: {key}", error) from error
+    def _numbers(
+        self, key: str, shape: tuple[int, ...], dtype: np.dtype, start: int, stop: int
+    ) -> Iterator[np.ndarray]:
+        at = start
+        try:
+            for values in self._batches(key, block_steps(shape, dtype), start, stop):
+                yield turned(self._flat(values, math.prod(shape), key, at).reshape(len(values), *shape))
+                at += len(values)
+        except _DAMAGE as error:
+            raise damaged(self.path, f"{self.name}: {key}", error) from error
 
-        return Column(channels_last((len(self), *shape), dtype), dtype, blocks, named=key)
-
-    def _dtype(self, key: str) -> np.dtype:
-        """The type of the numbers in a column; of numbers where the column is missing, and its reading reports that."""
-        if key not in self.present:
-            return np.dtype(np.float32)
-        kind = self.schema.field(key).type
-        while pyarrow.types.is_nested(kind) and hasattr(kind, "value_type"):
-            kind = kind.value_type
-        return np.dtype(object) if pyarrow.types.is_nested(kind) else np.dtype(kind.to_pandas_dtype())
-
-    def _numbers(self, values: Any, size: int, key: str, first: int) -> np.ndarray:
+    def _flat(self, values: Any, size: int, key: str, first: int) -> np.ndarray:
         """The numbers of a column with ``size`` numbers in each row, flat; ``first`` is the number of the first row."""
         row, rows = np.arange(len(values)), len(values)
         while pyarrow.types.is_nested(values.type):
@@ -340,39 +319,38 @@ class _Rows:
             )
         return values.to_numpy(zero_copy_only=False)
 
-    def images(self, key: str, size: tuple[int, int]) -> Column:
-        """A column of encoded pictures, uint8 [T, H, W, 3]."""
+    def images(self, key: str, size: tuple[int, int], start: int, stop: int) -> Iterator[np.ndarray]:
+        """Encoded pictures of consecutive steps, uint8 [steps, H, W, 3], in blocks."""
 
-        def blocks() -> Iterator[np.ndarray]:
-            try:
-                for batch in self._batches(key, IMAGES_AT_ONCE):
-                    yield np.stack([self._picture(picture["bytes"], size) for picture in batch.column(0).to_pylist()])
-            except _DAMAGE as error:
-                raise damaged(self.path, f"{self.name}: {key}", error) from error
+        def decoded(encoded: bytes | None) -> np.ndarray:
+            if encoded is None:
+                raise DemonstrationsError(f"{self.path}: {self.name}: an image is not in the parquet file itself")
+            image = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR)
+            if image is None or image.shape[:2] != size:
+                wanted = f"{size[0]} x {size[1]}"
+                raise DemonstrationsError(f"{self.path}: {self.name}: an image is damaged, or not {wanted}")
+            return np.ascontiguousarray(image[..., ::-1])
 
-        return Column((len(self), *size, 3), np.dtype(np.uint8), blocks, named=key)
+        try:
+            for values in self._batches(key, IMAGES_AT_ONCE, start, stop):
+                yield np.stack([decoded(picture["bytes"]) for picture in values.to_pylist()])
+        except _DAMAGE as error:
+            raise damaged(self.path, f"{self.name}: {key}", error) from error
 
-    def _picture(self, encoded: bytes | None, size: tuple[int, int]) -> np.ndarray:
-        if encoded is None:
-            raise DemonstrationsError(f"{self.path}: {self.name}: an image is not in the parquet file itself")
-        image = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR)
-        if image is None or image.shape[:2] != size:
-            raise DemonstrationsError(f"{self.path}: {self.name}: an image is damaged, or not {size[0]} x {size[1]}")
-        return np.ascontiguousarray(image[..., ::-1])
-
-    def _batches(self, key: str, rows: int) -> Iterator[Any]:
-        """The episode's part of a column, from the row groups that hold the episode."""
+    def _batches(self, key: str, rows: int, start: int, stop: int) -> Iterator[Any]:
+        """A column's values of steps of the episode, from the row groups that hold them."""
         if key not in self.present:
             raise DemonstrationsError(f"{self.path}: {self.name}: has no column {key}, which meta/info.json names")
+        start, stop = self.start + start, self.start + stop
         file, _ = _open(self.path, self.path.stat().st_mtime_ns)
         ends = np.cumsum([file.metadata.row_group(group).num_rows for group in range(file.metadata.num_row_groups)])
-        first, last = np.searchsorted(ends, [self.start, self.stop - 1], side="right")
+        first, last = np.searchsorted(ends, [start, stop - 1], side="right")
         at = 0 if first == 0 else int(ends[first - 1])
         for batch in file.iter_batches(rows, list(range(first, last + 1)), [key]):
-            low, high = max(self.start - at, 0), min(self.stop - at, len(batch))
+            low, high = max(start - at, 0), min(stop - at, len(batch))
             at += len(batch)
             if low < high:
-                yield batch.slice(low, high - low)
+                yield batch.column(0).slice(low, high - low)
 
 
 @lru_cache(maxsize=2)
@@ -412,7 +390,7 @@ def _episodes(folder: Path) -> tuple[dict[int, dict[str, Any]], set[int]]:
     return dict(sorted(episodes.items())), twice
 
 
-def _json(path: Path) -> dict[str, Any]:
+def _info(path: Path) -> dict[str, Any]:
     try:
         info = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(info.get("features"), dict):
@@ -423,13 +401,13 @@ def _json(path: Path) -> dict[str, Any]:
 
 
 @contextmanager
-def open_lerobot(path: Path, actions: Sequence[str] = ()) -> Iterator[LeRobot]:
+def open_lerobot(path: Path, actions: Sequence[str] = ()) -> Iterator[Source]:
     """Open a dataset.
 
     :param actions: features that are the control together; ``action`` if empty.
     :raises DemonstrationsError: the dataset has another version, or is damaged.
     """
     try:
-        yield LeRobot(path, actions)
+        yield LeRobot(path, actions).source()
     finally:
         _open.cache_clear()

@@ -1,18 +1,17 @@
-"""Checks of untrusted metadata: paths stay in the dataset's folder, names can be stored, counts are right."""
+"""Facts and names that sources give: rates, paths that stay in their folder, names that can be stored, counts."""
 
 from __future__ import annotations
 
 import math
 import os
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
-from ddco_pyro.data.hdf5 import DemonstrationsError
+import numpy as np
 
-_PLACEHOLDER = re.compile(r"\{(\w+)(?::0(\d\d?)d)?\}")
-_WIDEST = 12
-
+from ddco_pyro.data.arrays import NUMBERS
+from ddco_pyro.data.errors import DemonstrationsError
 
 FREQUENCY = "control_frequency"
 """Attribute of a file: control steps per second, Hz."""
@@ -88,28 +87,41 @@ def check_links(folder: Path) -> None:
 def filled(folder: Path, template: str, values: Mapping[str, int | str]) -> str:
     """A template such as ``data/chunk-{chunk_index:03d}.parquet`` with its placeholders filled.
 
-    The only format is zero padding to a width of at most 12.
+    The only format is zero padding of a number, to a width of at most 12.
 
     :raises DemonstrationsError: the template has other placeholders or formats.
     """
 
     def fill(found: re.Match[str]) -> str:
-        name, width = found[1], int(found[2] or 0)
-        value = values.get(name)
-        if value is None or width > _WIDEST or (width and isinstance(value, str)):
-            raise _unknown(folder, template, values)
-        return str(value).zfill(width)
+        value, width = values.get(found[1], found[0]), int(found[2] or 0)
+        return found[0] if width > 12 or (width and isinstance(value, str)) else str(value).zfill(width)
 
-    if set(_PLACEHOLDER.sub("", template)) & set("{}"):
-        raise _unknown(folder, template, values)
-    return _PLACEHOLDER.sub(fill, template)
+    path = re.sub(r"\{(\w+)(?::0(\d\d?)d)?\}", fill, template)
+    if {*path} & {*"{}"}:
+        known = ", ".join(f"{{{name}}}" for name in values)
+        raise DemonstrationsError(
+            f"{folder}: the path {template[:200]!r} may have only {known}, and numbers as {{chunk_index:03d}}"
+        )
+    return path
 
 
-def _unknown(folder: Path, template: str, values: Iterable[str]) -> DemonstrationsError:
-    known = ", ".join(f"{{{name}}}" for name in values)
-    return DemonstrationsError(
-        f"{folder}: the path {template[:200]!r} may have only {known}, and numbers as {{chunk_index:03d}}"
-    )
+def joined(parts: Mapping[str, np.ndarray], where: str) -> np.ndarray:
+    """Arrays [T, ...] by name as one array [T, D], in this order.
+
+    :param where: the demonstration, for messages.
+    :raises DemonstrationsError: there is no array, one holds no numbers, or has another number of steps than the first.
+    """
+    if not parts:
+        raise DemonstrationsError(f"{where}: has no actions")
+    first, steps = next((name, len(array)) for name, array in parts.items())
+    for name, array in parts.items():
+        if array.dtype.kind not in NUMBERS:
+            raise DemonstrationsError(
+                f"{where}: {name} holds {array.dtype}, not numbers; name the control with --action"
+            )
+        if len(array) != steps:
+            raise DemonstrationsError(f"{where}: {name} has {len(array)} steps, but {first} has {steps}")
+    return np.concatenate([array.reshape(steps, math.prod(array.shape[1:])) for array in parts.values()], axis=1)
 
 
 def _storable(key: str) -> bool:

@@ -1,4 +1,4 @@
-"""Videos: frames, and a part of a video as a column of pictures."""
+"""Videos: frames, and a part of a video as lazy pictures."""
 
 from __future__ import annotations
 
@@ -9,9 +9,7 @@ from pathlib import Path
 import av
 import numpy as np
 
-from ddco_pyro.data.hdf5 import DemonstrationsError
-from ddco_pyro.data.pictures import block_steps
-from ddco_pyro.data.sources.recording import Column
+from ddco_pyro.data.errors import DemonstrationsError
 
 
 def frames(path: Path, start: float = 0.0) -> Iterator[np.ndarray]:
@@ -37,27 +35,16 @@ def timed_frames(path: Path, start: float) -> Iterator[tuple[float, np.ndarray]]
                 yield frame.time - zero, frame.to_ndarray(format="rgb24", interpolation="BICUBIC")
 
 
-def video_column(path: Path, name: str, start: float, steps: int, size: tuple[int, int], frequency: float) -> Column:
-    """A column of T = ``steps`` frames from ``start`` seconds on, uint8 [T, H, W, 3].
-
-    :param name: name of the demonstration, for messages.
-    :param size: height and width.
-    :param frequency: frames per second.
-    """
-    shape = (*size, 3)
-
-    def blocks() -> Iterator[np.ndarray]:
-        at_once, shown = block_steps(shape, np.dtype(np.uint8)), _frames(path, name, start, steps, frequency, size)
-        while block := list(islice(shown, at_once)):
-            yield np.stack(block)
-
-    return Column((steps, *shape), np.dtype(np.uint8), blocks, video=True)
-
-
-def _frames(
+def frames_of_steps(
     path: Path, name: str, start: float, steps: int, frequency: float, size: tuple[int, int]
 ) -> Iterator[np.ndarray]:
-    """The frames of a demonstration, each within half a step of its time."""
+    """The frames of a demonstration's consecutive steps, each within half a step of its time, uint8 [H, W, 3].
+
+    :param name: of the demonstration, for messages.
+    :param start: the time of the first one, in seconds.
+    :param size: height and width.
+    :raises DemonstrationsError: a frame is missing, or of another size, or the video cannot be decoded.
+    """
     if not path.is_file():
         raise DemonstrationsError(f"{name}: {path}: the video is missing; leave its observation out with --observation")
     seen = 0

@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ddco_pyro.data.pictures import Observed, Transform, padded
+from ddco_pyro.data.arrays import Observed
+from ddco_pyro.data.pictures import Transform, padded
 from ddco_pyro.errors import nearest
 
 

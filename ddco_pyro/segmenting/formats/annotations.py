@@ -10,6 +10,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from ddco_pyro.data.arrays import NUMBERS, blocks, is_picture
 from ddco_pyro.data.files import whole_folder, write_text
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.errors import BadInput
@@ -107,7 +108,7 @@ class LabelStudio(Writer):
         return f"{self.out}: {len(tasks)} tasks; make a project with config.xml and import tasks.json"
 
     def _task(self, demo: Segments) -> dict[str, Any]:
-        actions = self.asked.source.recording(demo.name).actions.array()
+        actions = self.asked.source.read(demo.name).actions
         series = {"step": list(range(len(demo)))}
         series |= {f"control_{number}": column.tolist() for number, column in enumerate(actions.T)}
         probability = demo.levels[self.asked.level].probability
@@ -161,8 +162,8 @@ class Rerun(Writer):
         with whole_folder(self.out) as folder:
             for demo in segmented.segments:
                 self._write(str(folder / f"{demo.name}.rrd"), demo, segmented.frequency)
-        first = self.asked.source.recording(segmented.segments[0].name)
-        keys = [f"obs/{key}" for key in first.observations if key not in first.numbers]
+        first = self.asked.source.read(segmented.segments[0].name).observations
+        keys = [f"obs/{key}" for key, array in first.items() if array.dtype.kind not in NUMBERS]
         without = f", without {', '.join(keys)} (no numbers)" if keys else ""
         return f"{self.out}: {len(segmented)} recordings{without}; look at them with: rerun {self.out}/*.rrd"
 
@@ -170,7 +171,7 @@ class Rerun(Writer):
         import rerun
         from rerun import blueprint
 
-        recording, steps = self.asked.source.recording(demo.name), np.arange(len(demo))
+        found, steps = self.asked.source.read(demo.name), np.arange(len(demo))
         stream = rerun.RecordingStream("ddco-pyro", recording_id=demo.name)
         lanes = blueprint.StateTimelineView(origin="segments", name="segments")
         stream.save(path, default_blueprint=blueprint.Blueprint(blueprint.Vertical(lanes, blueprint.TimeSeriesView())))
@@ -187,16 +188,14 @@ class Rerun(Writer):
             starts = np.array([start for _, start, _ in runs])
             log(f"segments/{_entity(name)}", starts, rerun.StateChange.columns(state=states))
             log(f"probability/{_entity(name)}", steps, rerun.Scalars.columns(scalars=level.probability))
-        for key, column in {**recording.numbers, "control": recording.actions}.items():
-            if column.image:
-                pictures = [
-                    rerun.Image(picture).compress(jpeg_quality=90) for block in column.blocks() for picture in block
-                ]
-                for step, picture in enumerate(pictures):
+        numbers = {key: array for key, array in found.observations.items() if array.dtype.kind in NUMBERS}
+        for key, array in {**numbers, "control": found.actions}.items():
+            if is_picture(array):
+                for step, picture in enumerate(picture for block in blocks(array) for picture in block):
                     stream.set_time("step", sequence=step)
-                    stream.log(_entity(key), picture)
+                    stream.log(_entity(key), rerun.Image(picture).compress(jpeg_quality=90))
             else:
-                values = column.array().reshape(len(demo), -1).astype(float)
+                values = np.asarray(array).reshape(len(demo), -1).astype(float)
                 log(_entity(key), steps, rerun.Scalars.columns(scalars=values))
         stream.disconnect()
 

@@ -11,9 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
+from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.files import whole_file
-from ddco_pyro.data.hdf5 import DemonstrationsError, attributes_of, opened, written
-from ddco_pyro.data.sources.recording import BOUNDARY, LABEL_NAMES, label_names
+from ddco_pyro.data.hdf5 import attributes_of, opened, written
+from ddco_pyro.data.labels import BOUNDARY, LABEL_NAMES, label_names
 from ddco_pyro.errors import BadInput
 from ddco_pyro.names import choice_names
 from ddco_pyro.segmenting import Segmented, Segments, chosen_names

@@ -59,8 +59,7 @@ class Copy(Writer):
     """The entries of new columns of frames in ``meta/info.json``."""
 
     def check(self) -> None:
-        source = self.asked.source
-        assert isinstance(source, LeRobot)  # or the command refuses the format
+        source = LeRobot(self.asked.demos)
         if self.features and {SUBTASK, PERSISTENT} & source.features.keys():
             raise BadInput(f"{source.folder}: has subtasks already; name a dataset without them")
         if self.out.resolve().is_relative_to(source.folder.resolve()):
@@ -70,8 +69,7 @@ class Copy(Writer):
             raise self._taken()
 
     def write(self, segmented: Segmented) -> str:
-        source = self.asked.source
-        assert isinstance(source, LeRobot)
+        source = LeRobot(self.asked.demos)
         with suppress(_SameFolder), whole_folder(self.out) as temporary:
             shutil.copytree(
                 source.folder, temporary, dirs_exist_ok=True, copy_function=_link, ignore_dangling_symlinks=True

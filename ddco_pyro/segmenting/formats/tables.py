@@ -9,7 +9,7 @@ from typing import Any
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import whole_file
-from ddco_pyro.data.sources.recording import BOUNDARY
+from ddco_pyro.data.labels import BOUNDARY
 from ddco_pyro.drawing.shown import paths_of, stored_pictures
 from ddco_pyro.errors import BadInput
 from ddco_pyro.names import option_name

@@ -120,11 +120,6 @@ def chunk_missing(group: h5py.Group, folder: Path) -> None:
     dataset[: STEPS - 1] = 1.0
 
 
-def chunks(group: h5py.Group, folder: Path) -> None:
-    instead(group, "obs/offsets", group.file["data"].create_dataset("x", data=np.ones((STEPS, 4)), chunks=(5, 3)))
-    del group.file["data/x"]
-
-
 # --- values -----------------------------------------------------------------------------------------------------------
 
 
@@ -179,20 +174,17 @@ ROWS: dict[str, Row] = {
     "external link to a demonstration": Row(
         changed(linked, "/data/demo_0", "data/demo_1"), LINK.format("/data/demo_0")
     ),
-    "external link to all": Row(changed(linked, "/data", "data"), REPACK.format("data is a link to /data")),
     "soft link": Row(
         changed(soft, "data/demo_1/obs/offsets", "/data/demo_0/obs/offsets"), LINK.format("/data/demo_0/obs/offsets")
     ),
     "dangling link": Row(changed(soft, "data/demo_1", "demo_9"), LINK.format("demo_9")),
     "hard link": Row(changed(twice), None),
-    "a group in itself": Row(changed(circle), r"demo_1: obs/again/.*: its groups go in a circle"),
+    "a group in itself": Row(changed(circle), "demo_1: obs/again: its groups go in a circle"),
     "1e12 rows": Row(changed(rows_claimed), r"demo_1: actions claims 16000000000000 bytes, but the file holds \d+"),
     "a million rows": Row(
         changed(rows_claimed, 10**6), r"demo_1: actions claims 100 chunks, but the file holds 1; write it again"
     ),
     "a chunk missing": Row(changed(chunk_missing), r"demo_1: obs/offsets claims 4 chunks, but the file holds 2"),
-    "chunks": Row(changed(chunks), None),
-    "16 bits": Row(changed(half, 1.0), None),
     "16 bits, infinite": Row(
         changed(half, 1e30), r"demo_1: obs/offsets is inf at step 3, index \[2\]|the first in demo_1 at step 3"
     ),

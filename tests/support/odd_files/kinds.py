@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -198,48 +197,3 @@ ROWS: dict[str, Row] = {
     "nothing but the control": _row(only_leaked, says="no observation can be used"),
     "demonstrations of one step": _row(one_step),
 }
-
-CHANGES: tuple[Change, ...] = (
-    put("labels/phase", lambda steps, number: _half(steps)[:, None].astype(int)),
-    put("labels/step", lambda steps, number: [b"reach"] * steps),
-    put("labels/half", lambda steps, number: _half(steps).astype(int)),
-    put("obs/camera", _bytes(3, 12, 10)),
-    put("obs/wrist", _bytes(12, 10)),
-    put("obs/depth", _bytes(12, 10, dtype="u2")),
-    put("obs/goal", lambda steps, number: np.full((steps, 2), number % 2, dtype="f4")),
-    put("obs/broken", lambda steps, number: np.full((steps, 1), np.nan if number == 1 else number)),
-    put("actions", lambda steps, number: _integers(steps, number, -1, 1)),
-    put("actions", lambda steps, number: _integers(steps, number, 0, 3, None)),
-    put("actions", lambda steps, number: _integers(steps, number, -1, 2, 2)),
-    put("actions", lambda steps, number: _half(steps)),
-    with_switch(lambda steps, number: np.where(_half(steps), -1, 1)),
-    with_switch(lambda steps, number: np.full(steps, 3)),
-    leaked,
-    padded,
-    twins,
-    one_step,
-)
-"""What may be odd in a file, all at once."""
-
-MASKS: tuple[Masks, ...] = (
-    {},
-    {"valid": [b"demo_0"]},
-    {"train": [b"demo_1", b"demo_2"], "better": [b"demo_0"]},
-    {"train": [b"demo_1"], "valid": [b"demo_2"]},
-    {"train": [b"demo_1", b"demo_2"], "valid": [b"demo_2", b"demo_0"]},
-    {"valid": []},
-    {"better": [b"demo_9"]},
-)
-
-
-def drawn(path: Path, seed: int) -> Path:
-    """A file in which up to four things are odd, by seed."""
-    choose = random.Random(seed)
-    changes = choose.sample(CHANGES, choose.randint(0, 4))
-
-    def change(made: Arrays, number: int) -> None:
-        for each in changes:
-            each(made, number)
-
-    masks = choose.choice(MASKS) if choose.random() < 0.5 else {}
-    return write(path, change, masks, choose.choice([2, 3, NUMBER, NUMBER]))

@@ -1,0 +1,288 @@
+"""A demonstration: arrays by name, as they are stored or ready for a fit, and whether it can be used."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from ddco_pyro.data.arrays import (
+    LARGEST,
+    NUMBERS,
+    LazyArray,
+    Observed,
+    blocks,
+    is_picture,
+    network_input,
+    no_numbers,
+    turned,
+    usable,
+)
+from ddco_pyro.data.errors import DemonstrationsError
+from ddco_pyro.data.memory import PROGRAM
+from ddco_pyro.errors import nearest
+
+Attribute = float | int | str | bool
+
+NOTHING: Mapping[str, Any] = MappingProxyType({})
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Demonstration:
+    """One demonstration of T steps, s_0 a_0 ... s_{T-1} a_{T-1}.
+
+    >>> demo = ddco_pyro.Demonstration("demo_0", {"place": np.zeros((10, 2))}, np.ones((10, 2)), {"phase": [0] * 10})
+    >>> len(demo), demo.actions.dtype, demo.labels["phase"].shape
+    (10, dtype('float64'), (10,))
+
+    :param observations: key to [T, ...]; uint8 stays, other numbers become float64. Pictures uint8 [T, C, H, W] or
+        [T, H, W] become [T, H, W, C]. Pictures in files are a lazy :class:`~ddco_pyro.data.arrays.LazyArray`.
+    :param actions: the controls [T, A], float64; whole numbers [T] or [T, A] become int64.
+    :param labels: ground-truth segments by name, [T] or [T, 1], int64.
+    :param attributes: facts about the demonstration, such as its seed.
+    :raises DemonstrationsError: no steps, unequal lengths, other values than numbers, or numbers that are NaN, infinite
+        or beyond :data:`ddco_pyro.data.arrays.LARGEST`.
+    """
+
+    name: str
+    observations: Mapping[str, Observed]
+    actions: np.ndarray
+    labels: Mapping[str, np.ndarray] = field(default_factory=dict)
+    attributes: Mapping[str, Attribute] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name or "/" in self.name:
+            raise DemonstrationsError(
+                f"{self.name!r} cannot be the name of a demonstration; it must be a text, not empty, without a /"
+            )
+        for what, arrays in (("observations", self.observations), ("labels", self.labels)):
+            if not isinstance(arrays, Mapping) or not all(isinstance(key, str) for key in arrays):
+                raise DemonstrationsError(f"{self.name}: {what} have to be a mapping of names to arrays [T, ...]")
+        self._arrange(**vars(self))
+        check(self)
+        observations = {key: _ready(array) for key, array in self.observations.items()}
+        actions = self.actions.astype(np.int64 if self.actions.dtype.kind in "iu" else np.float64)
+        labels = {key: values.astype(np.int64) for key, values in self.labels.items()}
+        self._arrange(self.name, observations, actions, labels, self.attributes)
+        check_values(self, f"repair it, or leave {self.name} out (demonstrations.exclude)")
+
+    @classmethod
+    def stored(
+        cls,
+        name: str,
+        observations: Mapping[str, Any],
+        actions: Any,
+        labels: Mapping[str, Any] = NOTHING,
+        attributes: Mapping[str, Attribute] = NOTHING,
+    ) -> Demonstration:
+        """A demonstration as its source stores it: of any types, observations lazy or not, and not yet checked.
+
+        ``Demonstration(**vars(stored))`` is the same, checked and ready for a fit.
+        """
+        demo = object.__new__(cls)
+        demo._arrange(name, observations, actions, labels, attributes)
+        return demo
+
+    def _arrange(
+        self,
+        name: str,
+        observations: Mapping[str, Any],
+        actions: Any,
+        labels: Mapping[str, Any],
+        attributes: Mapping[str, Attribute],
+    ) -> None:
+        """Pictures get their channels last, whole numbers as controls [T] become [T, 1], and labels [T, 1] become [T].
+
+        :raises DemonstrationsError: something is no array.
+        """
+
+        def array(place: str, values: Any) -> Any:
+            if isinstance(values, LazyArray):
+                return values
+            try:
+                return turned(np.asarray(values))
+            except (ValueError, TypeError, RuntimeError) as error:
+                raise DemonstrationsError(f"{name}: {place} is no array: {' '.join(str(error).split())}") from None
+
+        control = array("actions", actions)
+        known = {key: array(f"labels/{key}", values) for key, values in labels.items()}
+        vars(self).update(
+            name=name,
+            observations={key: array(f"obs/{key}", values) for key, values in observations.items()},
+            actions=control[:, None] if control.dtype.kind in "iu" and control.ndim == 1 else control,
+            labels={key: values[:, 0] if values.shape[1:] == (1,) else values for key, values in known.items()},
+            attributes=attributes,
+        )
+
+    def arrays(self) -> dict[str, Observed]:
+        """Every array by its place: ``actions``, ``obs/<key>``, ``labels/<name>``."""
+        seen = {f"obs/{key}": array for key, array in self.observations.items()}
+        return {"actions": self.actions, **seen, **{f"labels/{key}": array for key, array in self.labels.items()}}
+
+    def __len__(self) -> int:
+        return len(self.actions) if self.actions.ndim else 0
+
+    def __repr__(self) -> str:
+        return f"{self.name}: {len(self)} steps{self.shapes}"
+
+    @property
+    def shapes(self) -> str:
+        """The arrays, a line each."""
+        return "".join(f"\n  {place} {[*array.shape[1:]]} {array.dtype}" for place, array in self.arrays().items())
+
+
+def _ready(array: Observed) -> Observed:
+    """An observation as fits read it; pictures in files stay lazy."""
+    if isinstance(array, LazyArray) and is_picture(array):
+        return array
+    values = np.asarray(array)
+    return values if values.dtype == np.uint8 else values.astype(np.float64)
+
+
+# --- checks -----------------------------------------------------------------------------------------------------------
+
+
+def check(demo: Demonstration, first: Demonstration | None = None) -> None:
+    """Refuse a demonstration that cannot be used, or not together with the first one; no lazy value is read.
+
+    It has no steps, an array of something else than numbers or of other steps than the controls; or its arrays, or
+    their shapes at one step, are not those of the first demonstration.
+
+    :raises DemonstrationsError: it is such a demonstration.
+    """
+    ours = demo.arrays()
+    for place, array in ours.items():
+        if array.dtype.kind not in NUMBERS:
+            raise DemonstrationsError(f"{demo.name}: {place} {no_numbers(array.dtype)}")
+    if problem := problem_of("actions", demo.actions.shape[1:], demo.actions.dtype):
+        raise DemonstrationsError(f"{demo.name}: actions {problem}")
+    if not len(demo):
+        raise DemonstrationsError(f"{demo.name}: actions has no steps; remove this demonstration")
+    other = demo if first is None else first
+    theirs = other.arrays()
+    if missing := sorted(theirs.keys() - ours.keys()):
+        raise DemonstrationsError(f"{demo.name}: {', '.join(missing)} is missing, which {other.name} has")
+    if more := sorted(ours.keys() - theirs.keys()):
+        raise DemonstrationsError(
+            f"{demo.name}: {', '.join(more)} is not in {other.name}; all demonstrations need the same"
+        )
+    for place, array in ours.items():
+        if place.startswith("labels/") and (problem := problem_of(place, array.shape[1:], array.dtype)):
+            raise DemonstrationsError(f"{demo.name}: {place} {problem}")
+        if problem := unlike(array, len(demo), theirs[place].shape[1:], other.name):
+            raise DemonstrationsError(f"{demo.name}: {place} {problem}")
+
+
+def problem_of(place: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
+    """The problem with an array whose steps have this shape and type, in words; empty without a problem."""
+    if place.startswith("obs/"):
+        return network_input(shape, dtype)[1]
+    if place.startswith("labels/"):
+        had = "text" if dtype.kind in "OSU" else str(dtype)
+        stored = f"is {had} of shape [{', '.join(map(str, ('steps', *shape)))}]"
+        return "" if dtype.kind in "iub" and not shape else f"{stored}, it has to be integers of shape [steps]"
+    if dtype.kind not in NUMBERS:
+        return no_numbers(dtype)
+    if shape:
+        return (
+            "" if len(shape) == 1 and shape[0] else f"has shape {list(shape)} at each step, it has to be [dimensions]"
+        )
+    return (
+        f"is {dtype} of shape [steps]; store discrete actions as integers (astype(int)), and anything else as "
+        "[steps, 1] (actions[:, None])"
+    )
+
+
+def unlike(array: Observed, steps: int, shape: tuple[int, ...], first: str) -> str:
+    """How an array differs from the controls in steps, or from the first demonstration in shape; empty if neither."""
+    if array.shape[:1] != (steps,):
+        return f"has {array.shape[0] if array.shape else 'no'} steps, but actions has {steps}"
+    if array.shape[1:] != shape:
+        return f"has shape {array.shape[1:]} at each step, but {shape} in {first}; all demonstrations need the same"
+    return ""
+
+
+def check_values(demo: Demonstration, remedy: str = "repair it", pictures: bool = False) -> None:
+    """Refuse a demonstration with a number that is not :func:`~ddco_pyro.data.arrays.usable`.
+
+    :param remedy: what the user can do.
+    :param pictures: whether pictures are read too, which takes long; their values are usable.
+    :raises DemonstrationsError: a number is NaN, infinite or too large, or an array cannot be read.
+    """
+    for place, array in demo.arrays().items():
+        before = 0
+        for block in () if is_picture(array) and not pictures else blocks(array):
+            good = usable(block)
+            if not good.all():
+                step, *index = np.argwhere(~good)[0].tolist()
+                value = block[step, *index]
+                limit = f", and at most {LARGEST:g} can be used" if np.isfinite(value) else ""
+                raise DemonstrationsError(
+                    f"{demo.name}: {place} is {number(value)} at step {before + step}, index {index}{limit}; {remedy}"
+                )
+            before += len(block)
+
+
+def check_fitted(demo: Demonstration, shapes: Mapping[str, tuple[int, ...]], control_size: int) -> None:
+    """Refuse a demonstration that a model cannot read which was fitted to other shapes.
+
+    :param shapes: of the model's observations at one step.
+    :param control_size: A of the fit.
+    :raises DemonstrationsError: an observation is missing, or it or the control has another shape or type.
+    """
+    known = demo.observations
+    for key in shapes:
+        if key not in known:
+            raise DemonstrationsError(
+                f"{demo.name}: there is no observation {key!r}{nearest(key, known)}, which the run was fitted to; "
+                f"there is: {', '.join(known)}"
+            )
+    fitted: dict[str, tuple[Observed, tuple[int, ...]]] = {"actions": (demo.actions, (control_size,))}
+    fitted |= {f"obs/{key}": (known[key], tuple(shape)) for key, shape in shapes.items()}
+    for place, (array, expected) in fitted.items():
+        if array.shape[1:] != expected:
+            raise DemonstrationsError(
+                f"{demo.name}: {place} has shape {array.shape[1:]} at each step, the run was fitted to {expected}"
+            )
+        if why := network_input(array.shape[1:], array.dtype)[1]:
+            raise DemonstrationsError(f"{demo.name}: {place} {why}")
+
+
+# --- numbers ----------------------------------------------------------------------------------------------------------
+
+
+def number(value: float) -> str:
+    """A value with as few digits as identify it in its type, single or double; never as minus zero."""
+    value = float(value) + 0.0
+    if value.is_integer() and abs(value) < 1e16:
+        return str(int(value))
+    with np.errstate(over="ignore"):
+        single = np.float32(value)
+    return str(single) if float(single) == value else str(value)
+
+
+COPIES = 4.0 + 16.0
+"""Bytes per number beyond the array as read: float32 in a padded batch, and two temporary float64 copies."""
+
+
+def needed(demos: Iterable[Demonstration], copies: float = COPIES) -> float:
+    """Bytes for demonstrations, by the shapes of their arrays: the arrays as read, and copies padded to the longest.
+
+    Pictures that stay in their file count for nothing.
+
+    :param copies: bytes of a number beyond the array as read.
+    """
+    count, longest, size, features = 0, 0, 0, 0
+    for demo in demos:
+        count, longest, numbers = count + 1, max(longest, len(demo)), 0
+        for place, array in demo.arrays().items():
+            if not (isinstance(array, LazyArray) and is_picture(array)):
+                size += math.prod(array.shape) * (1 if array.dtype == np.uint8 else 8)
+            if not (place.startswith("labels/") or is_picture(array)):
+                numbers += math.prod(array.shape[1:])
+        features = max(features, numbers)
+    return PROGRAM + size + copies * features * count * longest
