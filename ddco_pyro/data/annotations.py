@@ -89,8 +89,8 @@ def labels_of_table(table: LabelTable, source: Source) -> TableLabels:
 COLUMNS = {
     "demonstration": ("File Name", "Observation id"),
     "label": ("Behavior",),
-    "start": ("Begin Time - msec", "Begin Time - ss.msec", "Start (s)"),
-    "stop": ("End Time - msec", "End Time - ss.msec", "Stop (s)"),
+    "start": ("Begin Time - ss.msec", "Begin Time - msec", "Start (s)"),
+    "stop": ("End Time - ss.msec", "End Time - msec", "Stop (s)"),
 }
 """The columns of ELAN's tab-delimited text and of BORIS' aggregated events, by role."""
 

@@ -425,7 +425,7 @@ def test_an_interrupted_import_leaves_nothing_and_one_that_is_there_is_not_repla
             raise Stopped
 
     with pytest.raises(Stopped):
-        import_demonstrations(ROBOMIMIC, out, on_recording=stop)
+        import_demonstrations(ROBOMIMIC, out, on_demonstration=stop)
     assert not any(tmp_path.iterdir())
     import_demonstrations(ROBOMIMIC, out)
     assert [path.name for path in tmp_path.iterdir()] == ["demos.hdf5"]
