@@ -62,12 +62,13 @@ class Demonstration:
         for what, arrays in (("observations", self.observations), ("labels", self.labels)):
             if not isinstance(arrays, Mapping) or not all(isinstance(key, str) for key in arrays):
                 raise DemonstrationsError(f"{self.name}: {what} have to be a mapping of names to arrays [T, ...]")
-        self._arrange(**vars(self))
-        check(self)
-        observations = {key: _ready(array) for key, array in self.observations.items()}
-        actions = self.actions.astype(np.int64 if self.actions.dtype.kind in "iu" else np.float64)
-        labels = {key: values.astype(np.int64) for key, values in self.labels.items()}
-        self._arrange(self.name, observations, actions, labels, self.attributes)
+        given = Demonstration.stored(**vars(self))
+        check(given)
+        vars(self).update(
+            observations={key: _ready(array) for key, array in given.observations.items()},
+            actions=given.actions.astype(np.int64 if given.actions.dtype.kind in "iu" else np.float64),
+            labels={key: values.astype(np.int64) for key, values in given.labels.items()},
+        )
         check_values(self, f"repair it, or leave {self.name} out (demonstrations.exclude)")
 
     @classmethod
@@ -81,42 +82,28 @@ class Demonstration:
     ) -> Demonstration:
         """A demonstration as its source stores it: of any types, observations lazy or not, and not yet checked.
 
+        Pictures get their channels last, whole numbers as controls [T] become [T, 1], and labels [T, 1] become [T].
         ``Demonstration(**vars(stored))`` is the same, checked and ready for a fit.
-        """
-        demo = object.__new__(cls)
-        demo._arrange(name, observations, actions, labels, attributes)
-        return demo
-
-    def _arrange(
-        self,
-        name: str,
-        observations: Mapping[str, Any],
-        actions: Any,
-        labels: Mapping[str, Any],
-        attributes: Mapping[str, Attribute],
-    ) -> None:
-        """Pictures get their channels last, whole numbers as controls [T] become [T, 1], and labels [T, 1] become [T].
 
         :raises DemonstrationsError: something is no array.
         """
 
         def array(place: str, values: Any) -> Any:
-            if isinstance(values, LazyArray):
-                return values
             try:
-                return turned(np.asarray(values))
+                return values if isinstance(values, LazyArray) else turned(np.asarray(values))
             except (ValueError, TypeError, RuntimeError) as error:
                 raise DemonstrationsError(f"{name}: {place} is no array: {' '.join(str(error).split())}") from None
 
-        control = array("actions", actions)
+        demo, control = object.__new__(cls), array("actions", actions)
         known = {key: array(f"labels/{key}", values) for key, values in labels.items()}
-        vars(self).update(
+        vars(demo).update(
             name=name,
             observations={key: array(f"obs/{key}", values) for key, values in observations.items()},
             actions=control[:, None] if control.dtype.kind in "iu" and control.ndim == 1 else control,
             labels={key: values[:, 0] if values.shape[1:] == (1,) else values for key, values in known.items()},
             attributes=attributes,
         )
+        return demo
 
     def arrays(self) -> dict[str, Observed]:
         """Every array by its place: ``actions``, ``obs/<key>``, ``labels/<name>``."""

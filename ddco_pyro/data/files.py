@@ -143,7 +143,7 @@ def _check_writable(output: Output) -> None:
     if place.is_file() and not os.access(place, os.W_OK):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
     there = next(path for path in (place, *place.parents) if path.is_dir())
-    temporary = f"{_prefix(place)}{os.getpid()}-{'x' * 8}{_REPLACED}"  # of the greatest length
+    temporary = f"{_prefix(place)}{os.getpid()}-{'x' * 8}{2 * _TEMPORARY}"  # of the greatest length
     names = (*place.relative_to(there).parts, temporary)
     if max(len(os.fsencode(name)) for name in names) > os.pathconf(there, "PC_NAME_MAX"):
         raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG))
@@ -192,16 +192,9 @@ def _flush(path: Path) -> None:
             os.fsync(written.fileno())
 
 
-_REPLACED = f"-replaced{_TEMPORARY}"
-"""Suffix of the name of a folder that is being replaced."""
-
-
 @contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
     """A temporary folder that replaces ``path`` when the block ends without an error.
-
-    The replacement takes two renames. If a process is killed between them, the old folder keeps a temporary name until
-    the next process that writes there restores it.
 
     :raises NoSpace: the disk is full.
     :raises NotWritable: nothing may be written there.
@@ -209,7 +202,7 @@ def whole_folder(path: Path) -> Iterator[Path]:
     with _explained(path):
         place = _target(path)
         temporary = Path(tempfile.mkdtemp(prefix=_prepared(place), suffix=_TEMPORARY, dir=place.parent))
-        replaced = temporary.with_name(temporary.name.removesuffix(_TEMPORARY) + _REPLACED)
+        replaced = temporary.with_name(f"{temporary.name}{_TEMPORARY}")
         try:
             yield temporary
             for file in temporary.rglob("*"):
@@ -219,27 +212,20 @@ def whole_folder(path: Path) -> Iterator[Path]:
                 place.rename(replaced)
             temporary.rename(place)
         finally:
-            _put_back(replaced, place)
+            if replaced.exists() and not place.exists():
+                replaced.rename(place)
             for old in (replaced, temporary):
                 shutil.rmtree(old, ignore_errors=True)
-
-
-def _put_back(replaced: Path, place: Path) -> None:
-    if replaced.exists() and not place.exists():
-        replaced.rename(place)
 
 
 def _prepared(place: Path) -> str:
     """The prefix of this process's temporary names beside ``place``, after cleaning up.
 
-    Temporary files that killed processes of this machine left for ``place`` are removed; a folder that one of them was
-    replacing is restored.
+    Temporary files that killed processes of this machine left for ``place`` are removed.
     """
     place.parent.mkdir(parents=True, exist_ok=True)
     prefix = _prefix(place)
     for old in place.parent.glob(f"{glob.escape(prefix)}*{_TEMPORARY}"):
-        if old.name.endswith(_REPLACED):
-            _put_back(old, place)
         process = old.name.removeprefix(prefix).partition("-")[0]
         if process.isdecimal() and not Path(f"/proc/{process}").exists():
             shutil.rmtree(old, ignore_errors=True) if old.is_dir() else old.unlink(missing_ok=True)

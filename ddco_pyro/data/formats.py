@@ -26,14 +26,13 @@ class Format(NamedTuple):
 
 
 def _minari(path: Path, names: Collection[str]) -> bool:
-    if path.is_file():
-        return path.name == "main_data.hdf5" and path.with_name("metadata.json").is_file()
-    return (path / "data" / "metadata.json").is_file() or (path / "metadata.json").is_file()
+    folders = (path.parent,) if path.name == "main_data.hdf5" else (path / "data", path)
+    return any((folder / "metadata.json").is_file() for folder in folders)
 
 
 def _act(path: Path, names: Collection[str]) -> bool:
-    return {"action", "observations"} <= {*names} or (
-        path.is_dir() and any(one.suffix in (".hdf5", ".h5") for one in path.glob("episode_*"))
+    return {"action", "observations"} <= {*names} or any(
+        one.suffix in (".hdf5", ".h5") for one in path.glob("episode_*")
     )
 
 

@@ -144,19 +144,12 @@ class Field:
 
     def as_json(self) -> dict[str, Any]:
         """The statistics as plain data."""
-        data = asdict(self)
         ends = {
-            name: [float(value) if np.isfinite(value) else None for value in data[name]]
+            name: [float(value) if np.isfinite(value) else None for value in getattr(self, name)]
             for name in ("minimum", "maximum")
         }
-        shown = {
-            "dtype": str(self.dtype),
-            "shape": list(self.shape),
-            "constant": self.constant,
-            "rounding": self.rounding,
-            "values": sorted(self.values),
-        }
-        return data | ends | shown
+        shown = {"dtype": str(self.dtype), "shape": [*self.shape], "values": sorted(self.values)}
+        return asdict(self) | ends | shown | {"constant": self.constant, "rounding": self.rounding}
 
 
 @dataclass(frozen=True)
@@ -206,12 +199,6 @@ class Inspection:
         auto = control_parts(ControlSpec(), self.control) if self.control else ()
         kinds = (f"{line}, by control.kind: auto" for line in described(auto))
         return [*self.exclusions, *notes(self.control), *self.coincidences, *kinds]
-
-    @property
-    def affected(self) -> list[str]:
-        """Names of the demonstrations with unusable values, in order."""
-        names = {name for array in self.fields.values() for name in array.affected}
-        return [name for name in self.lengths if name in names]
 
     @property
     def observations(self) -> list[Field]:

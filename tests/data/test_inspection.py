@@ -108,7 +108,6 @@ def test_values_that_cannot_be_used_have_a_place(path: Path) -> None:
     assert (pose.nan, pose.infinite, pose.huge) == (1, 0, 1 + 3)
     assert (pose.first, pose.affected) == (("demo_3", 2), ["demo_3", "demo_4"])
     assert (goal.first, goal.affected) == (("demo_4", 2), ["demo_4"])
-    assert found.affected == ["demo_3", "demo_4"]
     assert found.problems == [
         "obs/goal has 0 NaN and 2 infinite values, the first in demo_4 at step 2; 1 of 5 demonstrations is affected",
         "obs/pose has 1 NaN and 0 infinite values and 4 beyond ±1e+30, the first in demo_3 at step 2; 2 of 5 "

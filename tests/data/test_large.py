@@ -14,7 +14,6 @@ from command_line import call
 from large import measured, zeros
 
 from ddco_pyro.data import memory
-from ddco_pyro.training.data import demonstrations
 
 GIGABYTE = 10**9
 LIMIT = 2 * GIGABYTE
@@ -86,40 +85,3 @@ def test_looking_does_not_take_more_than_a_block(tmp_path: Path) -> None:
     assert (base.status, found.status) == (0, 0)
     assert "3 demonstrations of 10000 to 10000 steps" in found.out
     assert found.peak - base.peak < 150e6  # of 240 MB
-
-
-@pytest.mark.slow
-def test_a_file_that_really_has_more_than_memory(tmp_path: Path, toy_run, toy_spec) -> None:
-    """2.6 GB of noise for pictures, which no network sees: all goes through, and is right."""
-    path, number, steps = tmp_path / "demos.hdf5", 26, 500
-    originals = list(demonstrations(toy_spec))
-    random = np.random.default_rng(0)
-    with h5py.File(path, "w") as file:
-        for index in range(number):
-            group = file.create_group(f"data/demo_{index}")
-            one = originals[index % len(originals)]
-            rows = np.resize(np.arange(len(one)), steps)
-            for key in ("offsets", "visited"):
-                group[f"obs/{key}"] = one.observations[key][rows]
-            group["actions"] = one.actions[rows]
-            group.create_dataset("obs/camera", data=random.integers(0, 256, (steps, 250, 267, 3), dtype=np.uint8))
-    assert path.stat().st_size > 2.6 * GIGABYTE
-    peaks = {}
-
-    def run(*arguments: object) -> str:
-        ended = measured(*arguments)
-        assert ended.status == 0, ended.err
-        peaks[arguments[0]] = ended.peak
-        return ended.out
-
-    assert "26 demonstrations of 500 to 500 steps" in run("inspect", path)
-    run("init", path, "--out", tmp_path / "spec.yaml")
-    run("fit", tmp_path / "spec.yaml", "--out", tmp_path / "run", "--set", "training.epochs=2")
-    run("segment", toy_run.folder, path, "--in-place", "--html", tmp_path / "a.html")
-    run("import", path, "--out", tmp_path / "imported.hdf5")
-    print({name: f"{peak / 1e6:.0f} MB" for name, peak in peaks.items()})
-    assert max(peaks.values()) < LIMIT
-    with h5py.File(path) as file, h5py.File(tmp_path / "imported.hdf5") as imported:
-        for name in ("demo_0", "demo_25"):
-            for key in ("actions", "obs/camera", "labels/option"):
-                np.testing.assert_array_equal(imported[f"data/{name}/{key}"], file[f"data/{name}/{key}"])

@@ -183,37 +183,6 @@ def test_a_folder_that_is_cut_off_leaves_what_was_there(tmp_path, error):
     assert (tmp_path / "folder").stat().st_mode & 0o777 == 0o755
 
 
-class Killed(BaseException):
-    """Where a process was killed: nothing of it runs after that."""
-
-
-@pytest.mark.parametrize("step", ["before the first", "between the two", "after the second"])
-def test_a_folder_is_there_whole_wherever_its_writer_was_killed(tmp_path, monkeypatch, step):
-    """Killed before or after each of the two renames, the folder is the old or the new one once it is written again."""
-    path, rename = tmp_path / "folder", Path.rename
-    write_folder(path, "old")
-    dead, renamed = forked.run(os.getpid).value, []
-
-    def killed(self, target):
-        done = {"before the first": 0, "between the two": 1, "after the second": 2}[step]
-        if len(renamed) < done:
-            renamed.append(rename(self, target))
-        if len(renamed) == done:
-            raise Killed
-
-    with monkeypatch.context() as patched:
-        patched.setattr("os.getpid", lambda: dead)
-        patched.setattr(Path, "rename", killed)
-        patched.setattr("shutil.rmtree", lambda *_, **__: None)
-        patched.setattr("ddco_pyro.data.files._put_back", lambda *_: None)
-        with pytest.raises(Killed):
-            write_folder(path, "new")
-    assert path.exists() == (step != "between the two")
-    with whole_folder(tmp_path / "folder"):  # the next writer
-        assert contents(path)["deeper/file"] == ("new" if step == "after the second" else "old")
-    assert [one.name for one in tmp_path.iterdir()] == ["folder"]
-
-
 def test_a_link_stays_and_what_it_leads_to_is_replaced(tmp_path):
     (tmp_path / "there").mkdir()
     link, folder = tmp_path / "link", tmp_path / "folder"
