@@ -124,6 +124,11 @@ def is_picture(array: Observed) -> bool:
     return array.dtype == PICTURES and len(array.shape) == 1 + PICTURE_DIMENSIONS
 
 
+def in_file(array: Observed) -> bool:
+    """Whether an array is pictures that stay in their file until they are shown or a network reads them."""
+    return isinstance(array, LazyArray) and bool(array.file) and is_picture(array)
+
+
 def channels_last(shape: tuple[int, ...], dtype: np.dtype[Any]) -> tuple[int, ...]:
     """The shape [T, H, W, C] of pictures stored as [T, C, H, W] or [T, H, W]; any other shape unchanged.
 

@@ -16,6 +16,7 @@ from ddco_pyro.data.arrays import (
     LazyArray,
     Observed,
     blocks,
+    in_file,
     is_picture,
     network_input,
     no_numbers,
@@ -124,7 +125,7 @@ class Demonstration:
 
 def _ready(array: Observed) -> Observed:
     """An observation as fits read it; pictures in files stay lazy."""
-    if isinstance(array, LazyArray) and is_picture(array):
+    if in_file(array):
         return array
     values = np.asarray(array)
     return values if values.dtype == np.uint8 else values.astype(np.float64)
@@ -267,7 +268,7 @@ def needed(demos: Iterable[Demonstration], copies: float = COPIES) -> float:
     for demo in demos:
         count, longest, numbers = count + 1, max(longest, len(demo)), 0
         for place, array in demo.arrays().items():
-            if not (isinstance(array, LazyArray) and is_picture(array)):
+            if not in_file(array):
                 size += math.prod(array.shape) * (1 if array.dtype == np.uint8 else 8)
             if not (place.startswith("labels/") or is_picture(array)):
                 numbers += math.prod(array.shape[1:])

@@ -231,7 +231,7 @@ def _slower(array: Observed, frames: int) -> Observed:
                 yield block[middle % frames :: frames]
                 middle -= len(block)
 
-        return replace(array, shape=(steps, *array.shape[1:]), read=read)
+        return replace(array, shape=(steps, *array.shape[1:]), read=read, file="")
     rows = np.asarray(array)[: steps * frames].reshape(steps, frames, *array.shape[1:])
     return rows.mean(1, dtype=np.float64).astype(array.dtype) if array.dtype.kind == "f" else rows[:, frames // 2]
 

@@ -7,7 +7,7 @@ from itertools import takewhile
 
 import numpy as np
 
-from ddco_pyro.data.arrays import PICTURE_DIMENSIONS, LazyArray, Observed, is_picture
+from ddco_pyro.data.arrays import PICTURE_DIMENSIONS, Observed, in_file
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.sources import Source
 from ddco_pyro.spec import PathSpec
@@ -184,18 +184,12 @@ def stored_pictures(source: Source, lengths: Mapping[str, int]) -> list[Observed
     """
     if not set(lengths) <= set(source.names):
         return []
-    first = (
-        next(
-            (array for array in source.read(name).observations.values() if _stored(array) and len(array) == steps), None
-        )
-        for name, steps in lengths.items()
-    )
-    return _all_or_none(first, len(lengths))
 
+    def first(name: str) -> Observed | None:
+        arrays = source.read(name).observations.values()
+        return next((array for array in arrays if in_file(array) and len(array) == lengths[name]), None)
 
-def _stored(array: Observed) -> bool:
-    """Whether an array has pictures that are stored as they are shown."""
-    return isinstance(array, LazyArray) and is_picture(array) and bool(array.file)
+    return _all_or_none(map(first, lengths), len(lengths))
 
 
 def _all_or_none(arrays: Iterable[Observed | None], count: int) -> list[Observed]:
