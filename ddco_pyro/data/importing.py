@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -92,23 +91,22 @@ def import_demonstrations(
         about = {**whole.attributes, **({FREQUENCY: rate} if rate else {})}
         about |= {LABEL_NAMES: table.names} if table else {}
         about |= {"source": Path(source).name, "source_format": whole.format}
-        if not choice.skip_broken:  # before pictures are decoded
-            _check_all(whole, names, choice)
+        left_out = _unusable(whole, names, choice)  # before pictures are decoded
+        _refuse(left_out, names, choice)
         first: Demonstration | None = None
-        left_out = dict[str, str]()
         with robomimic_file(out, about, masks) as data:
             for number, name in enumerate(names):
-                try:
-                    demo = _usable(whole, name, choice, first)
-                    check_values(demo, pictures=choice.skip_broken)
-                    write_demonstration(data, demo)
-                except DemonstrationsError as error:
-                    if not choice.skip_broken:
-                        raise _advised(error, whole, names, choice) from None
-                    left_out[name] = str(error)
-                else:
-                    notes = notes if first else [*_unread(whole.read(name), demo.observations), *notes]
-                    first = first or demo
+                if name not in left_out:
+                    try:
+                        demo = _chosen(whole, name, choice)
+                        check_values(demo, pictures=choice.skip_broken)
+                        write_demonstration(data, demo)
+                    except DemonstrationsError as error:
+                        left_out[name] = error
+                        _refuse(left_out, names, choice)
+                    else:
+                        notes = notes if first else [*_unread(whole.read(name), demo.observations), *notes]
+                        first = first or demo
                 on_demonstration(number + 1, len(names))
             if first is None:
                 why = next(iter(left_out.values()), "there is none")
@@ -116,37 +114,36 @@ def import_demonstrations(
             written = tuple(name for name in whole.names if name in data)
             kept = {mask: tuple(name for name in members if name in data) for mask, members in whole.masks.items()}
             masks |= {mask: members for mask, members in kept.items() if members}
-    return Imported(out, written, left_out, tuple(notes), counts)
+    reasons = {name: str(error) for name, error in left_out.items()}
+    return Imported(out, written, reasons, tuple(notes), counts)
 
 
-def _usable(source: Source, name: str, choice: Choice, first: Demonstration | None = None) -> Demonstration:
-    """The chosen part of a demonstration, which is usable as far as is known without reading lazy values."""
-    demo = _chosen(source, name, choice)
-    check(demo, first)
-    return demo
-
-
-def _check_all(source: Source, names: tuple[str, ...], choice: Choice) -> None:
-    """Refuse the first demonstration that cannot be used beside the others; no lazy value is read."""
+def _unusable(source: Source, names: Sequence[str], choice: Choice) -> dict[str, DemonstrationsError]:
+    """Why demonstrations cannot be used beside the others, as far as is known without reading lazy values."""
     first: Demonstration | None = None
-    try:
-        for name in names:
-            demo = _usable(source, name, choice, first)
-            first = first or demo
-    except DemonstrationsError as error:
-        raise _advised(error, source, names, choice) from None
-
-
-def _advised(error: DemonstrationsError, source: Source, names: tuple[str, ...], choice: Choice) -> DemonstrationsError:
-    """The error, with the advice to leave demonstrations out where one of them can be used."""
+    left_out = dict[str, DemonstrationsError]()
     for name in names:
-        with suppress(DemonstrationsError):
-            check_values(_usable(source, name, choice), pictures=True)
-            return DemonstrationsError(f"{error}; or leave such ones out with --skip-broken")
-    return error
+        try:
+            demo = _chosen(source, name, choice)
+            check(demo, first)
+            first = first or demo
+        except DemonstrationsError as error:
+            left_out[name] = error
+    return left_out
 
 
-def _names(source: Source, choice: Choice) -> tuple[str, ...]:
+def _refuse(left_out: Mapping[str, DemonstrationsError], names: Sequence[str], choice: Choice) -> None:
+    """Refuse unusable demonstrations, with the advice to leave them out where others are left.
+
+    :raises DemonstrationsError: there are any, and they are not to be left out.
+    """
+    if left_out and not choice.skip_broken:
+        advice = "; or leave such ones out with --skip-broken" if len(left_out) < len(names) else ""
+        error = next(iter(left_out.values()))
+        raise DemonstrationsError(f"{error}{advice}", error.located)
+
+
+def _names(source: Source, choice: Choice) -> Sequence[str]:
     if choice.mask is None:
         return source.names
     if choice.mask not in source.masks:

@@ -152,7 +152,7 @@ class Field:
         return asdict(self) | ends | shown | {"constant": self.constant, "rounding": self.rounding}
 
 
-@dataclass(frozen=True)
+@dataclass
 class Inspection:
     """The contents of a file of demonstrations.
 
@@ -171,19 +171,19 @@ class Inspection:
 
     path: Path
     format: str
-    lengths: Mapping[str, int]
-    fields: Mapping[str, Field]
     masks: Mapping[str, tuple[str, ...]]
     frequency: float | None
+    lengths: dict[str, int] = field(default_factory=dict)
+    fields: dict[str, Field] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
     control: tuple[ControlDimension, ...] = ()
     coincidences: tuple[str, ...] = ()
     leaks: tuple[str, ...] = ()
     excluded: tuple[str, ...] = ()
-    unreadable: tuple[str, ...] = ()
+    unreadable: list[str] = field(default_factory=list)
     odd: Mapping[str, str] = field(default_factory=dict)
     turns: Mapping[str, tuple[tuple[int, ...], tuple[int, ...]]] = field(default_factory=dict)
-    attributes: Mapping[str, Mapping[str, Attribute]] = field(default_factory=dict)
+    attributes: dict[str, Mapping[str, Attribute]] = field(default_factory=dict)
 
     @property
     def exclusions(self) -> list[str]:
@@ -242,73 +242,57 @@ def inspect(path: str | Path, form: str | None = None, exclude: Sequence[str] = 
     :raises DemonstrationsError: the source cannot be read, or holds no demonstrations.
     """
     with open_source(path, form) as source:
-        return _Inspector(source, tuple(exclude)).inspection(Path(path))
+        masks = {mask: tuple(name for name in members if name not in exclude) for mask, members in source.masks.items()}
+        found = Inspection(Path(path), source.format, masks, source.frequency, excluded=tuple(exclude))
+        _Inspector(source, found).read([name for name in source.names if name not in exclude])
+    return found
 
 
 class _Inspector:
     """One pass over all arrays of a source, which feeds every statistic."""
 
-    def __init__(self, source: Source, exclude: tuple[str, ...]) -> None:
-        self.source, self.exclude = source, exclude
-        self.fields: dict[str, Field] = {}
-        self.lengths: dict[str, int] = {}
-        self.attributes: dict[str, Mapping[str, Attribute]] = {}
+    def __init__(self, source: Source, found: Inspection) -> None:
+        self.source, self.found = source, found
         self.problems: dict[tuple[str, str], list[str]] = {}  # messages by kind and subject
         self.controls: dict[str, np.ndarray] = {}
         self.copies, self.leaks = Copies(), Leaks()
         self.jumps: dict[str, Jumps] = {}
 
-    def inspection(self, path: Path) -> Inspection:
-        """Read everything."""
-        source, exclude, fields = self.source, self.exclude, self.fields
-        unreadable: list[str] = []
-        places: dict[str, Collection[str]] = {}
-        names = [name for name in source.names if name not in exclude]
+    def read(self, names: Sequence[str]) -> None:
+        """Read these demonstrations."""
+        found, fields, places = self.found, self.found.fields, dict[str, Collection[str]]()
         for name in names:
             try:
                 places[name] = self._read(name)
             except DemonstrationsError as error:
                 self._problem("unreadable", str(error), re.sub(r"\d+", "", str(error).removeprefix(name)))
-                unreadable.append(name)
+                found.unreadable.append(name)
                 self.copies.digests.pop(name, None)
                 self.controls.pop(name, None)
         for name, there in places.items():
             for place in (place for place in fields if place not in there):
                 self._problem("missing", f"{name}: {place} is missing", place)
-        masks = {mask: tuple(name for name in members if name not in exclude) for mask, members in source.masks.items()}
         self._name_labels()
-        dimensions = control_dimensions(self.controls)
-        varying = [dimension.number for dimension in dimensions if not dimension.constant]
+        found.control = control_dimensions(self.controls)
+        found.odd = self._odd(found.control)
+        varying = [dimension.number for dimension in found.control if not dimension.constant]
         kinds = (
             messages[0] if len(messages) == 1 else f"{messages[0]}; the first of {len(messages)} such"
             for messages in self.problems.values()
         )
+        found.problems = [*kinds, *_problems_of_division(self.source, names, found.masks), *_problems(found)]
         ends = {place: (fields[place].minimum, fields[place].maximum) for place in self.jumps}
         turns = {
             place: (tuple(jumps.angles(*ends[place])["2π"]), tuple(jumps.quaternions))
             for place, jumps in self.jumps.items()
         }
-        return Inspection(
-            path=path,
-            format=source.format,
-            lengths=self.lengths,
-            fields=fields,
-            masks=masks,
-            frequency=source.frequency,
-            problems=[*kinds, *_problems_of_division(source, names, masks), *_problems(fields, self.lengths)],
-            control=dimensions,
-            coincidences=(
-                *self.copies.notes(masks),
-                *self.leaks.notes(varying, list(self.copies.digests)),
-                *(note for place, jumps in self.jumps.items() for note in jumps.notes(place, *ends[place])),
-            ),
-            turns={place: each for place, each in turns.items() if any(each)},
-            leaks=tuple(place for place, array in fields.items() if self.leaks.whole(place, varying, array.constant)),
-            excluded=exclude,
-            unreadable=tuple(unreadable),
-            odd=self._odd(dimensions),
-            attributes=self.attributes,
+        found.turns = {place: each for place, each in turns.items() if any(each)}
+        found.coincidences = (
+            *self.copies.notes(found.masks),
+            *self.leaks.notes(varying, list(self.copies.digests)),
+            *(note for place, jumps in self.jumps.items() for note in jumps.notes(place, *ends[place])),
         )
+        found.leaks = tuple(place for place in fields if self.leaks.whole(place, varying, fields[place].constant))
 
     def _odd(self, dimensions: Sequence[ControlDimension]) -> dict[str, str]:
         """Names of demonstrations to exclude, and why.
@@ -321,20 +305,20 @@ class _Inspector:
         still = {name: rows for name, rows in long.items() if same(rows.min(0).astype(float), rows.max(0)).all()}
         dead = [name for name, rows in still.items() if not rows.any()]
         others = [name for name in still if name not in dead]
-        reasons = dict.fromkeys(dead, "all commands are 0") if 2 * len(dead) < len(self.lengths) else {}
-        if len(others) <= most_few(len(self.lengths)):
+        reasons = dict.fromkeys(dead, "all commands are 0") if 2 * len(dead) < len(self.found.lengths) else {}
+        if len(others) <= most_few(len(self.found.lengths)):
             reasons |= dict.fromkeys(others, "all commands are the same")
         for dimension in dimensions:
             for name in () if dimension.values else dimension.exceptions:
                 reasons.setdefault(
                     name, f"control dimension {dimension.number} has further values there, and is a switch elsewhere"
                 )
-        return {name: reasons[name] for name in self.lengths if name in reasons}
+        return {name: reasons[name] for name in self.found.lengths if name in reasons}
 
     def _name_labels(self) -> None:
         try:
             for name, names in label_names(self.source.attributes).items():
-                if array := self.fields.get(f"labels/{name}"):
+                if array := self.found.fields.get(f"labels/{name}"):
                     array.names = names
         except DemonstrationsError as error:
             self._problem("names", str(error), "labels")
@@ -342,15 +326,15 @@ class _Inspector:
     def _read(self, name: str) -> Collection[str]:
         """Read a demonstration; the places of its arrays."""
         demo = self.source.read(name)
-        self.lengths[name], self.attributes[name] = len(demo), demo.attributes
+        self.found.lengths[name], self.found.attributes[name] = len(demo), demo.attributes
         self.copies.digests[name] = hashlib.sha256()
         arrays = demo.arrays()
         for place, array in arrays.items():
-            field = self.fields.get(place) or Field(place, array.shape[1:], array.dtype, np.zeros(0), np.zeros(0))
+            field = self.found.fields.get(place) or Field(place, array.shape[1:], array.dtype, np.zeros(0), np.zeros(0))
             if problem := unlike(array, len(demo), field.shape, "the first"):
                 self._problem("shape", f"{name}: {place} {problem}", place)
                 continue
-            self.fields[place] = field
+            self.found.fields[place] = field
             field.demonstrations += 1
             field.video = field.video or (isinstance(array, LazyArray) and array.video)
             if not field.video and field.numeric:
@@ -395,8 +379,8 @@ def _problems_of_division(source: Source, names: Sequence[str], masks: Mapping[s
             yield str(error)
 
 
-def _problems(fields: Mapping[str, Field], lengths: Mapping[str, int]) -> Iterator[str]:
-    for array in fields.values():
+def _problems(found: Inspection) -> Iterator[str]:
+    for array in found.fields.values():
         if problem := array.problem:
             yield f"{array.place} {problem}"
         if array.first is not None:
@@ -406,6 +390,6 @@ def _problems(fields: Mapping[str, Field], lengths: Mapping[str, int]) -> Iterat
                 f"{array.place} has {array.unusable}, the first in {name} at step {step}; "
                 f"{affected} of {array.demonstrations} demonstrations {'is' if affected == 1 else 'are'} affected"
             )
-    empty = [name for name, steps in lengths.items() if steps == 0]
+    empty = [name for name, steps in found.lengths.items() if steps == 0]
     if empty:
         yield f"{', '.join(empty[:3])}{' ...' if len(empty) > 3 else ''}: no steps"
