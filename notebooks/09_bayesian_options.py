@@ -413,5 +413,4 @@ plt.show()
 
 # %% [markdown]
 # The p-values are those of seven weights and of the log-likelihood. With the right model none is small. A posterior
-# with memoryless options is rejected. `tests/model/test_bayesian.py` repeats this test, and tests a Gibbs sampler with
-# `sample_paths` in the same way.
+# with memoryless options is rejected.

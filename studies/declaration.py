@@ -122,6 +122,7 @@ class Declaration(Model):
     families: dict[Text, Annotated[Items[Text], Field(min_length=2)]] = Field(default={})
     failed: dict[Text, float] = Field(default={})
     pinned: bool = False
+    exploratory: bool = False  # contrasts were declared after the results, or tasks chose the methods
     kept: Items[KeptSpec] = ()
 
     def problems(self) -> Problems:

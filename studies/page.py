@@ -163,7 +163,8 @@ class Numbers:
         form = settings.get("form") or (".0%" if measure.startswith("success") else ".2f")
         form = f"+{form}" if difference and not (alone and "form" in settings) else form
         text = SHOWN[show](known, form).replace("-", "−")
-        return f"**{text}**" if show in ("interval", "±") and verdict in (HOLDS, FAILS) else text
+        declared = study is not None and not study.declared.exploratory
+        return f"**{text}**" if declared and show in ("interval", "±") and verdict in (HOLDS, FAILS) else text
 
 
 def report(folder: Folder, state: State) -> str:

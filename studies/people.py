@@ -1,15 +1,15 @@
 """Gestures of surgeons: options without labels, and with a few, beside what a user would try instead (JIGSAWS).
 
-    python -m studies.people --data FOLDER [--tasks Knot_Tying Suturing] [--splits last surgeon trial pusht]
+    python -m studies.people --data FOLDER [--tasks Knot_Tying Suturing] [--splits last surgeon trial]
         [--labelled 0 1 3 5 all] [--jobs 2]
 
 FOLDER holds ``TASK.hdf5``, of ``ddco-pyro import JIGSAWS/TASK --hz 10``. No licence lets anyone share these data; Johns
 Hopkins University gives them on request.
 
 ``last`` holds out the last trial of each surgeon. ``trial`` and ``surgeon`` are the official splits: each trial, and
-each surgeon, is held out in turn. ``pusht`` is pushing by mouse without labels, ``FOLDER/pusht_human.hdf5``. The spec
-is what ``ddco-pyro init`` writes for the training demonstrations. Labelled demonstrations are spread evenly over them.
-A cell that was done is not done again. Adds its numbers to ``docs/results/people.csv``.
+each surgeon, is held out in turn. The spec is what ``ddco-pyro init`` writes for the training demonstrations. Labelled
+demonstrations are spread evenly over them. A cell that was done is not done again. Adds its numbers to
+``docs/results/people.csv``.
 """
 
 from __future__ import annotations
@@ -44,13 +44,11 @@ from ddco_pyro.selection.small import decide
 from ddco_pyro.spec import parse_spec, with_overrides
 from ddco_pyro.spec.yaml import read_yaml
 from ddco_pyro.statistics import edit_score
-from ddco_pyro.training.data import demonstrations as read_demonstrations
-from ddco_pyro.training.data import parts
 from studies import study
 from studies.study import Cell, Row, Settings, described
 
 LABELS, KNOWN = "gesture", "known"
-ALL, SPLITS = "all", ["last", "surgeon", "trial", "pusht"]
+ALL, SPLITS = "all", ["last", "surgeon", "trial"]
 SECOND = 10  # steps
 DEFAULTS = Settings({"seed": 0}, Path("runs/people"))
 
@@ -133,52 +131,6 @@ class PeopleCell(Cell):
                 yield Row(split, self.task, named, None, own or 0, measure, value)
 
 
-@dataclass(frozen=True)
-class PushTCell(Cell):
-    """PushT has no labels: how long segments are, and how much fits with other training seeds agree."""
-
-    data: str
-    method: str
-
-    @property
-    def name(self) -> str:
-        """Of its files."""
-        return f"PushT-{self.method}"
-
-    def depends(self, settings: Settings) -> dict[str, Any]:
-        """What decides its results; the place of the data does not."""
-        return super().depends(settings) | {"seeds": SEEDS}
-
-    def results(self, settings: Settings, folder: Path) -> dict[str, Any]:
-        """Fit with each seed, and compare the segments of the held-out demonstrations."""
-        path = Path(self.data) / "pusht_human.hdf5"
-        facts = inspect(path)
-        decided = decide(parse_spec(read_yaml(starting_spec(facts, path).text)), Demonstrations.read(path), SECOND)
-        spec = with_overrides(parse_spec(read_yaml(starting_spec(facts, path, decided=decided).text)), ALONE)
-        spec = with_overrides(spec, USUAL if self.method == "options, β = 1" else {})
-        demos = read_demonstrations(spec)
-        train, valid = (parts(spec, demos)[part] for part in ("train", "valid"))
-        if self.method == "windowed k-means":
-            found, count = fit(spec, demos), spec.hierarchy.levels[0].count if spec.hierarchy else 1
-            kinds = [clusters(found, train, valid, count, seed) for seed in range(SEEDS)]
-        else:
-            fits = [fit(with_overrides(spec, {"training.seed": seed}), demos) for seed in range(SEEDS)]
-            kinds = [list(each.segment(valid)[0]) for each in fits]
-        pairs = itertools.combinations(map(np.concatenate, kinds), 2)
-        return {
-            "median": [typical_length(own) / SECOND for own in kinds],
-            "segments": [float(np.mean([1 + (np.diff(row) != 0).sum() for row in own])) for own in kinds],
-            "NMI of pairs": [float(normalized_mutual_info_score(*pair)) for pair in pairs],
-        }
-
-    def rows(self, results: Mapping[str, Any]) -> Iterator[Row]:
-        """Of each seed the median segment in seconds and the number of segments; the agreement of each two seeds."""
-        for measure, values in results.items():
-            for seed, value in enumerate(values):
-                yield Row("PushT", "PushT", self.method, None, seed, measure, value)
-
-
-SEEDS, METHODS = 5, ("options", "options, β = 1", "windowed k-means")
 ALONE: dict[str, Any] = {"compare_with": []}
 NOTHING, ALONE_WEIGHT = 1e-6, 0.3
 """The power with which controls count nothing, and the recogniser's weight beside transitions."""
@@ -243,7 +195,7 @@ def typical_length(labels: Iterable[np.ndarray]) -> float:
     return float(np.median(np.concatenate(lengths)))
 
 
-def clusters(found: Fit, train: Demonstrations, valid: Demonstrations, count: int, seed: int = 0) -> list[np.ndarray]:
+def clusters(found: Fit, train: Demonstrations, valid: Demonstrations, count: int) -> list[np.ndarray]:
     """k-means on observations and controls averaged over a second before and after each step."""
     model, rows = found.hierarchy, []
     for part in (train, valid):
@@ -251,7 +203,7 @@ def clusters(found: Fit, train: Demonstrations, valid: Demonstrations, count: in
         x = torch.cat([observed(batch.inputs), batch.actions.double()], dim=-1)
         features = window_means(x, batch.lengths, SECOND, SECOND).numpy()
         rows.append([own[:length] for own, length in zip(features, batch.lengths.tolist(), strict=True)])
-    fitted = KMeans(count, n_init=10, random_state=seed).fit(np.concatenate(rows[0]))
+    fitted = KMeans(count, n_init=10, random_state=0).fit(np.concatenate(rows[0]))
     return [fitted.predict(own) for own in rows[1]]
 
 
@@ -331,8 +283,8 @@ def scored(named: Sequence[np.ndarray], kinds: Sequence[np.ndarray], truth: Sequ
 
 def cells(own: argparse.Namespace) -> list[Cell]:
     """All of a split before another."""
-    found: list[Cell] = [PushTCell(str(own.data), method) for method in METHODS if "pusht" in own.splits]
-    for split, task in itertools.product([split for split in own.splits if split != "pusht"], own.tasks):
+    found: list[Cell] = []
+    for split, task in itertools.product(own.splits, own.tasks):
         demos = labelled_demonstrations(own.data / f"{task}.hdf5")
         names = folds(demos, split)
         found += [PeopleCell(str(own.data), task, fold, labelled) for fold in names for labelled in own.labelled]

@@ -18,7 +18,7 @@ from ddco_pyro.model.batch import encode
 
 STATE = {"state": np.array([0.5, -1.0, 2.0])}
 STD = 0.3
-ALWAYS, SELDOM = 100.0, -100.0  # logits, which the hierarchy bounds
+SELDOM = -100.0  # a logit, which the hierarchy bounds
 P_VALUE = 1e-3
 make = partial(make_hierarchy, network="linear", std=STD)
 

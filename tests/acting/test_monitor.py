@@ -12,7 +12,6 @@ from planted import make_spec, make_trainer
 from random_demonstrations import of_states
 
 import ddco_pyro
-from ddco_pyro.acting.controller import ObservationError
 from ddco_pyro.acting.monitor import Monitor
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.inference import log_likelihood, posterior
@@ -94,34 +93,6 @@ def test_a_recogniser_of_the_past_is_evidence_at_every_step(watched):
     assert value == pytest.approx(float(alone), rel=1e-5)
 
 
-def test_a_monitor_with_a_recogniser_sees_the_past_alone(watched):
-    hierarchy, demos = watched
-    demo, steps = demos[0], 6
-    later = np.arange(len(demo)) >= steps
-    other = replace(
-        demo,
-        observations={"state": np.where(later[:, None], 7.0, demo.observations["state"])},
-        actions=np.where((np.arange(len(demo)) >= steps - 1)[:, None], 9.0, demo.actions),
-    )
-    ours, theirs = (beliefs(hierarchy, one)[0] for one in (demo, other))
-    for one, same in zip(ours[:steps], theirs[:steps], strict=True):
-        for level, again in zip(one, same, strict=True):
-            np.testing.assert_array_equal(level, again)
-    assert any(np.abs(a - b).max() > 1e-3 for a, b in zip(ours[-1], theirs[-1], strict=True))
-
-
-def test_the_control_comes_with_every_observation_but_the_first():
-    monitor, state = Monitor(make_hierarchy((3,))), {"state": np.zeros(3)}
-    with pytest.raises(ObservationError, match="no control comes before the first observation"):
-        monitor.step(state, np.zeros(2))
-    monitor.reset()
-    monitor.step(state)
-    with pytest.raises(ObservationError, match=r"shape \(2,\); got none"):
-        monitor.step(state)
-    with pytest.raises(ObservationError, match=r"has shape \(3,\), the demonstrations had \(2,\)"):
-        monitor.step(state, np.zeros(3))
-
-
 PLANTED = [(1, 6), (2, 3), (3, 4)]
 """Phases, each with its number of steps."""
 
@@ -178,6 +149,3 @@ def test_without_demonstrations_no_fraction_is_known(phases):
     monitor = fit.monitor()
     monitor.step({"state": demos[0].observations["state"][0]})
     assert monitor.progress({"level-1": fit.names["level-1"]})["level-1"][2:] == (1, None, None)
-
-
-# --- one observation at a time ----------------------------------------------------------------------------------------

@@ -120,9 +120,3 @@ def turns_in(path: Path) -> list[str]:
 
 def test_a_sentence_is_read_once() -> None:
     assert {str(path.relative_to(ROOT)): turns for path in FILES if (turns := turns_in(path))} == {}
-
-
-def test_turns_are_found_over_the_end_of_a_line(tmp_path: Path) -> None:
-    path = tmp_path / "some.py"
-    path.write_text('"""Runs of\n    before."""\nprint("but "\n      "for", 1)  # nobody\n')
-    assert turns_in(path) == ["of before", "but for", "nobody"]

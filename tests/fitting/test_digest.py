@@ -13,16 +13,16 @@ import numpy as np
 import pytest
 import yaml
 from command_line import call
+from killing import Interrupting
 from odd_files.hdf5 import instead
 from selecting import DATA, data_at, two_skills
 
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.errors import BadInput
-from ddco_pyro.events import EpochEnded
 from ddco_pyro.fitting import digest as fitted_to
 from ddco_pyro.fitting.digest import difference, digest
-from ddco_pyro.spec import Spec, parse_spec, with_overrides
+from ddco_pyro.spec import Spec, parse_spec
 
 FLAT = {"kind": "flat", "policy": {"network": "linear"}}
 REFUSED = (
@@ -90,14 +90,9 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A spec, its demonstrations, their run, and one that was interrupted; nobody changes them."""
     folder = tmp_path_factory.mktemp("finished")
     labelled().write(folder / "demos.hdf5")
-
-    def stop(event: object) -> None:
-        if isinstance(event, EpochEnded) and event.epoch == 2:
-            raise KeyboardInterrupt
-
     ddco_pyro.fit(spec_of(folder / "demos.hdf5"), out=folder / "run")
     with pytest.raises(KeyboardInterrupt):
-        ddco_pyro.fit(spec_of(folder / "demos.hdf5"), out=folder / "interrupted", on_event=stop)
+        ddco_pyro.fit(spec_of(folder / "demos.hdf5"), out=folder / "interrupted", on_event=Interrupting(2))
     return folder
 
 
@@ -145,22 +140,6 @@ def test_what_makes_no_difference_is_not_refused(changing: Path, tmp_path: Path)
     run = shutil.copytree(changing / "interrupted", tmp_path / "run")
     ddco_pyro.fit(run / "spec.yaml", out=run)
     assert (run / "model.safetensors").read_bytes() == (changing / "run" / "model.safetensors").read_bytes()
-
-
-def test_a_baseline_of_other_demonstrations_is_not_taken_over(finished: Path, tmp_path: Path) -> None:
-    """Copied from a run of the same spec; the run itself has still to be trained."""
-    path = finished / "demos.hdf5"
-    spec = with_overrides(spec_of(path), {"training.epochs": 1})
-    other = two_skills(seed=1)
-    replace(labelled(), demonstrations=tuple(replace(one, actions=new.actions)
-            for one, new in zip(labelled(), other, strict=True))).write(tmp_path / "demos.hdf5")  # fmt: skip
-    there = ddco_pyro.fit(spec, tmp_path / "demos.hdf5", out=tmp_path / "there")
-    flat = shutil.copytree(there.folder / "baselines", tmp_path / "here" / "baselines") / "flat"
-    shutil.copy(there.folder / "spec.yaml", tmp_path / "here")
-    for text in (flat / "spec.yaml", tmp_path / "here" / "spec.yaml"):
-        text.write_text(text.read_text().replace(str(tmp_path / "demos.hdf5"), str(path)))
-    with pytest.raises(BadInput, match=rf"^{flat}: is a run of other demonstrations \(actions changed\)"):
-        ddco_pyro.fit(spec, out=tmp_path / "here")
 
 
 def test_a_selection_of_a_file_that_has_changed_is_not_continued(tmp_path: Path) -> None:

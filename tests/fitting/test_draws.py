@@ -67,18 +67,6 @@ def _agree(counts: np.ndarray, probabilities: np.ndarray, draws: int) -> None:
         assert stats.chisquare(observed, expected, sum_check=False).pvalue > 1e-4
 
 
-def test_past_the_end_there_is_nothing() -> None:
-    found = drawn(make_hierarchy((2, 2)), of_states(LENGTHS), 5)
-    assert found.demonstrations == ("demo_0", "demo_1", "demo_2")
-    for options, starts in zip(found.options.values(), found.starts.values(), strict=True):
-        assert (options.shape, options.dtype, starts.dtype) == ((1, 5, 3, 4), np.int8, bool)
-        for n, length in enumerate(LENGTHS):
-            assert (options[..., n, length:] == -1).all()
-            assert not starts[..., n, length:].any()
-            assert (options[..., n, :length] > 0).all()
-            assert starts[..., n, 0].all()
-
-
 def test_a_demonstrations_draws_depend_on_its_place_and_the_seed_alone() -> None:
     hierarchy, lengths = make_hierarchy((3,)), (40, 7, 30)
     whole = drawn(hierarchy, of_states(lengths), 6, 1).options["level-1"]

@@ -14,7 +14,7 @@ import pytest
 import yaml
 from command_line import call
 from made_metrics import compared as made
-from selecting import DATA, data_at, two_skills
+from selecting import DATA, two_skills
 
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
@@ -136,6 +136,7 @@ def test_what_cannot_be_acted_on_is_refused_in_a_line_and_changes_nothing(fault:
         (lambda fit: fit.controller().act_all([SEEN, SEEN]), "there are 1 episodes and 2 observations"),
         (lambda fit: fit.draws(two_skills(), 0), "draws=0: has to be a whole number from 1 on"),
         (lambda fit: fit.draws(two_skills(), 2).boundaries("skill", 0, np.ones(8)), "there is no level 'skill'"),
+        (lambda fit: fit.monitor().step(SEEN, np.zeros(2)), "no control comes before the first observation"),
         (lambda fit: fit.monitor().progress({"skill": []}), "order: there is no 'skill'"),
         (lambda fit: fit.monitor().progress({"option": ["reach"]}), "order: there is no 'reach'"),
         (lambda fit: ddco_pyro.fit(fit.spec, np.ones((8, 2))), "got ndarray"),
@@ -310,44 +311,6 @@ def test_the_best_model_is_exported(commanded: Path, tmp_path: Path) -> None:
     assert [sorted(each) for each in names] == [["option"], []]  # a flat policy has no options
 
 
-# --- in pieces --------------------------------------------------------------------------------------------------------
-
-
-def test_pieces_say_what_the_whole_says(in_memory: ddco_pyro.Fit, monkeypatch: pytest.MonkeyPatch) -> None:
-    demos = two_skills()
-    (whole,) = in_memory.infer(demos)
-    monkeypatch.setattr("ddco_pyro.model.hierarchy.STEPS_AT_ONCE", 40)
-    pieces = list(in_memory.infer(demos))
-    assert [name for piece in pieces for name in piece.names] == list(demos.names)
-    assert len(pieces) > 2
-    assert all(len(piece.names) * max(piece.lengths) <= 40 for piece in pieces)
-    row = 0
-    for piece in pieces:
-        for own, steps in enumerate(piece.lengths):
-            assert piece.log_likelihood[own] == pytest.approx(whole.log_likelihood[row], rel=1e-6)
-            for kind in ("posterior", "path"):
-                ours, theirs = (getattr(one, kind)[0][0][at, :steps] for one, at in ((piece, own), (whole, row)))
-                np.testing.assert_allclose(ours, theirs, atol=1e-5)
-            total = piece.decomposition.dimensions[own].sum() + piece.decomposition.options[own]
-            assert float(total) == pytest.approx(piece.log_likelihood[own], rel=1e-6)
-            row += 1
-    assert in_memory.posterior(demos).u[0].shape == whole.posterior.u[0].shape
-    (segments,) = in_memory.segment(demos)
-    for own, row in zip(segments, whole.path.choices[0], strict=True):
-        np.testing.assert_array_equal(own, row[: len(own)])
-
-
-def compare(ours: object, theirs: object) -> None:
-    assert type(ours) is type(theirs)
-    if isinstance(ours, dict):
-        assert ours.keys() == theirs.keys()
-    if isinstance(ours, dict | list):
-        for key in ours if isinstance(ours, dict) else range(len(ours)):
-            compare(ours[key], theirs[key])
-    else:
-        assert ours == (pytest.approx(theirs, rel=1e-5, abs=1e-6) if isinstance(ours, float) else theirs)
-
-
 # --- what is read -----------------------------------------------------------------------------------------------------
 
 
@@ -379,18 +342,7 @@ def test_a_fit_reads_its_demonstrations_once(commanded: Path, tmp_path: Path, re
     assert (tmp_path / "run" / "report.html").exists()
 
 
-def test_a_selection_reads_its_demonstrations_once(tmp_path: Path, reads: Counter) -> None:
-    data = data_at(tmp_path) | {"selection": {"folds": 2, "grid": {"observations": [["turn"], ["place", "turn"]]}}}
-    (tmp_path / "spec.yaml").write_text(yaml.safe_dump(data | {"observations": ["turn"]}))
-    assert call("select", tmp_path / "spec.yaml", "--out", tmp_path / "select", "--jobs", "1").status == 0
-    assert reads == dict.fromkeys(everything(tmp_path / "demos.hdf5"), 1.0)
-    assert (tmp_path / "select" / "fit" / "report.html").exists()
-
-
 def test_check_reads_no_observations(commanded: Path, reads: Counter) -> None:
     """The controls are read: which are constant, or take two values, is part of what it says."""
     assert call("check", commanded / "spec.yaml").status == 0
     assert reads == {name: 1.0 for name in everything(commanded / "demos.hdf5") if name.endswith("/actions")}
-
-
-# --- how often a fit builds a model -----------------------------------------------------------------------------------

@@ -21,7 +21,6 @@ from ddco_pyro.errors import BadInput
 from ddco_pyro.exporting import write_numpy
 from ddco_pyro.fitting.names import accepted, matched
 from ddco_pyro.metrics import NamedByLabel
-from ddco_pyro.names import label_name
 from ddco_pyro.report.options import use_table
 from ddco_pyro.spec import parse_spec
 
@@ -85,21 +84,6 @@ def test_below_an_agreement_of_three_fifths_a_name_is_proposed_and_not_given():
     found = {one.name: one.agreement for one in stands_for(choices, demos)}
     assert found == pytest.approx({"reach": 6 / 7, "grasp": 3 / 6, "lift": 3 / 5})
     assert propose(choices, demos) == {"skill": ("reach", "option 2", "lift")}
-
-
-@pytest.mark.parametrize(
-    ("arguments", "name"),
-    [
-        (("phase", 1, ["reach", " grasp "]), "grasp"),
-        (("phase", 1, ["reach", " "]), "phase 1"),
-        (("phase", 5, ["reach"]), "phase 5"),
-        (("phase", -1, ["reach"]), "unknown"),
-        (("option", 5), "label 5"),
-        (("skill", 5, (), "skill"), "label 5"),
-    ],
-)
-def test_a_label_is_never_a_number_alone(arguments, name):
-    assert label_name(*arguments) == name
 
 
 @pytest.fixture(scope="module")

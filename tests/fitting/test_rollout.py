@@ -252,11 +252,3 @@ def test_together_as_alone(name, weights, actors, spec):
             changes += (np.diff(own.choices, axis=0) != 0).any(1).sum()
     assert acted == actors
     assert changes > 1 or name in ("flat", "lstm", "windows")
-
-
-def test_environments_are_closed_when_one_fails():
-    made = []
-    broken = replace(kept(made), outcome=lambda environment: 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        run_episode(broken, Controller.from_spec(make(MODELS["flat"]), MEAN), SEEDS[0])
-    assert [one.closed for one in made] == [True]

@@ -9,6 +9,7 @@ from dataclasses import asdict
 
 import numpy as np
 import pytest
+from killing import Interrupting
 
 import ddco_pyro
 from ddco_pyro.events import EpochEnded
@@ -33,18 +34,6 @@ def parts(toy_spec, demos):
 @pytest.fixture
 def copied(toy_run, tmp_path):
     return shutil.copytree(toy_run.folder, tmp_path / "run")
-
-
-class Interrupting:
-    """Ctrl-C at the end of some epoch."""
-
-    def __init__(self, epochs):
-        self.left = epochs
-
-    def __call__(self, event):
-        self.left -= isinstance(event, EpochEnded)
-        if self.left == 0:
-            raise KeyboardInterrupt
 
 
 # --- contents ---------------------------------------------------------------------------------------------------------

@@ -1,7 +1,6 @@
 """The document of a person's labels and its journal, against the list of all its states."""
 
-import subprocess
-import sys
+import resource
 from contextlib import nullcontext
 
 import numpy as np
@@ -152,37 +151,6 @@ def test_edits_of_something_else_are_refused_and_kept(tmp_path, other):
     Journal(path, empty(), ours).close()  # and left to others
 
 
-WRITER = """
-import sys
-from pathlib import Path
-from ddco_pyro.labelling.document import Document
-from ddco_pyro.labelling.document import Journal
-journal = Journal(Path(sys.argv[1]), Document({"demo_0": 6, "demo_1": 3}, ("reach", "grasp")), "option")
-journal.at("http://127.0.0.1:8000/")
-for number in range(10**6):
-    journal.edit([("paint", "demo_0", number % 6, 6, number % 2 + 1)])
-    print(number, flush=True)
-"""
-
-
-def test_kill_9_loses_at_most_the_edit_in_flight_and_a_second_process_is_refused(tmp_path):
-    path = tmp_path / "labels.journal"
-    writer = subprocess.Popen([sys.executable, "-c", WRITER, path], stdout=subprocess.PIPE, text=True)
-    assert writer.stdout is not None
-    done = [int(writer.stdout.readline()) for _ in range(40)]
-    with pytest.raises(BadInput, match=rf"is open in a process of \S+, {writer.pid}, at http://127.0.0.1:8000/; end"):
-        Journal(path, empty(), "option")
-    writer.kill()
-    done += [int(line) for line in writer.stdout.read().split("\n") if line]
-    writer.wait()
-    document, expected = empty(), empty()
-    Journal(path, document, "option").close()
-    assert len(document.done) - len(done) in (0, 1)
-    for number in range(len(document.done)):
-        expected.edit([("paint", "demo_0", number % 6, 6, number % 2 + 1)])
-    assert said(document) == said(expected)
-
-
 @pytest.mark.parametrize(
     ("content", "line"),
     [
@@ -208,24 +176,16 @@ def test_a_file_that_is_no_journal_stays_as_it_is(tmp_path, content, line):
 
 
 def test_an_edit_that_a_full_disk_cuts_is_not_made(tmp_path):
-    """With a limit of the size of files; Python ignores the signal of it."""
-    code = """
-import resource, sys
-exec(sys.argv[2])
-size = journal.path.stat().st_size
-resource.setrlimit(resource.RLIMIT_FSIZE, (size + 20, resource.RLIM_INFINITY))
-try:
-    journal.edit([("paint", "demo_0", 0, 6, 2)])
-except OSError as error:
-    print(error.strerror, journal.path.stat().st_size - size, journal.document.labels["demo_0"].max())
-resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY,) * 2)
-journal.edit([("paint", "demo_0", 0, 6, 1)])
-"""
-    begun = WRITER.partition("journal.at")[0]
-    path = tmp_path / "labels.journal"
-    ended = subprocess.run([sys.executable, "-c", code, path, begun], capture_output=True, text=True)
-    assert (ended.stdout, ended.stderr) == ("No space left on device 0 -1\n", "")
-    document = empty()
-    Journal(path, document, "option").close()
-    assert document.labels["demo_0"].tolist() == [1] * 6
-    assert len(document.done) == 1
+    """With a limit of the size of files."""
+    path, document, before = tmp_path / "labels.journal", empty(), resource.getrlimit(resource.RLIMIT_FSIZE)
+    journal = Journal(path, document, "option")
+    content = path.read_bytes()
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(content) + 20, before[1]))
+    try:
+        with pytest.raises(OSError, match="No space left on device"):
+            journal.edit([("paint", "demo_0", 0, 6, 2)])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert path.read_bytes() == content
+    assert (document.labels["demo_0"] == FREE).all()
+    journal.close()

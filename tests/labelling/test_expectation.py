@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ddco_pyro.labelling.proposals import USUAL, Shown, excess, expected_wrong, first_wrong, ranking, unforeseen
+from ddco_pyro.labelling.proposals import Shown, excess, expected_wrong, ranking, unforeseen
 
 
 def proposed(generator, steps, sure):
@@ -26,25 +26,10 @@ def test_expected_wrong_steps_are_the_planted_ones_whatever_the_posterior_misses
     assert expected_wrong(shown, half, found) == pytest.approx(expected_wrong(shown, free, found) / 4, rel=0.1)
 
 
-def test_first_proposals_count_as_one_demonstration_and_alone_where_none_is_held_out():
-    assert unforeseen([0.3, 0.5], []) == pytest.approx(0.4)
-    assert unforeseen([0.3, 0.5], [0.1, 0.1, 0.0]) == pytest.approx((0.4 + 0.2) / 4)
-    assert unforeseen([-0.2], [0.1]) == 0.0  # posteriors that are not sure enough are taken at their word
-    assert unforeseen([], []) == USUAL
-
-
 def test_steps_without_a_name_say_nothing_of_a_proposal():
     shown = Shown(np.array([1, 2, 2, 3]), np.array([0.9, 0.8, 0.7, 0.6]))
     assert excess(shown, np.array([1, 1, -1, -2])) == pytest.approx(1 / 2 - (0.1 + 0.2) / 2)
     assert excess(shown, np.full(4, -1)) == 0.0
-
-
-def test_segments_under_other_numbers_are_no_wrong_steps():
-    proposed = Shown(np.array([1, 1, 2, 2, 3, 3]), np.full(6, 0.9))
-    named = Shown(np.array([2, 2, 3, 3, 1, 1]), np.ones(6))
-    moved = Shown(np.array([2, 2, 2, 3, 1, 1]), np.ones(6))
-    assert first_wrong(proposed, named) == (pytest.approx(0.6), 0)
-    assert first_wrong(proposed, moved) == (pytest.approx(0.6), 1)
 
 
 def order_of(wrong, edits, centres, accepted=()):
@@ -70,10 +55,3 @@ def test_the_next_one_is_of_another_kind_than_accepted_ones_which_come_last():
     assert ranked[-1] == 1
     assert farthest == 5
     assert order_of([10] * 6, [2] * 6, centres)[1] is None
-
-
-@pytest.mark.parametrize("accepted", [(), (0,), (0, 1)])
-def test_equal_demonstrations_have_an_order_too(accepted):
-    ranked, _ = order_of([1, 1], [1, 1], [[2.0], [2.0]], accepted)
-    assert sorted(ranked) == [0, 1]
-    assert order_of([1], [1], [[2.0]])[0] == [0]

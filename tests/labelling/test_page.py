@@ -13,17 +13,14 @@ import h5py
 import httpx2
 import numpy as np
 import pytest
-from standing_in import StandIn
 
-from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.planted import pick_and_place
-from ddco_pyro.fitting.fit import fit
 from ddco_pyro.labelling.background import Background
 from ddco_pyro.labelling.document import FREE, OPEN
 from ddco_pyro.labelling.refitting import Ways
 from ddco_pyro.labelling.server import Listening, running
 from ddco_pyro.labelling.session import Session
-from ddco_pyro.spec import parse_spec
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 
@@ -41,28 +38,6 @@ def browser():
         browser = started.chromium.launch(executable_path=str(CHROMIUM), args=["--no-sandbox"])
         yield browser
         browser.close()
-
-
-@pytest.fixture(scope="module")
-def file(tmp_path_factory):
-    demos, path = pick_and_place(6), tmp_path_factory.mktemp("page") / "demos.hdf5"
-    demos.write(path)
-    return path
-
-
-@pytest.fixture(scope="module")
-def run(file, tmp_path_factory):
-    linear = {"policy": {"network": "linear"}, "termination": {"network": "linear"}}
-    spec = {
-        "demonstrations": {"path": str(file), "valid_fraction": 0},
-        "observations": ["gripper", "object", "goal", "jaw"],
-        "control": {"std": {"learn": True, "floor": 0.01, "per_option": True}, "power": 0.1},
-        "hierarchy": {"levels": [{"name": "skill", "count": 4, **linear}], "meta_policy": linear["policy"]},
-        "training": {"optimizer": {"name": "em"}, "tune_fraction": 0, "epochs": 5},
-        "report": {"trajectory": "gripper"},
-        "compare_with": [],
-    }
-    return fit(parse_spec(spec), out=tmp_path_factory.mktemp("run") / "run")
 
 
 @pytest.fixture
@@ -524,11 +499,16 @@ def starts_of(address):
 
 
 @pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.slow)])
-def test_axe_has_no_serious_complaint(browser, scheme):
+def test_axe_has_no_serious_complaint(browser, session, run, scheme, monkeypatch):
     axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe-playwright-python is not installed")
-    session = StandIn()
-    session.accepted[1] = True
-    session.running = 100
+    come = threading.Event()
+
+    def coming(on_event):
+        assert come.wait(SOON)
+        return replace(run, named={})
+
+    monkeypatch.setattr(Ways, "calls", {"fine": coming})
+    session.ask()
     context = browser.new_context(color_scheme=scheme, bypass_csp=True)
     with served(session) as address:
         tab = context.new_page()
@@ -540,12 +520,16 @@ def test_axe_has_no_serious_complaint(browser, scheme):
             return [(one["id"], one["nodes"][0]["html"]) for one in found if one["impact"] in ("serious", "critical")]
 
         assert complaints() == []
+        come.set()
+        playwright.expect(tab.locator("#question canvas[role=img]")).to_have_count(6)
         keys(tab, "2")
         playwright.expect(tab.get_by_role("slider", name="Step")).to_be_focused()
         keys(tab, "0")
         said(tab, "Left open")
         keys(tab, "9")
         said(tab, "There are 4 options")
+        keys(tab, "Enter")
+        said(tab, "Accepted")
         assert complaints() == []
         keys(tab, "?")
         assert complaints() == []
@@ -569,8 +553,14 @@ FRAMES = """async work => {
 }"""
 
 
-def test_two_hundred_demonstrations_of_two_thousand_steps_stay_smooth(tabs):
-    with served(StandIn(200, 2000, 3, ask=False)) as address:
+def test_two_hundred_demonstrations_of_two_thousand_steps_stay_smooth(tabs, run, tmp_path):
+    def slowed(demo):
+        rows = np.linspace(0, len(demo) - 1, 2000).astype(int)
+        return Demonstration(demo.name, {key: own[rows] for key, own in demo.observations.items()}, demo.actions[rows])
+
+    Demonstrations(tuple(map(slowed, pick_and_place(200)))).write(tmp_path / "demos.hdf5")
+    session = Session(replace(run, named={}), tmp_path / "demos.hdf5", tmp_path / "labels.hdf5")
+    with served(session) as address:
         tab = tabs(address)
         tab.get_by_role("slider", name="Step").focus()
         assert items(tab).count() == 200
@@ -580,3 +570,4 @@ def test_two_hundred_demonstrations_of_two_thousand_steps_stay_smooth(tabs):
         keys(tab, "+", "+", "+", "+", " ")
         assert tab.evaluate(FRAMES, "play") >= 30
         assert at(tab) > 40
+    session.close()

@@ -68,31 +68,6 @@ def test_it_is_the_sum_over_the_paths_that_have_the_labels_with_a_regression_of_
             np.testing.assert_array_equal(shown.options, proposals.options[list(best[1])])
 
 
-def test_draws_of_a_boundary_are_as_frequent_as_the_sum_over_paths_says():
-    fit, demos, _ = planted(12, 6, (2,), ending=-1.0)
-    fit.hierarchy.power.fill_(0.1)  # the controls say little
-    proposals = Proposals(fit, demos, 1, 2)
-    labels = free(demos)
-    labels["demo_0"][0] = 1
-    proposals.update(labels)
-    seen = 0
-    for n, name in enumerate(demos.names):
-        runs = proposals.runs(name)
-        for (a, before, step), (b, _, after) in itertools.pairwise(runs):
-            exact = np.zeros(6)
-            for path, ends, probability in paths(proposals.pieces[0].tables, n, 6, [3]):
-                own, ended = np.array(path)[:, 0], np.array(ends)[:, 0]
-                at = [t for t in range(before + 1, after) if (own[t - 1], own[t]) == (a, b) and ended[t] == 1]
-                if at:
-                    exact[min(at, key=lambda t: (abs(t - step), t))] += probability
-            drawn = proposals.drawn(name)[step]
-            exact /= exact.sum()
-            often = np.bincount(drawn, minlength=6) / len(drawn)
-            assert (np.abs(often - exact) < 4 * np.sqrt(exact * (1 - exact) / len(drawn)) + 1e-9).all()
-            seen += (exact > 0.1).sum() > 1
-    assert seen > 2  # boundaries that may be elsewhere
-
-
 # --- whose numbers ----------------------------------------------------------------------------------------------------
 
 

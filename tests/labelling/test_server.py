@@ -1,9 +1,12 @@
 """The server of ``label``: who may ask, what may be asked, and how it answers what it cannot do."""
 
 import json
+import re
 import socket
 import subprocess
 import sys
+from concurrent.futures import Future
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from zipfile import ZipFile
@@ -11,19 +14,41 @@ from zipfile import ZipFile
 import anyio
 import httpx2
 import pytest
-from standing_in import StandIn
+from killing import HANGS
 from starlette.testclient import TestClient
 
+from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.errors import Failed
+from ddco_pyro.labelling.background import Background
 from ddco_pyro.labelling.server import HEADERS, MOST_BYTES, PAGE, Listening, application
+from ddco_pyro.labelling.session import Session
 
 TOKEN, PORT = "a-token", 4321
 BASE = f"http://127.0.0.1:{PORT}"
 
 
 @pytest.fixture
-def session():
-    return StandIn(ask=False)
+def session(run, file, tmp_path, monkeypatch):
+    """A session whose refits never end, and which writes two formats."""
+    monkeypatch.setattr(Background, "_submit", lambda background, call: Future())
+    begun = Session(
+        replace(run, named={}), file, tmp_path / "labels.hdf5", exporters={"csv": one_file, "elan": a_folder}
+    )
+    yield begun
+    begun.close()
+
+
+def one_file(segmented, fit, folder, level):
+    path = folder / "segments.csv"
+    path.write_text(f"{len(segmented.segments)} demonstrations\n")
+    return path
+
+
+def a_folder(segmented, fit, folder, level):
+    path = folder / "segments"
+    path.mkdir()
+    (path / "demo_0.eaf").write_text(f"{len(segmented.segments)} demonstrations\n")
+    return path
 
 
 @pytest.fixture
@@ -53,29 +78,15 @@ def test_foreign_hosts_and_origins_are_refused_whatever_they_know(client, sessio
     for headers in foreign:
         assert post(client, "edit", step, **headers).status_code == 403, headers
         assert client.get(f"/{TOKEN}/state", headers=headers).status_code == 403, headers
-    assert session.revision == 1
+    assert not session.document.done
     assert post(client, "edit", step, Host=f"localhost:{PORT}", Origin=f"http://localhost:{PORT}").status_code == 200
-    assert session.revision == 2
+    assert len(session.document.done) == 1
 
 
 OUTSIDE = [
-    "../pyproject.toml",
-    "../../../etc/passwd",
-    "app.js/../page.css",
-    "/etc/passwd",
-    "static/app.js",
-    "index.html",
-]
-OUTSIDE += [
-    "server.py",
-    "demo/-1",
-    "demo/0/picture/x",
-    "demo/0/../0",
-    "export/../state",
-    "export/..%2f",
-    "page.css\0",
-    ".",
-]
+    "../pyproject.toml", "../../../etc/passwd", "app.js/../page.css", "/etc/passwd", "static/app.js", "index.html",
+    "server.py", ".", "page.css\0", "demo/-1", "demo/0/picture/x", "demo/0/../0", "export/../state", "export/..%2f",
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("path", OUTSIDE)
@@ -146,7 +157,7 @@ def test_methods_bodies_and_commands_are_checked(client, session):
     assert client.get(f"/{TOKEN}/demo/99").status_code == 400
     assert client.get(f"/{TOKEN}/demo/{'9' * 6000}").status_code == 400
     assert client.get(f"/{TOKEN}/export/floppy").status_code == 400
-    assert session.revision == 1
+    assert not session.document.done
 
 
 def test_a_failure_of_the_program_is_one_line(session):
@@ -156,17 +167,18 @@ def test_a_failure_of_the_program_is_one_line(session):
 
 
 def test_what_a_session_says_arrives(client, session, tmp_path, monkeypatch):
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(temporary))
+    first = session.revision
     assert client.get(f"/{TOKEN}/state").json() == session.state()
-    assert list(client.get(f"/{TOKEN}/state?since=1").json()) == ["revision", "refit", "warnings", "dirty"]
+    assert list(client.get(f"/{TOKEN}/state?since={first}").json()) == ["revision", "refit", "warnings", "dirty"]
     assert client.get(f"/{TOKEN}/state?since=x").json() == session.state()
     assert client.get(f"/{TOKEN}/demo/2").json() == session.demo(2)
     assert client.get(f"/{TOKEN}/demo/2/nearest/5").json() == session.nearest(2, 5)
     said = post(client, "edit", {"do": "name", "demo": 1, "step": 4, "option": 3}).json()
-    assert (said["revision"], said["demo"]) == (2, 1)
-    assert client.get(f"/{TOKEN}/state?since=1").json() == session.state()
-    assert post(client, "refit", {}).status_code == 200
-    assert client.get(f"/{TOKEN}/state?since=2").json()["refit"]["running"]
+    assert (said["revision"], said["demo"]) == (first + 1, 1)
+    assert client.get(f"/{TOKEN}/state?since={first}").json() == session.state()
     assert post(client, "save", {}).json() == {"message": session.save()}
     sent = client.get(f"/{TOKEN}/export/csv")
     assert (sent.text, "segments.csv" in sent.headers["content-disposition"]) == ("6 demonstrations\n", True)
@@ -174,7 +186,9 @@ def test_what_a_session_says_arrives(client, session, tmp_path, monkeypatch):
     assert "segments.zip" in sent.headers["content-disposition"]
     assert ZipFile(BytesIO(sent.content)).read("demo_0.eaf") == b"6 demonstrations\n"
     client.get(f"/{TOKEN}/export/floppy")
-    assert not list(tmp_path.iterdir()), "an export leaves files behind"
+    assert not list(temporary.iterdir()), "an export leaves files behind"
+    assert post(client, "refit", {}).status_code == 200
+    assert client.get(f"/{TOKEN}/state?since={session.revision}").json()["refit"]["running"]
 
 
 def test_a_port_that_is_taken_is_named_and_tokens_differ():
@@ -191,16 +205,17 @@ def test_a_port_that_is_taken_is_named_and_tokens_differ():
         second.socket.close()
 
 
-def test_an_interrupt_saves_and_ends_with_one_line():
-    program = Path(__file__).parents[1] / "support" / "standing_in.py"
-    interruptible = "import runpy, signal; signal.signal(signal.SIGTERM, signal.default_int_handler)"
-    code = f"{interruptible}; runpy.run_path({str(program)!r}, run_name='__main__')"
-    command = [sys.executable, "-c", code, "0"]
+def test_an_interrupt_saves_and_ends_with_one_line(run, file, tmp_path):
+    out = tmp_path / "labels.hdf5"
+    command = [sys.executable, "-m", "ddco_pyro.cli", "label", run.folder, file, "--out", out, "--no-browser"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         address = process.stdout.readline().strip()
         with httpx2.Client(base_url=address, trust_env=False) as client, socket.socket() as idle:
             idle.connect(("127.0.0.1", httpx2.URL(address).port))
-            assert client.post("edit", json={"do": "new", "text": "push"}).status_code == 200
+            asked = {"do": "paint", "demo": 0, "start": 0, "stop": 5, "option": 2}
+            assert client.post("edit", json=asked).status_code == 200
             process.terminate()
-            out, err = process.communicate(timeout=30)
-    assert (process.returncode, out.strip(), err) == (0, "labels/skill of 6 demonstrations are in labelled.hdf5", "")
+            said, err = process.communicate(timeout=HANGS)
+    assert (process.returncode, err) == (0, "")
+    assert re.fullmatch(rf"{out}: labels/skill, 5 of \d+ steps", said.splitlines()[-1])
+    assert Demonstrations.read(out)[0].labels["skill"][:6].tolist() == [2] * 5 + [-1]

@@ -11,8 +11,6 @@ from itertools import pairwise
 import h5py
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from time_lines import unpacked
 
 from ddco_pyro.cli.label import _exporters, _fitted
@@ -233,64 +231,6 @@ def test_accepting_says_what_is_shown_except_what_is_open(begin):
     assert (state["demos"][1]["accepted"], state["summary"]["labelled"], state["order"][-1]) == (True, 1, 1)
 
 
-whole = st.integers(-1, 48)
-index = st.integers(0, 1)
-commands = st.one_of(
-    st.fixed_dictionaries({"do": st.sampled_from(["open", "split", "merge"]), "demo": index, "step": whole}),
-    st.fixed_dictionaries(
-        {"do": st.sampled_from(["name", "everywhere"]), "demo": index, "step": whole, "option": st.integers(0, 5)}
-    ),
-    st.fixed_dictionaries(
-        {"do": st.just("paint"), "demo": index, "start": whole, "stop": whole, "option": st.integers(0, 5)}
-    ),
-    st.fixed_dictionaries({"do": st.just("move"), "demo": index, "boundary": whole, "to": whole}),
-    st.fixed_dictionaries({"do": st.just("accept"), "demo": index}),
-    st.fixed_dictionaries({"do": st.just("new"), "text": st.sampled_from(["lift", "push", ""])}),
-    st.fixed_dictionaries(
-        {"do": st.just("rename"), "option": st.integers(1, 5), "text": st.sampled_from(["go", "lift"])}
-    ),
-    st.fixed_dictionaries({"do": st.sampled_from(["undo", "redo"])}),
-)
-
-
-@pytest.mark.usefixtures("quiet")
-@settings(max_examples=3, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.lists(commands, min_size=3, max_size=10), st.randoms(use_true_random=False))
-def test_any_commands_leave_whole_demonstrations_and_are_undone_and_read_again(begin, tmp_path, sequence, random):
-    out = f"{len([*tmp_path.iterdir()])}.hdf5"
-    session = begin(out)
-    first, done = shown(session), 0
-    for command in sequence:
-        if command["do"] == "move" and random.random() < 0.8:  # to a boundary that is there
-            here = session.demo(command["demo"])["segments"]
-            command = {**command, "boundary": random.choice(here)["start"]}
-        before = shown(session), session.journal.path.read_bytes()
-        try:
-            answer = session.edit(command)
-        except BadInput:
-            assert (shown(session), session.journal.path.read_bytes()) == before
-            continue
-        json.dumps([answer, session.state(), session.demo(0)])
-        assert session.journal.path.read_bytes().startswith(before[1])
-        for (_, steps), labels in zip(shown(session), session.document.labels.values(), strict=True):
-            for own, (option, said) in zip(labels, steps, strict=True):
-                assert own <= 0 or option == own
-                assert (said == "open") == (own == OPEN)
-                assert own != FREE or said == "proposed"
-    last = shown(session)
-    session.journal.close()
-    again = begin(out)
-    assert shown(again) == last
-    assert again.state()["names"] == session.state()["names"]
-    while again.state()["can_undo"]:
-        again.edit({"do": "undo"})
-        done += 1
-    assert shown(again) == first
-    for _ in range(done):
-        again.edit({"do": "redo"})
-    assert shown(again) == last
-
-
 @pytest.mark.parametrize(
     "command",
     [
@@ -321,18 +261,6 @@ def test_a_command_that_cannot_be_done_is_one_line_and_changes_nothing(unchanged
         session.edit(command)
     assert "\n" not in str(error.value)
     assert (shown(session), session.journal.path.read_bytes()) == (before, content)
-
-
-def test_edits_of_many_threads_come_one_after_another(begin):
-    session = begin()
-    orders = [{**paint, "start": start, "stop": start + 1, "option": 1 + start % COUNT} for start in range(8)]
-    threads = [threading.Thread(target=session.edit, args=(order,)) for order in orders]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert session.document.labels["demo_0"][:8].tolist() == [1 + start % COUNT for start in range(8)]
-    assert len(session.document.done) == 8
 
 
 # --- refits -----------------------------------------------------------------------------------------------------------
@@ -570,11 +498,6 @@ def test_what_is_closed_is_saved_and_left_to_others(begin, tmp_path):
     session.close()
     assert Demonstrations.read(tmp_path / "out.hdf5")[0].labels["option"][10] == 3
     assert begin().state()["demos"][0]["labelled"] == 10
-
-
-def test_a_format_that_is_none_is_refused(begin, tmp_path):
-    with pytest.raises(BadInput, match="csv"):
-        begin().export("xls", tmp_path)
 
 
 @pytest.mark.usefixtures("undecided")

@@ -10,7 +10,6 @@ import pyro
 import pytest
 import torch
 from oracle import brute_force, paths, random_tables
-from pyro.infer.inspect import get_model_relations
 
 from ddco_pyro.inference import log_likelihood
 from ddco_pyro.inference.engines import known_controls
@@ -41,37 +40,6 @@ def repeated(tables, times):
     """The first trajectory's tables, that many times."""
     parts = (tables.selection, tables.termination, tables.control)
     return Tables(*(tuple(table[:1].expand(times, *table.shape[1:]) for table in part) for part in parts))
-
-
-# --- sites ------------------------------------------------------------------------------------------------------------
-
-
-def causes(depth, steps):
-    """What each site depends on, in §4.1 and at every level."""
-    found = {}
-    for t in range(steps):
-        for d in range(depth, 0, -1):
-            above, before = [f"h_{d + 1}_{t}"] * (d < depth), [f"h_{d}_{t - 1}"] * (t > 0)
-            found[f"h_{d}_{t}"] = {*above, *before, *[f"b_{d}_{t}"] * (t > 0)}
-            if t > 0:
-                found[f"b_{d}_{t}"] = {*before, *[f"b_{d - 1}_{t}"] * (d > 1)}
-        found[f"a_{t}"] = {f"h_{d}_{t}" for d in range(1, depth + 1)}
-    return found
-
-
-def program_of(counts):
-    """Arguments of the model for random tables of three steps."""
-    tables = random_tables(counts, (True,) * len(counts), trajectories=2, steps=3)
-    return complete(tables, torch.tensor([3, 2])), *known_controls(tables)
-
-
-@pytest.mark.parametrize("counts", [(), (2,), (2, 3)])
-def test_pyro_finds_the_dependencies(counts):
-    relations = get_model_relations(ahmm, program_of(counts))
-    expected = causes(len(counts), 3)
-    assert {site: set(others) for site, others in relations["sample_sample"].items()} == expected
-    assert relations["observed"] == ["a_0", "a_1", "a_2"]
-    assert set(relations["plate_sample"]["demonstrations"]) == expected.keys()
 
 
 # --- samples ----------------------------------------------------------------------------------------------------------

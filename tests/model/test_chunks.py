@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import pytest
@@ -12,7 +13,7 @@ from torch import Tensor
 from ddco_pyro.inference import log_likelihood
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.model.networks import Inputs
+from ddco_pyro.model.networks import CLASSES, Inputs
 
 SHAPES = {"state": (3,), "camera": (10, 9, 3)}
 CONV = {"network": "conv", "layers": [{"filters": 3, "kernel": 3, "stride": 2, "padding": 1}], "hidden": [6]}
@@ -34,6 +35,7 @@ NETWORKS: dict[str, dict[str, Any]] = {
     "per_timestep": {"policy": {"network": "per_timestep", "hidden": [4], "inputs": ["state"]}},
 }
 TRAJECTORIES, STEPS = 2, 13
+assert {"linear", *re.findall(r"'network': '(\w+)'", str(NETWORKS))} == set(CLASSES), "a new network belongs here"
 
 
 def hierarchy(network: str, dtype: torch.dtype = torch.float64) -> Hierarchy:

@@ -112,19 +112,6 @@ def test_bins_add_up_to_quantiles(key):
     np.testing.assert_allclose(seen.std(0), np.where(np.tile(np.ptp(raw, axis=0) > 0, 1 + bins), 1, 0), atol=1e-5)
 
 
-def test_differences_are_seen_in_bins_too():
-    encoder = fitted(ObservationSpec(key="grid", differences=True, bins=2), ObservationSpec(key="pose"))
-    raw = np.concatenate([encoder.features(demo.observations) for demo in DEMOS])
-    assert (encoder.given, encoder.sizes) == ([8, 3], [24, 3])
-    middle = encoder.high[8:16].numpy()
-    np.testing.assert_array_equal(encoder.low[16:24], middle)
-    for dimension, values in zip(middle, raw[:, :8].T, strict=True):
-        assert dimension in values
-        different = np.unique(values)
-        assert abs((different < dimension).mean() - 0.5) <= 1 / len(different)
-    assert torch.isinf(encoder.low[24:]).all()
-
-
 def test_a_value_that_most_steps_have_is_one_value_of_a_part():
     """What is 0 but for a few steps, as the shape of what is seen at times, has its parts where it is not."""
     random = np.random.default_rng(0)
@@ -174,16 +161,6 @@ def test_batches_are_padded_with_zeros_and_images_stay_bytes():
         for padded in (found.inputs.vector, found.inputs.images["camera"], found.actions):
             assert padded.shape[:2] == (3, 5)
             assert not padded[n, len(demo) :].any()
-
-
-@pytest.mark.parametrize(("rows", "steps"), [([2, 1], None), ([0, 1], 4)], ids=["all steps", "the first steps"])
-def test_select_trims_to_the_longest(rows, steps):
-    whole = batch()
-    found = whole.select(torch.tensor(rows), steps)
-    assert (found.lengths.tolist(), found.inputs.time.tolist(), found.steps) == ([4, 3], [0, 1, 2, 3], 7)
-    assert torch.equal(found.actions, whole.actions[rows, :4])
-    assert torch.equal(found.inputs.vector, whole.inputs.vector[rows, :4])
-    assert torch.equal(found.inputs.images["camera"], whole.inputs.images["camera"][rows, :4])
 
 
 # --- controls ---------------------------------------------------------------------------------------------------------

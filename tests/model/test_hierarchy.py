@@ -78,6 +78,3 @@ def test_a_learned_deviation_keeps_its_floor_and_is_shared_by_the_level():
     with torch.no_grad():
         hierarchy.levels[0].policy.std.raw[:] = -100.0
     np.testing.assert_allclose(hierarchy.levels[0].policy.std().detach(), [0.2, 0.2], rtol=1e-6)
-
-
-# --- memory -----------------------------------------------------------------------------------------------------------

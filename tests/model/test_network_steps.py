@@ -4,85 +4,14 @@ from __future__ import annotations
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from stacked_networks import COPIES, SHAPE, answer, assert_close, make, make_inputs, random_inputs, refused, separate
 from torch import nn
 
-from ddco_pyro.model.networks import CLASSES, InputShape
-
-
-def step_by_step(network, inputs):
-    """The outputs of a call for every step of every trajectory, the state carried from each to the next."""
-    trajectories, steps = inputs.batch
-    found = []
-    for n in range(trajectories):
-        state, rows = None, []
-        for t in range(steps):
-            row, state = answer(network, inputs.part(slice(n, n + 1), slice(t, t + 1)), state)
-            rows.append(row)
-        found.append(torch.cat(rows, dim=1))
-    return torch.cat(found)
-
-
-sizes = st.lists(st.integers(1, 5), max_size=2)
-some_vectors = st.dictionaries(st.sampled_from(["pose", "goal"]), st.integers(1, 6), min_size=1)
-pictures = st.dictionaries(
-    st.sampled_from(["camera", "wrist"]), st.tuples(st.integers(1, 12), st.integers(1, 12), st.integers(1, 4)),
-    min_size=1,
-)  # fmt: skip
-perceptrons = st.fixed_dictionaries({"network": st.sampled_from(["mlp", "per_timestep"]), "hidden": sizes})
-filters = st.builds(
-    lambda number, kernel: {"filters": number, "kernel": kernel, "stride": 2, "padding": kernel // 2},
-    st.integers(1, 3), st.integers(1, 5),
-)  # fmt: skip
-convolutions = st.fixed_dictionaries(
-    {"network": st.just("conv"), "hidden": sizes, "layers": filters.map(lambda one: [one])},
-    optional={"pool": st.sampled_from(["flatten", "mean", "spatial_softmax"])},
-)
-users = st.sampled_from(
-    [{"network": "user_networks:Own", "options": {"gain": 0.7}}, {"network": "user_networks:Remembering"}]
-)
-
-
-def lstm(over):
-    """An LSTM over another network."""
-    some = st.lists(st.integers(1, 5), min_size=1, max_size=2)
-    horizon = st.none() | st.integers(1, 10)
-    return st.fixed_dictionaries({"network": st.just("lstm"), "over": over, "hidden": some, "horizon": horizon})
-
-
-def branches():
-    """A branch for each of three observations, and one for two of them."""
-    pair = (perceptrons | lstm(perceptrons)).map(lambda network: network | {"inputs": ["goal", "pose"]})
-    vector = st.just({"network": "linear"}) | perceptrons | users | lstm(perceptrons)
-    of = st.fixed_dictionaries(
-        {"camera": convolutions | lstm(convolutions)}, optional={"pose": vector, "goal": vector, "pair": pair}
-    )
-    some = st.lists(st.integers(1, 5), min_size=1, max_size=2)
-    return st.fixed_dictionaries({"network": st.just("branches"), "of": of, "hidden": some})
-
+from ddco_pyro.model.networks import CLASSES
 
 assert set(CLASSES) == {"linear", "constant", "mlp", "per_timestep", "conv", "lstm", "branches"}, (
     "a new network belongs in every_kind"
 )
-every_kind = st.one_of(
-    st.tuples(st.just({"network": "linear"}) | perceptrons | users, some_vectors, st.just({})),
-    st.tuples(st.just({"network": "constant"}), some_vectors, pictures | st.just({})),
-    st.tuples(lstm(st.none() | perceptrons | users | lstm(perceptrons)), some_vectors, st.just({})),
-    st.tuples(branches(), st.just({"pose": 2, "goal": 3}), st.just({"camera": (7, 6, 2)})),
-    st.tuples(convolutions | lstm(convolutions), some_vectors | st.just({}), pictures),
-)
-
-
-@settings(deadline=None)
-@given(every_kind, st.integers(1, 9), st.integers(1, 3), st.integers(1, 8), st.integers(0, 12))
-def test_a_call_for_many_steps_is_a_call_for_each(kind, longest, trajectories, steps, start):
-    spec, vectors, images = kind
-    network = make(InputShape(vectors, images, longest), **spec)
-    inputs = random_inputs(InputShape(vectors, images), trajectories, steps, start)
-    whole, _ = answer(network, inputs)
-    assert_close(whole, step_by_step(network, inputs))
 
 
 def separate_memory(network, k):

@@ -22,7 +22,6 @@ from stacked_networks import (
     separate,
 )
 from torch import nn
-from torch.utils.flop_counter import FlopCounterMode
 from user_networks import Stateful
 
 from ddco_pyro.model.networks import Inputs, InputShape, ShapeError, build
@@ -118,18 +117,6 @@ def one_at_a_time(network, inputs):
 def test_every_step_has_its_own_network(steps, start):
     network, inputs = make(network="per_timestep", hidden=[6]), make_inputs(steps=steps, start=start)
     assert_close(network(inputs)[0], one_at_a_time(network, inputs))
-
-
-@pytest.mark.parametrize(
-    ("trajectories", "steps", "start"), [(2, 60, 0), (2, 59, 0), (2, 7, 40), (1, 1, 7), (1, 1, 99)]
-)
-def test_each_step_costs_one_network_however_many_there_are(trajectories, steps, start):
-    width, longest = 16, 60
-    network = make(InputShape({"state": FEATURES}, {}, longest), network="per_timestep", hidden=[width])
-    with FlopCounterMode(display=False) as counter:
-        network(make_inputs(trajectories, steps, start))[0]
-    multiplications = COPIES * (FEATURES * width + width * OUTPUTS)
-    assert counter.get_total_flops() == 2 * trajectories * steps * multiplications
 
 
 # --- images -----------------------------------------------------------------------------------------------------------

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from oracle import brute_force
 
 from ddco_pyro.inference import log_likelihood, logspace
-from ddco_pyro.inference.engines import compare_engines
 from ddco_pyro.model.emissions import Gaussian
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
 from ddco_pyro.model.tables import complete
@@ -52,31 +49,6 @@ def random_actions(number=2, steps=4, seed=9, dtype=torch.float64):
     return torch.randn(number, steps, 2, generator=torch.Generator().manual_seed(seed)).to(dtype)
 
 
-CASES = [
-    ((1,), ("options",)), ((3,), ("options",)), ((3,), ("both",)), ((2,), ("control",)), ((3, 2), ("both", "options")),
-    ((2, 2), ("control", "both")), ((2, 3, 2), ("options", "both", "options")), ((2, 2, 2), ("both",) * 3),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("counts", "emits"), CASES)
-def test_the_likelihood_is_the_sum_over_paths(counts, emits):
-    steps = 4 - len(counts)
-    outputs, actions = random_outputs(counts, emits, steps=steps), random_actions(steps=steps)
-    lengths = torch.tensor([steps, 1])
-    tables = outputs.tables(actions)
-    truth = [brute_force(tables, n, int(length)).log_likelihood for n, length in enumerate(lengths)]
-    found = by_outputs(outputs, actions, lengths).detach().numpy()
-    np.testing.assert_allclose(found, truth, atol=1e-9, rtol=0)
-
-
-@pytest.mark.parametrize(("counts", "emits"), CASES)
-def test_every_gradient_is_that_of_pyros_enumeration(counts, emits):
-    outputs, actions = random_outputs(counts, emits, number=3, steps=5), random_actions(3, 5)
-    check = compare_engines(outputs, actions, torch.tensor([5, 1, 4]))
-    assert check.value < 1e-12
-    assert check.gradient < 1e-10
-
-
 @settings(max_examples=60)
 @given(st.data())
 def test_the_compiled_pass_is_the_one_in_log_space(data):
@@ -98,15 +70,6 @@ def test_the_compiled_pass_is_the_one_in_log_space(data):
         torch.testing.assert_close(ours, theirs, rtol=1e-6, atol=1e-6 * float(theirs.abs().max().clamp(min=1)))
 
 
-def test_what_cannot_be_reached_does_not_overflow_into_the_gradient():
-    """The meta-policy always acts itself, and all the options below would have done far better."""
-    outputs = random_outputs((1, 1, 1), ("options", "both", "control"), 2, 4, seed=2, sharp=10.0)
-    actions, lengths = random_actions(2, 4), torch.tensor([4, 1])
-    value = log_likelihood(outputs.tables(actions), lengths).sum()
-    for gradient in torch.autograd.grad(value, leaves(outputs), allow_unused=True, materialize_grads=True):
-        assert gradient.isfinite().all()
-
-
 def test_single_precision_stays_close():
     single = random_outputs((3, 2), ("both", "options"), 4, 50, dtype=torch.float32)
     actions, lengths = random_actions(4, 50, dtype=torch.float32), torch.full((4,), 50)
@@ -116,30 +79,6 @@ def test_single_precision_stays_close():
     torch.testing.assert_close(found, expected, rtol=1e-6, atol=0)
     (gradient,) = torch.autograd.grad(found.sum(), single.emissions[0].mean)
     assert gradient.dtype == torch.float32
-
-
-def test_what_lies_beyond_a_length_is_ignored():
-    outputs, actions, lengths = random_outputs((2,), ("both",)), random_actions(), torch.tensor([4, 2])
-    expected = by_outputs(outputs, actions, lengths)
-    with torch.no_grad():
-        outputs.termination_logits[0][1, 2:], actions[1, 2:] = 50.0, 1e3
-    found = by_outputs(outputs, actions, lengths)
-    torch.testing.assert_close(found, expected)
-    for gradient in torch.autograd.grad(found.sum(), [outputs.termination_logits[0], outputs.emissions[0].mean]):
-        assert not gradient[1, 2:].any()
-
-
-def test_underflow_is_left_to_log_space():
-    """Controls that every option is 1000 deviations away from, each at other steps."""
-    outputs, actions = random_outputs((2,), ("options",), 1, 4), random_actions(1, 4)
-    with torch.no_grad():
-        outputs.emissions[0].std[:] = 1e-3
-        outputs.termination_logits[0][:] = -60.0
-        outputs.emissions[0].mean[:] = torch.tensor([[0.0], [1.0]]).expand(1, 4, 2, 2)
-        actions[0] = torch.tensor([[0.0, 0], [1, 1], [0, 0], [1, 1]])
-    value = by_outputs(outputs, actions, torch.tensor([4]))
-    truth = brute_force(outputs.tables(actions), 0, 4).log_likelihood
-    np.testing.assert_allclose(value.detach(), [truth], rtol=1e-9)
 
 
 def test_a_second_derivative_is_never_left_out_in_silence():

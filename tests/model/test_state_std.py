@@ -165,9 +165,6 @@ def test_without_skill_options_lead_by_their_sigma_alone():
     assert of_state.nats_per_step < -3 * of_state.standard_error < 0
 
 
-# --- a baseline's own -------------------------------------------------------------------------------------------------
-
-
 # --- what is refused --------------------------------------------------------------------------------------------------
 
 

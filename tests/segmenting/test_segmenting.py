@@ -14,8 +14,6 @@ from types import SimpleNamespace
 
 import h5py
 import numpy as np
-import pyarrow
-import pyarrow.compute
 import pyarrow.parquet as parquet
 import pytest
 import yaml
@@ -418,23 +416,6 @@ def test_subtasks_are_written_as_lerobot_writes_them(tmp_path):
     assert [frames.metadata.row_group(group).num_rows for group in range(frames.num_row_groups)] == [5, 6, 7, 8]
 
 
-def test_subtasks_begin_at_the_very_times_of_frames(lerobot_run, tmp_path):
-    """To the bit, in the frames' own type."""
-    out = tmp_path / "annotated"
-    assert call("segment", lerobot_run.folder, LEROBOT, "--lerobot", out).status == 0
-    table = rows_of(out)
-    entry = table.schema.field("language_persistent").type.value_type
-    assert entry.field("timestamp").type == table.schema.field("timestamp").type == pyarrow.float32()
-    for one in look(lerobot_run.folder, LEROBOT).segments:
-        rows = table.filter(pyarrow.compute.equal(table["episode_index"], int(one.name[5:])))
-        times, entries = rows["timestamp"].to_pylist(), rows["language_persistent"].to_pylist()
-        assert all(row == entries[0] for row in entries)
-        options = one.levels["skill"].options.tolist()
-        active = [[said for said in entries[0] if said["timestamp"] <= time][-1] for time in times]
-        assert [said["content"] for said in active] == [("control", "skill 1", "skill 2")[one] for one in options]
-        assert {said["timestamp"] for said in entries[0]} <= set(times)
-
-
 def test_a_copy_with_subtasks(lerobot_run, tmp_path):
     out, features = tmp_path / "annotated", ("language_persistent", "language_events")
     arguments = ("segment", lerobot_run.folder, LEROBOT, "--lerobot", out, "--level", "phase")
@@ -506,17 +487,6 @@ def test_kinds_that_lie_apart_are_found_in_demonstrations_not_seen(name):
     found = scores(name, planted(4, seed=1))
     assert found.matched_globally.accuracy > 0.97
     assert found.boundary_f1_1 > 0.97
-
-
-def test_time_tells_apart_what_a_step_alone_does_not():
-    """With much noise a hidden Markov model and change points use the steps around; the gripper is left out."""
-    whole = planted(30, noise=1.0), planted(10, seed=1, noise=1.0)
-    train, noisy = (
-        Demonstrations(tuple(replace(demo, actions=demo.actions[:, :1]) for demo in demos)) for demos in whole
-    )
-    truth = [demo.labels["kind"] for demo in noisy]
-    nmi = {name: agreement(segment(name, train, noisy, 3, 0), truth).nmi for name in BASELINES}
-    assert min(nmi["hmm"], nmi["change_points"]) > nmi["kmeans"] + 0.1
 
 
 def test_equal_lengths():

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-import signal
 
 import joblib
 import numpy as np
 import pytest
 from selecting import Told, kept, score, spec_at, two_skills
 
-from ddco_pyro.errors import Failed
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.selection import SelectionFailed, Workers, final_spec, folds, select
 from ddco_pyro.spec import with_overrides
@@ -137,13 +135,6 @@ def test_an_unexpected_error_is_told_and_tried_again_next_time(tmp_path, monkeyp
 
 
 # --- in processes -----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_a_process_that_is_ended_from_outside_has_one_line(tmp_path, monkeypatch):
-    monkeypatch.setattr(folds, "score", lambda *_: signal.raise_signal(signal.SIGKILL))
-    with pytest.raises(Failed, match=r"^a process that trained a fold was ended from outside .* continue"):
-        select(spec_at(tmp_path), tmp_path / "run", Told(), Workers(2))
 
 
 @pytest.mark.slow

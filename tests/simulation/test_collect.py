@@ -199,6 +199,11 @@ LEVEL = {"count": 2, "policy": {"network": "linear"}}
 CONV = {"network": "conv"}
 
 
+def own(options):
+    """A network of one's own that needs ``passes``."""
+    return {"network": "user_networks:Diverging", "options": dict.fromkeys(options, 1)}
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -228,6 +233,17 @@ CONV = {"network": "conv"}
         (
             {"baseline": None, "hierarchy": {"levels": [LEVEL], "meta_policy": {"network": "nowhere:Net"}}},
             r"^hierarchy\.meta_policy: network 'nowhere:Net' cannot be imported",
+        ),
+        *(
+            (
+                {"baseline": {"kind": "flat", "policy": own(options)}},
+                rf"^baseline\.policy: .* made with options .*{why}",
+            )
+            for options, why in {
+                (): "missing 1 required positional argument: 'passes'",
+                ("passes", "gian"): "got an unexpected keyword argument 'gian'",
+                ("passes", "shape"): "got multiple values for argument 'shape'",
+            }.items()
         ),
     ],
 )

@@ -12,11 +12,8 @@ import toy_task
 from gymnasium import spaces
 
 from ddco_pyro.errors import BadInput
-from ddco_pyro.fitting.fit import fit
-from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.simulation.task import OutcomeError, Task, UnknownTask, find_task
-from ddco_pyro.spec import parse_spec
 from ddco_pyro.spec.base import TASKS
 
 
@@ -179,23 +176,3 @@ def test_what_cannot_be_a_task_is_refused():
     gymnasium.register("ddco-test/Sets-v0", Sets)
     with pytest.raises(BadInput, match="the action is a MultiBinary"):
         Task.from_gymnasium("ddco-test/Sets-v0")
-
-
-def test_the_example_collects_fits_and_rolls_out(tmp_path, monkeypatch):
-    monkeypatch.setenv("DDCO_PYRO_CACHE", str(tmp_path / "cache"))
-    task = find_task("ddco_tasks.example:task")
-    assert run_episode(task, "supervisor", 1).outcome["success"] == 1.0
-    spec = parse_spec(
-        {
-            "task": "ddco_tasks.example:task",
-            "demonstrations": {"count": 12},
-            "observations": ["offsets", "passed"],
-            "hierarchy": {"levels": [{"count": 2}]},
-            "training": {"epochs": 3},
-            "rollout": {"policies": ["supervisor"]},
-        }
-    )
-    fitted = fit(spec, out=tmp_path / "run")
-    found = roll_out(fitted, 2, film=1, jobs=1)
-    assert found.methods["supervisor"].measures["success"].successes == 2
-    assert list((tmp_path / "run" / "videos").rglob("*.mp4"))

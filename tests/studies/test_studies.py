@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import functools
 import json
-import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +15,6 @@ import pandas as pd
 import pytest
 import toy_task
 import yaml
-from killing import HANGS
 from random_demonstrations import numbered
 
 from ddco_pyro.data.demonstrations import Demonstrations
@@ -28,7 +24,7 @@ from ddco_pyro.fitting.fitted import load
 from ddco_pyro.jobs import Workers
 from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.spec import SpecError
-from studies import cells, declaration, labelling, statistics
+from studies import cells, declaration, statistics
 from studies.__main__ import told
 from studies.cells import Folder
 from studies.declaration import Study
@@ -488,33 +484,6 @@ def test_the_commit_of_the_code_is_that_of_library_and_study(tmp_path, monkeypat
         assert cells.commit_of(study) == first
 
 
-def test_cells_of_init_depend_on_its_template(made, monkeypatch, tmp_path):
-    folder = made(spec="init")
-    cell = folder.cells("test")[0]
-    depends = folder.depends(cell)
-    (tmp_path / "other.j2").write_text(cells.TEMPLATE.read_text() + "# more\n")
-    assert folder.depends(cell) == depends
-    monkeypatch.setattr(cells, "TEMPLATE", tmp_path / "other.j2")
-    assert folder.depends(cell) != depends
-
-
-@pytest.mark.slow
-def test_a_killed_study_goes_on_with_what_is_done(made):
-    folder = made(demonstrations={**STUDY["demonstrations"], "counts": [6]})
-    command = [sys.executable, "-m", "studies", "run", folder.study.path, "--out", folder.path, "--jobs", "1"]
-    process = subprocess.Popen(list(map(str, command)), cwd=ROOT, start_new_session=True, stderr=subprocess.DEVNULL)
-    limit = time.monotonic() + HANGS
-    while not (kept := {path: path.read_bytes() for path in (folder.path / "cells").glob("*.json")}):
-        assert time.monotonic() < limit
-        time.sleep(0.05)
-    os.killpg(process.pid, signal.SIGKILL)
-    assert process.wait() == -signal.SIGKILL
-    assert len(kept) < 4
-    state = folder.run(HERE)
-    assert len(state.done) == 4
-    assert {path: path.read_bytes() for path in kept} == kept
-
-
 def test_the_best_point_on_development_seeds_is_tested(made):
     """With σ of 50 every method explains the demonstrations worse than with 0.5. Options have a grid of their own."""
     methods = {
@@ -581,65 +550,6 @@ def test_cells_of_an_earlier_table_are_not_done(made, done, tmp_path):
     table.write_text(re.sub(r"(?m)^.*,flat,\d+,1,.*\n", "", table.read_text()))
     folder = made(kept=[{"table": "table.csv"}])
     assert {(cell.method, cell.seed) for cell in folder.state().missing} == {("flat", 1)}
-
-
-def edited(shown, command):
-    """By hand, what a page shows after a command, without a model."""
-    at = command.get("boundary", command.get("step"))
-    place = next(n for n, (_, start, stop) in enumerate(shown) if start <= at < stop)
-    option, start, stop = shown[place]
-    if command["do"] == "name":
-        return [*shown[:place], (command["option"], start, stop), *shown[place + 1 :]]
-    if command["do"] == "split":
-        assert start < command["step"] < stop
-        return [*shown[:place], (option, start, at), (option, at, stop), *shown[place + 1 :]]
-    before, begun, _ = shown[place - 1]
-    assert at == start
-    assert begun < command["to"] < stop
-    return [*shown[: place - 1], (before, begun, command["to"]), (option, command["to"], stop), *shown[place + 1 :]]
-
-
-def test_a_simulated_person_makes_every_segment_right_with_the_planned_number_of_commands():
-    """One after another, each the first of a new plan; boundaries may be off by the slack."""
-    rng = np.random.default_rng(0)
-    for slack in (0, 1):
-        for _ in range(200):
-            shown, wanted = (labelling.runs_of(rng.integers(1, 4, 12)[np.sort(rng.integers(0, 12, 12))]) for _ in "ab")
-            number, left = len(labelling.plan(shown, wanted, slack)), labelling.plan(shown, wanted, slack)
-            while left:
-                shown, number = edited(shown, left[0]), number - 1
-                left = labelling.plan(shown, wanted, slack)
-                assert len(left) <= number
-            truth = np.concatenate([[option] * (stop - start) for option, start, stop in wanted])
-            found = np.concatenate([[option] * (stop - start) for option, start, stop in shown])
-            off = np.flatnonzero(found != truth)
-            edges = np.array([start for _, start, _ in wanted[1:]])
-            assert all(np.min(np.abs(edges - step - 0.5)) <= slack for step in off)
-
-
-@pytest.mark.parametrize(
-    ("shown", "wanted", "commands"),
-    [
-        ([(1, 0, 5), (2, 5, 9)], [(1, 0, 6), (2, 6, 9)], []),  # within the slack
-        ([(1, 0, 5), (2, 5, 9)], [(1, 0, 7), (2, 7, 9)], [{"do": "move", "boundary": 5, "to": 7}]),
-        ([(1, 0, 5), (2, 5, 9)], [(1, 0, 9)], [{"do": "name", "option": 1, "step": 5}]),
-        ([(1, 0, 9)], [(1, 0, 4), (2, 4, 9)], [{"do": "split", "step": 4}, {"do": "name", "option": 2, "step": 4}]),
-        ([(1, 0, 9)], [(labelling.OPEN, 0, 9)], [{"do": "open", "step": 0}]),
-    ],
-)
-def test_a_simulated_person_counts_as_by_hand(shown, wanted, commands):
-    assert labelling.plan(shown, wanted, 1) == commands
-
-
-def test_a_target_is_reached_where_it_stays_reached():
-    curve = [{"edits": edits, "right": right} for edits, right in ((0, 0.0), (9, 0.96), (12, 0.7), (16, 0.95), (17, 1))]
-    assert (labelling.reached(curve, 0.95), labelling.reached(curve[:3], 0.95)) == (16, None)
-    truth = [np.array([-1, 0, 0, 1, 1, -1]), np.array([0, 0, 1, 1])]
-    scratch = [{"edits": 0, "right": 0}, {"edits": 7, "right": 0.5}, {"edits": 10, "right": 1}]
-    assert labelling.from_scratch(truth) == scratch  # three boundaries, two names, two new labels; then one and two
-    halves = labelling.from_equal_parts(truth[1:] * 2, 0)  # a boundary, two names, two new labels; and two acceptances
-    assert [values["edits"] for values in halves] == [0, 6, 7]
-    assert [values["right"] for values in halves] == [0, 1, 1]
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import h5py
 import numpy as np
-from killing import COMMAND
+from command_line import COMMAND
 
 
 def zeros(group: h5py.Group, place: str, shape: tuple[int, ...], chunk: tuple[int, ...], dtype: str = "f8") -> None:

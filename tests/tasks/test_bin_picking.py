@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 from ddco_tasks import psm
-from ddco_tasks.bin_picking import alone, camera, candidates, geometry, objects, supervisor, task
+from ddco_tasks.bin_picking import alone, candidates, geometry, objects, task
 from ddco_tasks.bin_picking import environment as bin_picking
 from ddco_tasks.bin_picking.environment import Environment
-from ddco_tasks.bin_picking.instrument import BACKLASH, Instrument, slack_after
+from ddco_tasks.bin_picking.instrument import BACKLASH, slack_after
 from ddco_tasks.bin_picking.trials import Attempt, End, Trials
 from ddco_tasks.rendering import mujoco
 
@@ -54,22 +54,6 @@ def test_a_pixel_is_turned_back_into_its_point() -> None:
         np.testing.assert_allclose(geometry.lying_at(geometry.project(point)), point, atol=1e-12)
 
 
-def test_an_object_is_seen_where_it_lies_by_both_eyes(environment: Environment) -> None:
-    for number in range(environment.physics.objects):
-        lay(environment, number, (0.005 * number, 0.008, 0.002))
-    masks = camera.masks(environment.physics)
-    centre = environment.physics.centres().mean(axis=0)
-    for eye, right in enumerate((False, True)):
-        rows, columns = np.nonzero(masks[..., eye])
-        expected = geometry.project(centre, right)
-        np.testing.assert_allclose([columns.mean(), rows.mean()], expected, atol=6.0)
-        assert abs(rows.mean() - expected[1]) < 4.0
-    rows, columns = np.nonzero(masks[..., 0])
-    middle = np.array([columns[0], rows[0]], float)
-    disparity = middle - camera.matched(masks, middle)
-    np.testing.assert_allclose(disparity, [geometry.FOCAL_LENGTH * geometry.BASELINE / 0.649, 0.0], atol=1.0)
-
-
 # The instrument.
 
 
@@ -85,28 +69,6 @@ def test_backlash_is_a_dead_band_moved_through_in_small_steps() -> None:
             joints = np.where(joints - step > BACKLASH, step + BACKLASH, joints)
         motors = goal
         np.testing.assert_allclose(motors - slack, joints, atol=1e-12)
-
-
-def test_a_command_brings_the_joints_to_where_they_are_wanted() -> None:
-    generator = np.random.default_rng(4)
-    instrument, motors, slack = Instrument.numbered(1), psm.inverse(supervisor.RECOVERY[0].pose), np.zeros(6)
-    for _ in range(20):
-        place = generator.uniform([-0.02, -0.02, 0.0], [0.02, 0.02, 0.03])
-        joints = psm.inverse(geometry.upright(generator.uniform(-0.7, 2.2), place))
-        command = instrument.command(joints, motors, slack)
-        slack, motors = slack_after(slack, command - motors), command
-        np.testing.assert_allclose(instrument.joints(motors, slack), joints, atol=1e-9)
-        np.testing.assert_allclose(instrument.motors(joints, slack), motors, atol=1e-9)
-
-
-def test_open_loop_is_off_by_what_is_said_of_uncalibrated_arms(environment: Environment) -> None:
-    physics = environment.physics
-    misses = []
-    for x in np.linspace(-0.015, 0.015, 4):
-        wanted = np.array([x, x / 2, 0.004])
-        reached = psm.forward(physics.predicted(psm.inverse(geometry.upright(0.8, wanted))))
-        misses.append(np.linalg.norm(reached.position - wanted))
-    assert 3e-3 < np.mean(misses) < 6e-3
 
 
 # Grasp candidates.
@@ -125,35 +87,7 @@ def test_the_direction_of_a_candidate_is_across_the_wire(angle: float) -> None:
             assert abs(offset[0] * np.sin(angle) + offset[1] * np.cos(angle)) < 1.0  # on its axis
 
 
-def test_features_are_those_of_the_grippers_frame() -> None:
-    picture = np.zeros((256, 256), np.uint8)
-    cv2.rectangle(picture, (120, 60), (136, 190), 255, -1)
-    upright = candidates.Candidate(np.array([128.0, 125.0]), 0.0)
-    turned = candidates.Candidate(np.array([125.0, 127.0]), np.pi / 2)
-    seen = candidates.features(picture, upright)
-    assert seen.min() == 0.0
-    assert seen.max() == 1.0
-    np.testing.assert_allclose(candidates.features(np.rot90(picture), turned), seen, atol=0.3)
-    assert candidates.draw(np.zeros((256, 256), np.uint8), np.random.RandomState(0)) == []
-
-
 # Contact.
-
-
-JAWS = 4 * bin_picking.JAW_ERROR
-
-
-@pytest.mark.parametrize("number", range(3))
-def test_jaws_close_as_far_as_what_they_hold_lets_them(environment: Environment, number: int) -> None:
-    radius = objects.parts(environment.task.trials.kinds[number])[0][2]
-    lay(environment, number, (0.0, 0.012, 0.002))
-    for height, jaw in ((0.020, 1), (0.003, 1), (0.003, 0)):
-        observation = go(environment, (0.0, 0.012, height), jaw, np.pi / 2).observation
-        if jaw:
-            np.testing.assert_allclose(observation["kin"][6], supervisor.JAW_OPEN, atol=JAWS)
-    nearest, furthest = 0.0077, 0.0127  # m, of the pads from the hinge
-    angle = observation["kin"][6]
-    assert 2 * radius / furthest - JAWS < angle < 2 * radius / nearest + JAWS
 
 
 @pytest.mark.parametrize("number", range(3))
@@ -189,18 +123,6 @@ def test_objects_that_no_demonstration_has_shown_are_held_and_only_the_thread_ha
     environment.close()
 
 
-@pytest.mark.parametrize(("number", "turn"), [(0, 0.0), (1, np.pi / 4), (2, np.pi / 2)])
-def test_what_falls_where_loads_are_shown_slides_back(environment: Environment, number: int, turn: float) -> None:
-    physics = environment.physics
-    quaternion = np.array([np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2)])
-    physics.place_object(number, geometry.SHOWING - [0.0, 0.0, 0.008], quaternion)
-    for _ in range(2):
-        observation = go(environment, (0.0, 0.0, 0.03), 1).observation
-    assert physics.places()[number] == "bin"
-    assert physics.centres()[number][1] < 0.022
-    assert not observation["image"][:24].any()
-
-
 # What can go wrong: the episode ends, with a name.
 
 
@@ -233,19 +155,6 @@ def test_a_grasp_is_of_what_is_seen_in_the_bin(environment: Environment, monkeyp
     go(environment, (0.0, 0.02, 0.03), 0)
     assert go(environment, (0.0, 0.02, 0.03), 1).last()
     assert task.outcome(environment)["ended_unseen"] == 1.0
-
-
-def test_what_lies_in_a_cup_by_the_jaws_is_not_carried(environment: Environment) -> None:
-    """On others it is as high as what hangs in the jaws."""
-    lay(environment, 0, (-0.06, 0.0, 0.002))
-    for jaw in (0, 1):
-        go(environment, (0.0, 0.02, 0.03), jaw)
-    go(environment, (-0.061, 0.0, 0.026), 0)
-    lay(environment, 0, (-0.06, 0.0, 0.02))
-    assert environment.physics.held() == {0}
-    go(environment, (-0.061, 0.0, 0.026), 1)
-    last = environment.task.trials.attempts[-1]
-    assert (last.before, last.carried, last.places) == (2, frozenset(), ("accept",))
 
 
 def test_four_misses_in_a_row_end_the_bin(environment: Environment) -> None:

@@ -1,37 +1,16 @@
 """The forms of bin picking's controls against independent truths: what encoders read, OpenCV, the polar factor."""
 
-from collections.abc import Iterator
-
 import cv2
 import numpy as np
 import pytest
-from ddco_tasks import bin_picking, psm
+from ddco_tasks import psm
 from ddco_tasks.bin_picking import geometry, task
 from ddco_tasks.bin_picking.controls import JOINTS, MATRIX, POSE, Controls, nearest_rotation
-from ddco_tasks.bin_picking.environment import Environment
 from ddco_tasks.bin_picking.shape import FEWEST, NAMES, REGION, described
 from scipy import linalg
 from scipy.spatial.transform import Rotation
 
-from ddco_pyro.simulation.task import Task
-
-SEED = 2  # a bin of three objects
-TASKS = {"joints": bin_picking.task, "pose": bin_picking.pose, "matrix": bin_picking.matrix}
 FORMS = {"joints": JOINTS, "pose": POSE, "matrix": MATRIX}
-
-
-@pytest.fixture
-def environment(request: pytest.FixtureRequest) -> Iterator[Environment]:
-    """A bin after its reset, with controls of the form that is asked for."""
-    environment = TASKS[request.param].load(SEED)
-    environment.reset()
-    yield environment
-    environment.close()
-
-
-def over_the_bin(turn: float = 0.8) -> np.ndarray:
-    """Joints [6] of a gripper over the bin."""
-    return psm.inverse(geometry.upright(turn, np.array([0.004, 0.01, 0.03])))
 
 
 @pytest.mark.parametrize("form", FORMS.values(), ids=FORMS)
@@ -53,19 +32,6 @@ def test_poses_are_position_and_opencvs_rotation_vector_or_matrix() -> None:
     np.testing.assert_allclose(MATRIX.of_joints(joints)[3:].reshape(3, 3), pose.rotation)
 
 
-@pytest.mark.parametrize("environment", ["pose"], indirect=True)
-def test_the_encoders_then_read_the_pose_within_the_joints_limits(environment: Environment) -> None:
-    control = np.append(POSE.of_joints(over_the_bin()), 1.0)
-    read = environment.step(control).observation["kin"]
-    np.testing.assert_allclose(read[:3], control[:3], atol=0.6)  # mm: a move is not quite repeatable
-    np.testing.assert_allclose(read[3:6], control[3:6], atol=0.03)
-    environment.step(environment.action_spec().maximum)
-    motors = environment.physics.motors
-    assert (motors >= psm.JOINT_RANGES[:, 0]).all()
-    assert (motors <= psm.JOINT_RANGES[:, 1]).all()
-    assert np.isclose(motors[:3, None], psm.JOINT_RANGES[:3]).any()
-
-
 def test_the_nearest_rotation_is_the_polar_factor_or_beats_all_others() -> None:
     generator = np.random.default_rng(1)
     others = Rotation.random(2000, random_state=2).as_matrix()
@@ -78,44 +44,6 @@ def test_the_nearest_rotation_is_the_polar_factor_or_beats_all_others() -> None:
         assert np.linalg.norm(others - matrix, axis=(1, 2)).min() > np.linalg.norm(nearest - matrix)
         if sign > 0:
             np.testing.assert_allclose(nearest, linalg.polar(matrix)[0], atol=1e-12)
-
-
-def test_demonstrations_are_the_same_motions() -> None:
-    """Until the jaws touch something: from there on rounding tells."""
-    moves = {name: _approach(task) for name, task in TASKS.items()}
-    for name in ("pose", "matrix"):
-        for (seen, control, intended), (same_seen, joints, meant) in zip(moves[name], moves["joints"], strict=True):
-            np.testing.assert_allclose(seen, same_seen, atol=1e-6)
-            np.testing.assert_allclose(FORMS[name].joints(control), joints[:6], atol=1e-9)
-            np.testing.assert_allclose(FORMS[name].joints(intended), meant[:6], atol=1e-9)
-            assert (control[-1], intended[-1]) == (joints[-1], meant[-1])
-
-
-def _approach(task: Task) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    environment = task.load(SEED)
-    policy, step, found = task.policies["supervisor"](environment), environment.reset(), []
-    policy.reset(3)
-    for _ in range(3):
-        control = policy.act(step.observation)
-        found.append((step.observation["kin"], control, policy.intended))
-        step = environment.step(control)
-    environment.close()
-    return found
-
-
-@pytest.mark.parametrize("environment", ["joints", "matrix"], indirect=True)
-def test_a_control_that_is_not_finite_ends_the_bin(environment: Environment) -> None:
-    control = environment.task.controls.control(np.append(over_the_bin(), 1.0))
-    control[-2] = np.nan
-    step = environment.step(control)
-    assert step.last()
-    assert bin_picking.task.outcome(environment)["ended_unstable"] == 1.0
-    assert all(np.isfinite(value).all() for value in step.observation.values())
-
-
-def test_a_wrist_in_the_remote_centre_of_motion_has_no_joints() -> None:
-    at = 1e3 * (psm.RCM - psm.JAW_LENGTH * np.array([0.0, 0.0, 1.0]))
-    assert np.isnan(MATRIX.joints(np.concatenate([at, np.eye(3).ravel(), [1.0]]))).all()
 
 
 # --- the shape of a load ----------------------------------------------------------------------------------------------

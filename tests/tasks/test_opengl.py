@@ -9,7 +9,6 @@ import pytest
 from ddco_tasks.opengl import PACKAGES, advice
 
 ROOT = Path(__file__).parents[2]
-COMMAND = Path(sys.executable).with_name("ddco-pyro")
 NO_DRIVER = {"__EGL_VENDOR_LIBRARY_DIRS": "/nowhere"}
 LIBRARIES = {
     "libEGL.so.1 cannot be loaded": ("libEGL",),
@@ -56,14 +55,6 @@ def test_without_opengl_libraries_one_line_names_the_packages(cause: str, script
     assert (found.returncode, found.stdout) == (1, "")
     assert found.stderr.splitlines() == [f"{head}{advice(cause)}"]
     assert f"apt-get install {PACKAGES}" in advice(cause)
-
-
-@pytest.mark.slow
-def test_without_a_driver_one_line_names_the_packages() -> None:
-    for command in ((sys.executable, "tasks/opengl.py"), (COMMAND, "check", "specs/needle.yaml")):
-        found = ended(*command, **NO_DRIVER)
-        assert found.returncode == 1
-        assert found.stderr.splitlines()[-1].endswith(advice("EGL has no device that starts"))
 
 
 @pytest.mark.parametrize("own", [{}, NO_DRIVER | {"MUJOCO_GL": "osmesa"}, NO_DRIVER | {"DISPLAY": ":0"}], ids=str)

@@ -90,22 +90,3 @@ class Misinformed:
 def test_a_box_on_the_other_side_is_no_success() -> None:
     outcomes = [run_episode(cue.task, Misinformed(), seed).outcome for seed in range(4)]
     assert outcomes == [{"success": 0.0, "wrong_side": 1.0, "toppled": 0.0, "missed": 0.0}] * 4
-
-
-class Low:
-    """Keeps the tip where the box should come, 0.15 m above the surface."""
-
-    def reset(self, seed: int) -> None:
-        """Nothing to forget."""
-
-    def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
-        """Joint velocities [3] (rad/s)."""
-        place = cue.geometry.inverse(np.array([0.0, 0.15]), 0.0)
-        return cue.rules.towards(observation["joint_angles"], place)
-
-
-def test_the_box_does_not_come_where_the_arm_is() -> None:
-    episode = run_episode(cue.task, Low(), 0)
-    assert episode.outcome == {"success": 0.0, "wrong_side": 0.0, "toppled": 0.0, "missed": 1.0}
-    assert len(episode.record) == cue.STEPS
-    assert episode.record.observations["box_pose"][:, 0].min() == pytest.approx(cue.AWAY, abs=1e-3)

@@ -146,18 +146,6 @@ def test_clusters_are_k_means_of_observations_and_weighted_controls(seed):
     assert_k_means(np.hstack([vector, np.sqrt(8) * actions]), choices, 3)
 
 
-def test_other_demonstrations_go_to_the_nearest_mean():
-    vector, actions = random_rows(5, 3).astype(np.float32), random_rows(6, 2)
-    batch = make_batch(vector, actions)
-    found = Clusters(batch, 4, seed=0)
-    choices = alive(found.choices(batch))
-    means = np.stack([vector[choices == k].mean(0) for k in (1, 2, 3, 4)])
-    others = 2 * random_rows(7, 3)
-    distances = np.linalg.norm(others[:, None] - means, axis=-1)
-    choices = found.choices(make_batch(others, actions, lengths=(6, 8, 3)))
-    np.testing.assert_array_equal(alive(choices, (6, 8, 3)), distances.argmin(1) + 1)
-
-
 def test_images_are_seen_as_block_means():
     """Mean brightness of each block of 2 × 3 pixels, by hand, in [0, 1]; beside it the vector."""
     random = np.random.default_rng(8)

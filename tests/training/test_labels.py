@@ -128,14 +128,6 @@ def test_the_first_demonstrations_in_training_have_labels_those_to_tune_with_las
             assert row == (given if seen == {1, 2} else [min(option, 1) for option in given])
 
 
-def test_labels_of_unequal_length_are_free_past_the_end():
-    demos = random_demonstrations([[0, 4, -1], [4], [0, 0], [4, -3]])
-    labels = Labels.of(labelled(), demos, demos.select(["demo_3"]))
-    assert labels.values == (0, 4)
-    assert labels.train.tolist() == [[1, 2, -1], [2, -1, -1], [1, 1, -1], [2, -1, -1]]
-    assert labels.tune.tolist() == [[2, -1]]
-
-
 @pytest.mark.parametrize(
     ("labels", "message"),
     [

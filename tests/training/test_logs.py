@@ -69,9 +69,8 @@ class Kept:
         self.got.append("closed")
 
 
-def logged(monkeypatch, tmp_path, kept):
-    """What it says of some events."""
-    said = []
+def test_restarts_have_names_of_their_own_and_numbers_are_finite(tmp_path, monkeypatch) -> None:
+    said, kept = [], Kept()
     monkeypatch.setitem(LOGS, "tensorboard", (kept, "ddco_pyro"))
     with Log("tensorboard", tmp_path / "run", {"seed": 3}, said.append) as log:
         log(DemonstrationsDone(1, 2))
@@ -79,12 +78,7 @@ def logged(monkeypatch, tmp_path, kept):
         assert kept.got == []  # the run folder may not be there yet
         log(EpochEnded(0, "joint", 2, -1.0, float("nan")))
         log(EpochEnded(1, "joint", 3, -2.0, -3.0))
-    return said
-
-
-def test_restarts_have_names_of_their_own_and_numbers_are_finite(tmp_path, monkeypatch) -> None:
-    kept = Kept()
-    assert logged(monkeypatch, tmp_path, kept) == []
+    assert said == []
     assert kept.got == [
         (tmp_path / "run", {"seed": 3}),
         ({"DDCO/joint/train": -1.0}, 2),

@@ -243,20 +243,6 @@ def test_more_processes_than_shards_are_refused(whole, tmp_path):
 # --- many calls -------------------------------------------------------------------------------------------------------
 
 
-def places(number, calls, **how):
-    """The processes that make so many calls, by call."""
-    with run_all(dict.fromkeys(range(calls), os.getpid), Workers(number), "worked", **how) as results:
-        return dict(results)
-
-
-def test_calls_are_made_here_or_in_other_processes() -> None:
-    here = os.getpid()
-    assert set(places(1, 3).values()) == set(places(4, 1).values()) == set(places(1, 3, beside=True).values()) == {here}
-    assert places(4, 0) == places(4, 0, beside=True) == {}
-    assert here not in {*places(2, 3).values(), *places(2, 1, beside=True).values()}
-    assert list(places(3, 9, ordered=True)) == list(range(9))
-
-
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_events_come_call_after_call_and_the_wait_is_announced_once(jobs) -> None:
     def tell(number, on_event):  # pickled by value, as it is in no module
@@ -292,15 +278,6 @@ def test_an_error_ends_what_is_not_done(tmp_path, capfd) -> None:
         raise ValueError
     assert_ends(int(begun[0].name), 10)
     assert capfd.readouterr().err == ""
-
-
-def test_a_process_ends_at_sigterm_whatever_this_one_does() -> None:
-    before = signal.signal(signal.SIGTERM, signal.getsignal)
-    try:
-        with run_all({0: partial(signal.getsignal, signal.SIGTERM)}, Workers(2), "", beside=True) as results:
-            assert dict(results) == {0: signal.SIG_DFL}
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 KILLED = """

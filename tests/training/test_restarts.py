@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 import user_networks
+from killing import Interrupting
 from planted import make_spec, make_trainer, small_spec
 from random_demonstrations import numbered, of_states
 from sklearn.metrics import normalized_mutual_info_score
@@ -14,7 +15,7 @@ import ddco_pyro
 from ddco_pyro.drawing import words
 from ddco_pyro.evaluation import effort
 from ddco_pyro.evaluation.verdicts import verdict
-from ddco_pyro.events import EpochEnded, RestartDiverged, RestartStopped
+from ddco_pyro.events import RestartDiverged, RestartStopped
 from ddco_pyro.inference import log_likelihood, segment
 from ddco_pyro.metrics import Training
 from ddco_pyro.spec import with_overrides
@@ -79,18 +80,6 @@ def test_two_processes_give_the_same_bits_also_where_one_had_begun(undisturbed, 
     interrupted(make_trainer(spec, demos, tmp_path, Interrupting(5 * 3 + 2)))
     trainer = make_trainer(spec, demos, tmp_path, jobs=2)
     assert_same(trainer, trainer.run().state_dict(), tmp_path, undisturbed)
-
-
-class Interrupting:
-    """Ctrl-C at so many epochs."""
-
-    def __init__(self, epochs):
-        self.left = epochs
-
-    def __call__(self, event):
-        self.left -= isinstance(event, EpochEnded)
-        if self.left == 0:
-            raise KeyboardInterrupt
 
 
 def interrupted(trainer):
@@ -332,17 +321,3 @@ def test_a_hierarchy_is_no_less_likely_in_training_than_its_mixture(seed, monkey
     went_on = [one.start for one in restarts.each[1:]]
     assert (went_on == []) == (broken.objective <= restarting.ROUNDING)
     assert set(went_on) <= {restarting.BESIDE}
-
-
-def test_options_whose_every_psi_is_almost_one_are_as_likely_as_the_mixture(tmp_path):
-    """So that going on from the mixture cannot end below it by more than that."""
-    spec = contains(["vq"])
-    demos = memoryless(0)
-    fit = ddco_pyro.fit(spec, demos)
-    trainer = make_trainer(spec, demos, tmp_path)
-    model, mixture, batch = trainer.data.hierarchy(0), fit.baselines["mixture"].hierarchy, trainer.data.train
-    model.load_state_dict(model.state_dict() | mixture.state_dict())
-    model.begin_terminations(restarting.ALMOST_ALWAYS)
-    with torch.no_grad():
-        ours, theirs = (log_likelihood(one.tabulate(batch), batch.lengths).sum() for one in (model, mixture))
-    assert abs(float(ours - theirs)) / batch.steps < 0.004

@@ -15,8 +15,8 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.inference import log_likelihood
 from ddco_pyro.spec import with_overrides
 from ddco_pyro.training.checkpoint import Progress, Restart
-from ddco_pyro.training.loop import StageTraining, backward, train
-from ddco_pyro.training.objective import Objective, TrainingError
+from ddco_pyro.training.loop import StageTraining, train
+from ddco_pyro.training.objective import Objective
 from ddco_pyro.training.stages import RISING, StageEnd, plan
 
 QUICK = {"control": {"std": 1.0}, "optimizer": {"lr": 0.1}}
@@ -64,33 +64,6 @@ def test_a_meta_policy_that_nothing_trains_before_all_are_begins_with_its_option
         assert ends[first + 1 : last + 1, option].max() < 0.2
     acts = with_overrides(material.spec, {"hierarchy.meta_policy.emits": ["options", "control"]})
     assert [stage.discovering for stage in plan(acts, 1)] == [1, None]
-
-
-def test_beside_the_levels_under_a_uniform_meta_policy_the_meta_policy_learns_of_the_same_choices():
-    """Gradients against those of each by itself: the levels' do not change, and the meta-policy's are those of the
-    clamped likelihood of the whole hierarchy.
-    """
-    material = lines()
-    stage, rows = plan(material.spec, 1)[0], torch.arange(len(material.train))
-    alone = replace(stage, discovering=1, selecting=False)
-    model = material.hierarchy(0)
-    found = gradients(model, Objective(material, Progress(0), stage), rows)
-    levels = gradients(model, Objective(material, Progress(0), alone), rows)
-    objective = Objective(material, Progress(0), stage)
-    tables = model.tabulate(material.train).clamp(1, objective.known[0][1])
-    model.zero_grad()
-    (-log_likelihood(tables, material.train.lengths).sum() / material.train.steps).backward()
-    whole = {name: each.grad for name, each in model.named_parameters()}
-    for name, gradient in found.items():
-        expected = whole[name] if name.startswith("meta_policy.") else levels[name]
-        torch.testing.assert_close(gradient, expected)
-        assert gradient.abs().max() > 0
-
-
-def gradients(model, objective, rows):
-    model.zero_grad()
-    backward(objective, model, objective.data.train, rows)
-    return {name: each.grad.clone() for name, each in model.named_parameters() if each.grad is not None}
 
 
 def test_learning_rates_fall_along_half_a_cosine(tmp_path, monkeypatch):
@@ -143,16 +116,6 @@ def test_stages_share_the_budget_and_what_one_leaves_goes_to_the_later_ones(tmp_
     assert min(taken.values()) < 10  # one has stopped early
     assert max(taken.values()) > 11  # and another has taken more than an even share
     assert trainer.summary["spent"]["epochs"] == 62 - left
-
-
-@pytest.mark.parametrize("counts", [(2, 2), ()])
-def test_every_model_has_the_same_budget(tmp_path, counts):
-    """Whatever the number of its stages: 1 or 4 here. The steps are those of minibatches of 3 out of 8."""
-    spec = make_spec(counts, epochs=14, patience=None, batch_size=3, starts=["random", "random"])
-    trainer = make_trainer(spec, of_states([8] * 10), tmp_path)
-    trainer.run()
-    assert sum(epochs_of(trainer, 0).values()) == sum(epochs_of(trainer, 1).values()) == 14
-    assert trainer.summary["budget"] == trainer.summary["spent"] == {"epochs": 14, "gradient_steps": 14 * 3}
 
 
 def test_without_a_budget_every_stage_trains_until_its_patience(tmp_path):
@@ -252,13 +215,6 @@ def test_both_engines_train_to_the_same_model(tmp_path):
         states.append(make_trainer(spec, demos, tmp_path / engine).run().state_dict())
     for name, value in states[0].items():
         torch.testing.assert_close(states[1][name], value, rtol=1e-3, atol=1e-5)
-
-
-def test_what_is_not_finite_names_the_demonstration(tmp_path):
-    trainer = make_trainer(make_spec(), of_states([8] * 10), tmp_path)
-    trainer.data.train.actions[trainer.data.names.index("demo_0")] = torch.inf
-    with pytest.raises(TrainingError, match=r"demo_0 is not finite"):
-        trainer.run()
 
 
 # --- convergence ------------------------------------------------------------------------------------------------------

@@ -70,23 +70,6 @@ def _count(h, b, weight, depth, selected, ended):
             ended[level - 1][h[t - 1][level] - 1, b[t][level]] += weight
 
 
-def test_demonstrations_count_alike_in_one_piece_and_in_two():
-    tables, lengths = random_tables((3, 2), (False, False), 4, 6), torch.tensor([6, 4, 6, 5])
-    parts = [(_rows(tables, rows), lengths[rows]) for rows in (slice(0, 1), slice(1, 4))]
-    constants = random_constants(tables)
-    (whole, one), (pieces, other) = improved([(tables, lengths)], constants), improved(parts, constants)
-    assert pieces == pytest.approx(whole, abs=1e-9)
-    for own, parted in zip((*one.selection, *one.termination), (*other.selection, *other.termination), strict=True):
-        np.testing.assert_allclose(parted, own, atol=1e-9)
-
-
-def _rows(tables, rows):
-    return replace(
-        tables,
-        **{name: tuple(t[rows] for t in getattr(tables, name)) for name in ("selection", "termination", "control")},
-    )
-
-
 # --- what networks take over ------------------------------------------------------------------------------------------
 
 
