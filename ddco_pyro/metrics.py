@@ -108,6 +108,15 @@ class PerStep(Record):
     valid: Finite | None
 
 
+class Marginal(PerStep):
+    """The same of a density of the control that reads no observation, fitted to the training demonstrations.
+
+    It has the kinds of the model. ``controls`` is the number of control dimensions that vary.
+    """
+
+    controls: AtLeastOne
+
+
 class HeldOut(Record):
     """The log-likelihood of a held-out demonstration, nats."""
 
@@ -357,23 +366,28 @@ class Use(Record):
 
 
 class Segments(Record):
-    """Segments of a level on the most likely paths: the ``median`` of their steps, and their ``number`` in all."""
+    """Segments of a level on the most likely paths: the ``median`` of their steps, and their ``number`` in all.
+
+    ``twitches`` of them are too short for a skill (:func:`ddco_pyro.evaluation.options.segments_of`).
+    """
 
     median: Finite
     number: AtLeastOne
     demonstrations: AtLeastOne
+    twitches: int
 
-    def brief(self, frequency: float | None) -> bool:
-        """Whether options switch often, and most segments are too short for a skill."""
-        shortest = BRIEF_SECONDS * frequency if frequency else BRIEF_STEPS
-        return self.median < shortest and self.number >= OFTEN * self.demonstrations
+    OFTEN: ClassVar[int] = 6
+    """Segments in a demonstration from which on options switch often; a few twitches may be meant."""
 
+    @property
+    def often(self) -> bool:
+        """Whether options switch often."""
+        return self.number >= self.OFTEN * self.demonstrations
 
-BRIEF_SECONDS = 0.5
-BRIEF_STEPS = 5
-"""Options are brief where their median segment is shorter: by the first where the rate is known, else by the second."""
-OFTEN = 6
-"""Segments in a demonstration from which on options switch often; a few brief ones may be meant."""
+    @property
+    def brief(self) -> bool:
+        """Whether options switch often, and most segments are twitches."""
+        return self.often and 2 * self.twitches > self.number
 
 
 class Alike(Record):
@@ -546,6 +560,7 @@ class Metrics(Record, frozen=False):
     model: str
     log_likelihood_per_step: PerStep
     log_likelihood_by_dimension: ByDimension
+    marginal: LeftOut[Marginal | None] = None
     valid: list[HeldOut]
     demonstrations_by_likelihood: list[Listed]
     comparison: dict[str, Compared]

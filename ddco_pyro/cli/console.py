@@ -226,6 +226,27 @@ def labels(spec: Spec, used: Labels | None, known: Mapping[str, Sequence[str]]) 
 # --- fit, select, rollout ---------------------------------------------------------------------------------------------
 
 
+def skills(fit: Fit) -> None:
+    """How each option is used, how long segments are, and how they agree with labels."""
+    from ddco_pyro.evaluation.options import beside_equal_parts
+    from ddco_pyro.report.options import use_table
+
+    if fit.spec.hierarchy:
+        show(use_table(fit))
+        say(verdicts.twitches(fit.metrics.segments, fit.metrics.control_frequency))
+        for text, worse in beside_equal_parts(fit.metrics):
+            if not worse:
+                say(text)
+
+
+def warnings(fit: Fit) -> None:
+    """What is doubtful about the model, and what to do."""
+    from ddco_pyro.report.training import doubts
+
+    for what, advice in doubts(fit):
+        say(f"warning: {what} {advice}")
+
+
 ONE_FIT = (
     "± is one standard error over the held-out demonstrations of one fit; other training seeds give other fits: "
     "repeat them with --seeds 5."
@@ -233,16 +254,18 @@ ONE_FIT = (
 
 
 def log_likelihoods(fit: Fit) -> None:
-    """Log-likelihood of the model and of its baselines, as in the report, and in what their σ differs."""
-    from ddco_pyro.report.likelihood import stds, table
+    """Log-likelihood of the model and of its baselines, the test against the mixture, and what is doubtful of it."""
+    from ddco_pyro.report.likelihood import parts, stds, table
 
     metrics = fit.metrics
-    show(table(metrics, 3, "log-likelihood, nats per step (higher is better)"))
-    if caution := verdicts.caution(metrics):
-        say(caution)
-    if metrics.worth:
-        said = verdicts.worth_of(metrics)
+    if said := verdicts.tested(metrics):
         say(said if metrics.seeds else f"{said} {ONE_FIT}")
+    if found := parts(metrics):
+        show(found)
+    show(table(metrics, 3, "log-likelihood, nats per step (higher is better)"))
+    others = {name: one.training for name, one in metrics.comparison.items()}
+    for what, advice in (*verdicts.faults(metrics), *effort.unconverged(others)):
+        say(f"warning: {what} {advice}")
     if differ := stds(fit):
         say(differ)
     for name, training in metrics.trainings.items():
@@ -252,22 +275,10 @@ def log_likelihoods(fit: Fit) -> None:
 
 def seeds(metrics: Metrics) -> None:
     """Variation of the models of a run over training seeds; nothing where the fit was not repeated."""
-    found = metrics.seeds
-    if found is None:
-        return
-    rows = [[method(name), *words.spread(values)] for name, values in found.held_out.items()]
-    title = f"held-out nats per step over training seeds {words.listed(map(str, found.training_seeds))}"
-    show(Table(["Method", "mean", "95 % interval", "range"], rows, title=title))
-    sound, brief = verdicts.sound(metrics), verdicts.brief(metrics)
-    say(verdicts.over_seeds(found, method(metrics.model), len(metrics.valid), sound, brief))
-
-
-def warnings(fit: Fit) -> None:
-    """Warnings of a short training and of a degenerate solution, with remedies."""
-    from ddco_pyro.evaluation.options import degeneracies
-
-    for what, advice in (*effort.unconverged(fit.metrics), *degeneracies(fit.metrics, fit.spec, fit.names)):
-        say(f"warning: {what} {advice}")
+    if found := metrics.seeds:
+        rows = [[method(name), *words.spread(values)] for name, values in found.held_out.items()]
+        title = f"held-out nats per step over training seeds {words.listed(map(str, found.training_seeds))}"
+        show(Table(["Method", "mean", "95 % interval", "range"], rows, title=title))
 
 
 def names(fit: Fit) -> None:
@@ -307,8 +318,7 @@ def successes(metrics: Metrics) -> None:
 
     assert metrics.rollouts is not None  # it has been rolled out
     show(measures_table(metrics.rollouts.methods, title=f"{metrics.rollouts.episodes} episodes each"))
-    if said := verdicts.success_worth(metrics.rollouts, method(metrics.model)):
-        say(said)
+    say(verdicts.success(metrics))
 
 
 # --- inspect ----------------------------------------------------------------------------------------------------------

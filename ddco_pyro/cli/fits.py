@@ -150,10 +150,11 @@ def _fit_and_report(
             fitted = repeat(fitted, seeds, progress, jobs)
     from ddco_pyro.report import write_report  # imports matplotlib, after the fit
 
+    console.skills(fitted)
+    console.names(fitted)
+    console.warnings(fitted)
     console.log_likelihoods(fitted)
     console.seeds(fitted.metrics)
-    console.warnings(fitted)
-    console.names(fitted)
     print(f"report: {write_report(fitted, fitted.demonstrations)}")
     file = loaded.demonstrations.path
     segment = command("segment", folder, file or "", "--html", "segments.html", *_allowed(loaded))

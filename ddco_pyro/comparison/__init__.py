@@ -19,7 +19,7 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.errors import BadInput, path_of
 from ddco_pyro.evaluation.agreement import UNMATCHED
 from ddco_pyro.fitting.fitted import Fit, load
-from ddco_pyro.metrics import Training, read_successes
+from ddco_pyro.metrics import Marginal, Training, read_successes
 from ddco_pyro.statistics import paired, paired_difference, rate
 from ddco_pyro.training.data import train_and_valid
 
@@ -67,6 +67,7 @@ class Comparison:
     :param agreement: agreement of options with labels, a dict for each level of each run.
     :param rollouts: success paired by initial state, a dict for each pair of runs.
     :param sorted_by: the run whose likelihood sorts the trajectories: the best with options, or the best.
+    :param marginal: the density without observations that the best run knows; baselines know none.
     """
 
     rows: Sequence[Row]
@@ -75,6 +76,7 @@ class Comparison:
     agreement: Sequence[dict[str, Any]]
     rollouts: Sequence[dict[str, Any]]
     sorted_by: str
+    marginal: Marginal | None = None
 
     @property
     def worst_first(self) -> list[dict[str, Any]]:
@@ -130,7 +132,8 @@ def compare(runs: Sequence[str | Path], allow_code: bool = False) -> Comparison:
             row for row in _agreement(fit) if row not in agreement
         ]  # equal parts are the same in several runs
     sorted_by = next((fit.place for fit in ranked if fit.spec.hierarchy), ranked[0].place)
-    return Comparison(rows, demos[0].names, demos[0].lengths, agreement, _paired_rollouts(ranked), sorted_by)
+    marginal = next((fit.metrics.marginal for fit in ranked if fit.metrics.marginal), None)
+    return Comparison(rows, demos[0].names, demos[0].lengths, agreement, _paired_rollouts(ranked), sorted_by, marginal)
 
 
 def _row(rank: int, fit: Fit, values: np.ndarray, best: np.ndarray, lengths: Sequence[int]) -> Row:

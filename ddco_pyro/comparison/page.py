@@ -17,11 +17,11 @@ from ddco_pyro.drawing.figures import Interval, Panel, interval_plot, save, styl
 from ddco_pyro.drawing.page import Block, Cell, Page, Picture, Section, Table, Text, note
 from ddco_pyro.evaluation import effort, verdicts
 from ddco_pyro.evaluation.agreement import UNMATCHED, measure_names
-from ddco_pyro.metrics import Difference, PerStep, Rate
-from ddco_pyro.names import FLAT, HIERARCHY, MIXTURE, method
+from ddco_pyro.metrics import Rate
+from ddco_pyro.names import HIERARCHY, method
 from ddco_pyro.report.likelihood import SHOWN
 from ddco_pyro.segmenting.page import anchor
-from ddco_pyro.statistics import paired, worth
+from ddco_pyro.statistics import worth
 
 FILES = ("compare.png", "compare.json", "compare.md", "compare.html")
 """The files of a comparison."""
@@ -114,43 +114,22 @@ def rollout_table(compared: Comparison) -> Table | None:
 
 
 def verdict(compared: Comparison) -> str:
-    """The best run, its lead and whether the lead is significant, as in the report's first sentence."""
+    """The best run, its lead and whether the lead is significant; what is doubtful about runs comes first."""
     best, *others = compared.rows
-    steps = sum(compared.steps)
-    differences = {
-        row.name: Difference(nats_per_step=row.difference / steps, standard_error=row.dse and row.dse / steps)
-        for row in others
-    }
-    rising = effort.rising(row.name for row in compared.rows if not row.training.converged)
-    said = [_caution(compared), verdicts.explains(best.name, differences, len(compared.trajectories)), _worth(compared)]
-    return f"{' '.join(filter(None, said))}{rising}"
-
-
-def _caution(compared: Comparison) -> str:
-    """The runs that fell apart, those with options below the best flat one, and what to do; empty where there are
-    none.
-    """
-    rows, flat = compared.rows, next((row for row in compared.rows if row.model in FLAT), None)
     steps = np.array(compared.steps, dtype=float)
-    below = {
-        row.name: (flat.name, paired(np.array(row.each), np.array(flat.each), steps))
-        for row in rows
-        if flat and row.model == HIERARCHY
-    }
-    return verdicts.cautions({row.name: _per_step(row) for row in rows}, below, len(steps))
-
-
-def _per_step(row: Row) -> PerStep:
-    return PerStep(train=row.in_training, valid=row.per_step)
-
-
-def _worth(compared: Comparison) -> str:
-    """The worth of several policies and of options that last, where there is one run of each model."""
-    models = [row.model for row in compared.rows]
-    alone = {row.model: np.array(row.each) for row in compared.rows if models.count(row.model) == 1}
-    found = worth(HIERARCHY, alone, compared.steps)
-    sound = not any(verdicts.apart(_per_step(row)) for row in compared.rows if row.model in (HIERARCHY, MIXTURE))
-    return verdicts.worth(found, method(HIERARCHY), len(compared.trajectories), sound) if found else ""
+    each = {row.name: np.array(row.each) for row in compared.rows}
+    train, kinds = ({row.name: getattr(row, key) for row in compared.rows} for key in ("in_training", "model"))
+    models = verdicts.Models(each, train, steps, kinds, compared.marginal)
+    told = [" ".join(doubt) for name in each for doubt in models.doubts(name)]
+    leads = {row.name: models.lead(best.name, row.name) for row in others}
+    told.append(verdicts.explains(best.name, leads, len(steps)))
+    runs = [row.model for row in compared.rows]
+    alone = {row.model: each[row.name] for row in compared.rows if runs.count(row.model) == 1}
+    if models.sound() and (found := worth(HIERARCHY, alone, compared.steps)):
+        told.append(verdicts.lasting(found, method(HIERARCHY), len(steps)))
+        told += [] if compared.rollouts else [verdicts.said("success", "few")]
+    rising = effort.rising(row.name for row in compared.rows if not row.training.converged)
+    return f"{' '.join(told)}{rising}"
 
 
 def _links(compared: Comparison, folder: Path) -> dict[str, str]:

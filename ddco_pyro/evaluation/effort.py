@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from statistics import fmean
 
 from ddco_pyro.drawing.words import capital, listed, number, verb
-from ddco_pyro.metrics import Candidate, Metrics, Stage, Training
+from ddco_pyro.metrics import Candidate, Stage, Training
 from ddco_pyro.names import method
 
 
@@ -86,10 +86,10 @@ def restarts(training: Training) -> str:
 RAISE = "Raise training.epochs: all compared models have this budget, whatever their number of stages."
 
 
-def unconverged(metrics: Metrics) -> list[tuple[str, str]]:
+def unconverged(trainings: Mapping[str, Training]) -> list[tuple[str, str]]:
     """Every model whose budget ended a stage before it converged, in words with the numbers, and the remedy."""
     verdicts = []
-    for name, training in metrics.trainings.items():
+    for name, training in trainings.items():
         stages = [_too_short(stage) for stage in training.stages if not stage.converged]
         if stages:
             who = method(name)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -12,9 +12,10 @@ from torch import Tensor
 
 from ddco_pyro.acting.monitor import run_lengths
 from ddco_pyro.drawing.words import capital, duration, listed, number, percent
+from ddco_pyro.evaluation.verdicts import said
 from ddco_pyro.events import OnEvent, OptionsCompared, ignore
 from ddco_pyro.inference import Posterior
-from ddco_pyro.metrics import Agreement, Alike, Metrics, Segments, Use
+from ddco_pyro.metrics import Alike, Metrics, Segments, Use
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
 from ddco_pyro.names import numbered_name
 from ddco_pyro.spec import Spec, TrainingSpec
@@ -73,10 +74,25 @@ def option_use(posterior: Posterior, paths: Iterable[Sequence[np.ndarray]]) -> l
     return uses
 
 
-def segments_of(paths: Sequence[np.ndarray]) -> Segments:
-    """The segments of a level on the most likely paths [T] of demonstrations."""
-    lengths = np.concatenate(run_lengths(paths, max(int(path.max()) for path in paths)))
-    return Segments(median=float(np.median(lengths)), number=len(lengths), demonstrations=len(paths))
+TWITCH_SECONDS = 0.5
+TWITCH_STEPS = 5
+TWITCH_SHARE = 1 / 50
+"""A segment is a twitch where it is shorter: by the first where the rate is known, else by the others, of which the
+last is a share of its demonstration."""
+
+
+def segments_of(paths: Sequence[np.ndarray], frequency: float | None = None) -> Segments:
+    """The segments of a level on the most likely paths [T] of demonstrations.
+
+    :param frequency: of the control, Hz; None where unknown.
+    """
+    most = max(int(path.max()) for path in paths)
+    each = [np.concatenate(run_lengths([path], most)) for path in paths]
+    unknown = (max(TWITCH_STEPS, TWITCH_SHARE * own.sum()) for own in each)
+    shortest = (TWITCH_SECONDS * frequency if frequency else least for least in unknown)
+    twitches = sum(int((own < least).sum()) for own, least in zip(each, shortest, strict=True))
+    every = np.concatenate(each)
+    return Segments(median=float(np.median(every)), number=len(every), demonstrations=len(paths), twitches=twitches)
 
 
 MANY = 20
@@ -172,6 +188,12 @@ ADVICE: Mapping[Kind, str] = {
 }
 """The usual remedies."""
 
+LABELS = (
+    "Equal parts know nothing but the time. Observe what tells the labels apart, start from some of them "
+    "(training.labels), or start from equal parts (training.starts: [equal_parts])."
+)
+"""The same where equal parts agree better with labels."""
+
 START: Mapping[Kind, str] = {"unused": "vq", "redundant": "vq_controls", "dominating": "vq"}
 """The initialisation from clusters that is a remedy, too, unless training starts from labels or from clusters."""
 
@@ -185,7 +207,7 @@ class Finding:
     :param value: a share of the time, a duration in steps, or nats per step.
     :param other: the option that acts like a redundant one.
     :param times: selections of an option that never persists, in each demonstration with the option; the number of
-        demonstrations that an option takes whole.
+        demonstrations that an option takes whole; the share of twitches of a brief level.
     """
 
     kind: Kind
@@ -229,7 +251,6 @@ def diagnose(
     options: Sequence[Sequence[Use]],
     divergences: Sequence[Sequence[Alike]] = (),
     segments: Sequence[Segments] = (),
-    frequency: float | None = None,
 ) -> list[Finding]:
     """The signs of a degenerate solution in the ``options`` and ``divergences`` of a run, lowest level first.
 
@@ -240,11 +261,9 @@ def diagnose(
     - whole: an option that takes at least 90 % of the demonstrations that have it, where others lack it; or at least
       two thirds of them, where no more than half of all have it;
     - redundant: two used options with a divergence below 0.1 nats per step;
-    - brief: a level whose median segment is below 0.5 s, or 5 steps where the rate is unknown, and that has at least
-      six segments in a demonstration;
+    - brief: a level most of whose segments are twitches (:func:`segments_of`), with at least six segments in a
+      demonstration;
     - high-fitting: a caller that emits the control itself more than half of the time that it acts.
-
-    :param frequency: of the control, Hz; None where unknown.
     """
     findings: list[Finding] = []
     for level, use in enumerate(options, start=1):
@@ -253,8 +272,9 @@ def diagnose(
             least = MOSTLY if 2 * option.having <= everything else WHOLE
             findings += _of_option(level, option, least, alone=len(use) == 2)
         findings += _of_pairs(level, use, divergences[level - 1] if divergences else ())
-        if segments and segments[level - 1].brief(frequency):
-            findings.append(Finding("brief", level, 0, segments[level - 1].median))
+        if segments and segments[level - 1].brief:
+            own = segments[level - 1]
+            findings.append(Finding("brief", level, 0, own.median, times=own.twitches / own.number))
         above = options[level][0].share if level < len(options) else 0.0
         findings += _of_caller(level, use[0].share, above)
     return findings
@@ -329,7 +349,7 @@ def degeneracies(metrics: Metrics, spec: Spec, names: Mapping[str, Sequence[str]
     levels = spec.hierarchy.levels if spec.hierarchy else ()
     groups: dict[tuple[int, Kind], list[Finding]] = {}
     rate = metrics.control_frequency
-    for finding in diagnose(metrics.options, metrics.divergences, metrics.segments, rate):
+    for finding in diagnose(metrics.options, metrics.divergences, metrics.segments):
         if finding.kind not in ("never_persisting", "brief") or levels[finding.level - 1].lasts:
             groups.setdefault((finding.level, finding.kind), []).append(finding)
     signs = []
@@ -337,23 +357,28 @@ def degeneracies(metrics: Metrics, spec: Spec, names: Mapping[str, Sequence[str]
         level = levels[number_of_level - 1].name
         text = _sign(findings, level, names[level], rate)
         signs.append((text, findings[0].advice(spec.training)))
-    less = _less_than_equal_parts(metrics.agreement, [*names]) if metrics.agreement else ()
+    less = [(text, LABELS) for text, worse in beside_equal_parts(metrics) if worse]
     return [*signs, *less, *unlabelled_start(spec.training)]
 
 
-def _less_than_equal_parts(found: Agreement, levels: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """The levels that agree less with their labels than equal parts of each demonstration do, with a remedy."""
-    ours, equal, part = found.train, found.equal_train, "in training"
-    if found.valid and found.equal_valid:
-        ours, equal, part = found.valid, found.equal_valid, "held out"
-    for level, labels, own, other in zip(levels, found.labels, ours, equal, strict=False):  # earlier runs have none
-        if own and other and own.nmi < other.nmi:
-            yield (
-                f"Equal parts of each demonstration agree better with labels/{labels} than options of level “{level}” "
-                f"do: normalised mutual information {number(other.nmi)} against {number(own.nmi)}, {part}.",
-                "Equal parts know nothing but the time. Observe what tells the labels apart, start from some of them "
-                "(training.labels), or start from equal parts (training.starts: [equal_parts]).",
-            )
+def beside_equal_parts(metrics: Metrics) -> list[tuple[str, bool]]:
+    """How options of each level with labels agree with them, and whether equal parts of each demonstration do better.
+
+    On held-out demonstrations where there are any.
+    """
+    found, told = metrics.agreement, []
+    if found is None:
+        return []
+    valid = found.valid is not None and found.equal_valid is not None
+    ours, equal = (found.valid, found.equal_valid) if valid else (found.train, found.equal_train)
+    for labels, own, other in zip(found.labels, ours or (), equal or (), strict=False):
+        if own and other:
+            numbers = {"ours": number(own.nmi), "equal": number(other.nmi)}
+            numbers["accuracy"] = percent(own.matched_globally.accuracy)
+            numbers["equal_accuracy"] = percent(other.matched_globally.accuracy)
+            worse, part = own.nmi < other.nmi, "held out" if valid else "in training"
+            told.append((said("labels", "worse" if worse else "better", labels=labels, part=part, **numbers), worse))
+    return told
 
 
 def _sign(findings: Sequence[Finding], level: str, names: Sequence[str], frequency: float | None) -> str:
@@ -363,7 +388,10 @@ def _sign(findings: Sequence[Finding], level: str, names: Sequence[str], frequen
         share = first.amount(frequency)
         return f"High-fitting: the caller of level “{level}” emits the control itself in {share} of its steps."
     if kind == "brief":
-        return f"Options of level “{level}” switch every {first.amount(frequency)} (the median segment)."
+        return (
+            f"Options of level “{level}” switch every {first.amount(frequency)} (the median segment). "
+            f"{percent(first.times)} of their segments are twitches."
+        )
     if many == 1:
         return f"{capital(first.options(names))} of level “{level}” {first.deed(frequency)}."
     ordered = sorted(findings, key=lambda finding: finding.value)[:LISTED]

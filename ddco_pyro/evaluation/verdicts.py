@@ -1,10 +1,11 @@
-"""The verdict on a run: whether its options are worth it, in nats per step and in success."""
+"""What a run shows, in sentences, which stand in one table."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -14,138 +15,253 @@ from ddco_pyro.drawing.words import (
     duration,
     interval,
     listed,
-    mean_and_interval,
     more_successes,
     number,
-    of_episodes,
+    p_value,
+    percent,
     rate,
     signed,
     verb,
     with_error,
 )
 from ddco_pyro.evaluation.effort import rising
-from ddco_pyro.metrics import Below, Counts, Difference, Metrics, PerStep, Rollouts, Seeds, SuccessWorth, Worth
-from ddco_pyro.names import FLAT, MIXTURE, method
-from ddco_pyro.statistics import mean_interval, t_quantile, wider_interval
+from ddco_pyro.metrics import Difference, Marginal, Metrics, Segments, SuccessWorth, Worth
+from ddco_pyro.names import FLAT, HIERARCHY, MIXTURE, method
+from ddco_pyro.statistics import paired, t_quantile, wider_interval
 
 SMALLEST = 0.01
 """The smallest useful difference in nats per step: each step's control is exp(0.01) times as probable, 1 % more."""
 
-FAR = 2.0
-"""Nats per step that no sound model loses from training to held-out demonstrations: a control is e² = 7 times less
-probable there."""
+LOST = 0.5
+"""Nats per step and control dimension, from training to held-out demonstrations, from which on a model may have fallen
+apart: a control is 1.6 times less probable there."""
+
+FEWEST = 3
+"""Fewest held-out demonstrations of which an interval is told."""
+
+Direction = Literal["better", "worse", "same", "unclear", "brief", "few"]
+
+SENTENCES: Mapping[tuple[str, Direction, Literal["one", "several"]], str] = {
+    # options that last against the mixture
+    ("controls", "better", "one"): "In this fit options that last predict held-out controls better than the mixture "
+    "does: {lead}. One fit of each model is no verdict.",
+    ("controls", "worse", "one"): "In this fit options that last predict held-out controls worse than the mixture "
+    "does: {lead}. One fit of each model is no verdict.",
+    ("controls", "same", "one"): "In this fit options that last predict held-out controls as well as the mixture "
+    "does: {lead}.",
+    ("controls", "unclear", "one"): "This fit does not show whether options that last predict held-out controls better "
+    "than the mixture does: {lead}.",
+    ("controls", "brief", "one"): "In this fit very short options predict held-out controls better than the mixture "
+    "does: {lead}. {brief}, and they are no skills.",
+    ("controls", "few", "one"): "Too few demonstrations ({held_out}) are held out to compare options that last with "
+    "the mixture: {lead}.",
+    ("controls", "better", "several"): "Over {seeds} training seeds options that last predict held-out controls better "
+    "than the mixture does: {lead}.",
+    ("controls", "worse", "several"): "Over {seeds} training seeds options that last predict held-out controls worse "
+    "than the mixture does: {lead}.",
+    ("controls", "same", "several"): "Over {seeds} training seeds options that last predict held-out controls as well "
+    "as the mixture does: {lead}.",
+    ("controls", "unclear", "several"): "Over {seeds} training seeds it is inconclusive whether options that last "
+    "predict held-out controls better than the mixture does: {lead}.",
+    ("controls", "brief", "several"): "Over {seeds} training seeds very short options predict held-out controls better "
+    "than the mixture does: {lead}. {brief}, and they are no skills.",
+    ("controls", "few", "several"): "Too few demonstrations ({held_out}) are held out to compare options that last "
+    "with the mixture over {seeds} training seeds: {lead}.",
+    ("success", "better", "one"): "In this fit options succeed more often than the mixture: {lead}. One fit of each "
+    "model is no verdict.",
+    ("success", "worse", "one"): "In this fit options succeed less often than the mixture: {lead}. One fit of each "
+    "model is no verdict.",
+    ("success", "unclear", "one"): "This fit does not show whether options succeed more often than the mixture: "
+    "{lead}.",
+    ("success", "better", "several"): "Over {seeds} training seeds options succeed more often than the mixture: "
+    "{lead}.",
+    ("success", "worse", "several"): "Over {seeds} training seeds options succeed less often than the mixture: {lead}.",
+    ("success", "unclear", "several"): "Over {seeds} training seeds it is inconclusive whether options succeed more "
+    "often than the mixture: {lead}.",
+    ("success", "few", "one"): "Success was not measured.",
+    # a model against another one
+    ("model", "better", "one"): "{by} nats per step better than {other}",
+    ("model", "worse", "one"): "{by} nats per step worse than {other}",
+    ("model", "unclear", "one"): "with no clear difference from {other} ({lead} nats per step)",
+    # options against labels and against equal parts of each demonstration
+    ("labels", "better", "one"): "Options agree better with labels “{labels}” than equal parts of each demonstration "
+    "do: NMI {ours} against {equal}, accuracy {accuracy} against {equal_accuracy}, {part}.",
+    ("labels", "worse", "one"): "Equal parts of each demonstration agree better with labels “{labels}” than options "
+    "do: NMI {equal} against {ours}, accuracy {equal_accuracy} against {accuracy}, {part}.",
+    # doubts
+    ("held out", "worse", "one"): "{name} fell apart on held-out demonstrations: {valid} nats per step there, {train} "
+    "in training. That is {loss} less for each of {controls} controls.",
+    ("marginal", "worse", "one"): "{name} {predict} held-out controls worse than the mean and the spread of each "
+    "control do: {valid} against {marginal} nats per step.",
+    ("flat", "worse", "one"): "{name} {are} below {other} by {by} nats per step on held-out demonstrations.",
+    ("contained", "worse", "one"): "In training {name} {are} less likely than the {other} that they contain, by {by} "
+    "nats per step.",
+}
+"""Sentences by what was measured, in which direction, and over one fit or several training seeds. {lead} is always
+options minus the mixture."""
+
+ADVICE: Mapping[str, str] = {
+    "held out": "Such a fit follows its training demonstrations too closely, and comparisons with it say nothing. Take "
+    "fewer options or observations, smaller networks, larger ridges (training.optimizer.ridge), or more "
+    "demonstrations.",
+    "baseline": "Comparisons with this baseline say nothing. Give it a smaller network or larger ridges (its policy "
+    "and optimizer in compare_with).",
+    "marginal": "The observations do not say what the control is, or training ended too early.",
+    "flat": "Take {other}, or compare numbers of options and their networks by cross-validation (ddco-pyro select).",
+    "contained": "Add ways to begin (training.starts).",
+    "few": "{count} demonstrations are too few here: each held-out one leaves {rest} to train with. Record at least "
+    "{least}, and until then take two options and the fewest observations.",
+}
+"""What to do about a doubt."""
+
+
+@dataclass(frozen=True)
+class Models:
+    """Models that predict the same held-out demonstrations.
+
+    :param held_out: log p(ξ) of each demonstration by a model's name, nats, [N].
+    :param train: log-likelihood of the training demonstrations, nats per step.
+    :param steps: of each held-out demonstration, [N].
+    :param kinds: the kind of each model, such as ``flat``; a baseline of a run has its kind as name.
+    :param marginal: of the control without observations; None where unknown.
+    """
+
+    held_out: Mapping[str, np.ndarray]
+    train: Mapping[str, float]
+    steps: np.ndarray
+    kinds: Mapping[str, str]
+    marginal: Marginal | None = None
+
+    @classmethod
+    def of(cls, metrics: Metrics) -> Models:
+        """The model of a run and its baselines."""
+        rows = [row for row in metrics.demonstrations_by_likelihood if row.part == "valid"]
+        steps = np.array([row.steps for row in rows], float)
+        names = list(metrics.methods)
+        held_out = {name: np.array([row.log_likelihood_per_step[name] for row in rows]) * steps for name in names}
+        train = {name: one.log_likelihood_per_step.train for name, one in metrics.methods.items()}
+        return cls(held_out, train, steps, {name: name for name in names}, metrics.marginal)
+
+    def per_step(self, name: str) -> float:
+        """Held-out log-likelihood, nats per step."""
+        return float(self.held_out[name].sum() / self.steps.sum())
+
+    def lead(self, name: str, other: str) -> Difference:
+        """The paired difference of two models."""
+        return paired(self.held_out[name], self.held_out[other], self.steps)
+
+    def loss(self, name: str) -> float:
+        """Nats per step and control dimension that a model loses from training to held-out demonstrations."""
+        return (self.train[name] - self.per_step(name)) / (self.marginal.controls if self.marginal else 1)
+
+    def below_marginal(self, name: str) -> bool:
+        """Whether a density without observations predicts the held-out controls better."""
+        known = self.marginal
+        return known is not None and known.valid is not None and (
+            known.valid - self.per_step(name) > SMALLEST * known.controls
+        )  # fmt: skip
+
+    def apart(self, name: str) -> bool:
+        """Whether a model fell apart on held-out demonstrations.
+
+        It loses more than :data:`LOST` there, and is below the density without observations, or below every other model
+        by a 95 % interval. The likeliest of several models never fell apart.
+        """
+        others = [other for other in self.held_out if other != name]
+        if not len(self.steps) or self.loss(name) <= LOST or (others and self._best == name):
+            return False
+        behind = (direction(self.lead(name, other), len(self.steps)) == "worse" for other in others)
+        return self.below_marginal(name) or (bool(others) and all(behind))
+
+    @property
+    def _best(self) -> str:
+        return max(self.held_out, key=self.per_step)
+
+    def sound(self) -> bool:
+        """Whether differences between options and the mixture mean something: neither fell apart."""
+        return not any(self.apart(name) for name, kind in self.kinds.items() if kind in (HIERARCHY, MIXTURE))
+
+    def doubts(self, name: str) -> Iterator[tuple[str, str]]:
+        """What is doubtful about a model, and what to do."""
+        called = capital(method(name)) if self.kinds[name] == name else name
+        if self.apart(name):
+            values = {"valid": number(self.per_step(name)), "train": number(self.train[name])}
+            values |= {"loss": number(self.loss(name)), "controls": str(self.marginal.controls if self.marginal else 1)}
+            advice = "held out" if self.kinds[name] in (HIERARCHY, MIXTURE) else "baseline"
+            yield said("held out", "worse", name=called, **values), ADVICE[advice]
+        elif len(self.steps) and self.below_marginal(name) and self.marginal:
+            values = {"valid": number(self.per_step(name)), "marginal": number(self.marginal.valid)}
+            text = said("marginal", "worse", name=called, predict=verb(called, "predict", "predicts"), **values)
+            yield text, ADVICE["marginal"]
+        flats = [other for other, kind in self.kinds.items() if kind in FLAT and self.kinds[name] == HIERARCHY]
+        if flats and len(self.steps):
+            flat = max(flats, key=self.per_step)
+            lead, other = self.lead(name, flat), self._called(flat)
+            if direction(lead, len(self.steps)) == "worse":
+                by, are = f"{number(-lead.nats_per_step)} ± {number(lead.standard_error)}", verb(called, "are", "is")
+                text = said("flat", "worse", name=called, are=are, other=other, by=by)
+                yield text, ADVICE["flat"].format(other=other)
+
+    def _called(self, name: str) -> str:
+        """A model in words, or the name of a run."""
+        return method(name) if self.kinds[name] == name else name
+
+
+def said(measure: str, way: Direction, **values: str) -> str:
+    """A sentence of :data:`SENTENCES`."""
+    return SENTENCES[measure, way, "several" if "seeds" in values else "one"].format(**values)
+
+
+def direction(lead: Difference, held_out: int) -> Direction:
+    """The direction of a difference over held-out demonstrations, by its 95 % interval."""
+    if held_out < FEWEST or lead.standard_error is None:
+        return "few"
+    half = lead.standard_error * t_quantile(held_out - 1)
+    return _direction(lead.nats_per_step - half, lead.nats_per_step + half, SMALLEST)
+
+
+def _direction(low: float, high: float, smallest: float = 0.0) -> Direction:
+    if -smallest < low and high < smallest:
+        return "same"
+    return "better" if low > 0 else "worse" if high < 0 else "unclear"
+
+
+# --- what is doubtful -------------------------------------------------------------------------------------------------
+
+
+def doubts(metrics: Metrics) -> list[tuple[str, str]]:
+    """What is doubtful about the model of a run, and what to do; its baselines' faults are :func:`faults`."""
+    ours, found = method(metrics.model), list(Models.of(metrics).doubts(metrics.model))
+    for name, one in metrics.below.items():
+        if one.told:
+            by = number(max(one.objective, one.nats))
+            text = said("contained", "worse", name=ours, are=verb(ours, "are", "is"), other=method(name), by=by)
+            found.append((text, ADVICE["contained"]))
+    count = metrics.demonstrations.train
+    if found and metrics.demonstrations.left_out and count < FEW:
+        text, advice = found[-1]
+        found[-1] = text, f"{advice} {ADVICE['few'].format(count=count, rest=count - 1, least=FEW)}"
+    return found
+
+
+def faults(metrics: Metrics) -> list[tuple[str, str]]:
+    """What is doubtful about the baselines of a run, and what to do."""
+    models = Models.of(metrics)
+    return [found for name in metrics.comparison for found in models.doubts(name)]
+
+
+# --- the test against the mixture -------------------------------------------------------------------------------------
 
 
 def verdict(metrics: Metrics) -> str:
-    """The verdict on a run: differences on held-out demonstrations, and the models that have not converged."""
+    """Everything that a run shows of its models, in sentences: doubts first, those about baselines last."""
     names = (method(name) for name, training in metrics.trainings.items() if not training.converged)
-    return f"{caution(metrics)} {_explained(metrics)}{rising(names)}".lstrip()
+    first, last = ([" ".join(pair) for pair in pairs] for pairs in (doubts(metrics), faults(metrics)))
+    return f"{' '.join([*first, explained(metrics), tested(metrics), *last])}{rising(names)}".replace("  ", " ").strip()
 
 
-def caution(metrics: Metrics) -> str:
-    """What comes first in a verdict: the models that fell apart, a model below flat, and what to do; else empty.
-
-    The same for several runs is :func:`cautions`.
-    """
-    flats = {name: metrics.comparison[name].difference for name in FLAT if name in metrics.comparison}
-    ours = capital(method(metrics.model))
-    lowest = min(flats, key=lambda name: flats[name].nats_per_step, default=None)
-    below = {} if lowest is None else {ours: (method(lowest), flats[lowest])}
-    values = {capital(method(name)): one.log_likelihood_per_step for name, one in metrics.methods.items()}
-    said = cautions(values, below, len(metrics.valid))
-    number_of = metrics.demonstrations.train
-    said = " ".join(
-        [said, *(_below(ours, method(name), one) for name, one in metrics.below.items() if one.told)]
-    ).lstrip()
-    if said and metrics.demonstrations.left_out and number_of < FEW:
-        said += (
-            f" {number_of} demonstrations are too few here: each held-out one leaves {number_of - 1} to train with. "
-            f"Record at least {FEW}, and until then take two options and the fewest observations."
-        )
-    return said
-
-
-def _below(ours: str, mixture: str, below: Below) -> str:
-    """A sentence on a hierarchy that is less likely in training than a mixture that it contains."""
-    return (
-        f"In training {ours.lower()} {verb(ours, 'are', 'is')} less likely than the {mixture} that they contain, by "
-        f"{number(max(below.objective, below.nats))} nats per step. Add ways to begin (training.starts)."
-    )
-
-
-def cautions(values: Mapping[str, PerStep], flats: Mapping[str, tuple[str, Difference]], held_out: int) -> str:
-    """Sentences on the models that fell apart, and on those below flat, with what to do; empty where all are sound.
-
-    A model fell apart that loses more than :data:`FAR` from training to held-out demonstrations. It is below flat where
-    the 95 % interval of their difference says so, or by more than that.
-
-    :param values: of each model.
-    :param flats: the difference of a model to a flat one, with that one's name.
-    """
-    said = [
-        f"{name} fell apart on held-out demonstrations: {number(per_step.valid)} nats per step there, "
-        f"{number(per_step.train)} in training."
-        for name, per_step in values.items()
-        if apart(per_step)
-    ]
-    if said:
-        said.append(
-            "Such a fit follows its training demonstrations too closely, and comparisons with it say nothing. Take "
-            "fewer options or observations, smaller networks, larger ridges (training.optimizer.ridge), or more "
-            "demonstrations."
-        )
-    for name, (flat, difference) in flats.items():
-        if _direction(difference, held_out) < 0 or difference.nats_per_step < -FAR:
-            by = f"{number(-difference.nats_per_step)} ± {number(difference.standard_error)}"
-            said.append(
-                f"{name} {verb(name, 'are', 'is')} below {flat} by {by} nats per step on held-out demonstrations. "
-                f"Take {flat}, or compare numbers of options and their networks by cross-validation (ddco-pyro select)."
-            )
-    return " ".join(said)
-
-
-def apart(per_step: PerStep) -> bool:
-    """Whether a model with this log-likelihood fell apart."""
-    return per_step.valid is not None and per_step.train - per_step.valid > FAR
-
-
-def sound(metrics: Metrics) -> bool:
-    """Whether differences between the hierarchy and the mixture mean something: neither fell apart."""
-    both = (one for name, one in metrics.methods.items() if name in (metrics.model, MIXTURE))
-    return not any(apart(one.log_likelihood_per_step) for one in both)
-
-
-def headline(metrics: Metrics) -> str:
-    """The verdict in a line: over training seeds where there are several, else of this fit; first :func:`caution`."""
-    held_out, seeds = len(metrics.valid), metrics.seeds
-    if not sound(metrics):
-        return caution(metrics)
-    if seeds and "memory" in seeds.worth:
-        said = _verdict(*_range(seeds.worth["memory"], seeds.standard_error["memory"], held_out), brief(metrics))
-        said = said.removeprefix("So ").replace("It is", "it is")
-        return f"Over {len(seeds.training_seeds)} training seeds {said}"
-    said = decided(metrics.worth, held_out, brief(metrics)) if metrics.worth else _explained(metrics)
-    return f"{caution(metrics)} {said}".lstrip()
-
-
-def leads(metrics: Metrics) -> dict[str, str]:
-    """Names and values: the leads over baselines in nats per step, over training seeds first, then of this fit."""
-    said, seeds, ours = {}, metrics.seeds, method(metrics.model)
-    if seeds and (parts := _parts(seeds.worth, ours)):
-        said[f"Nats per step, {len(seeds.training_seeds)} seeds"] = ", ".join(parts)
-    if metrics.comparison:
-        each = (f"{ours} − {method(name)} {with_error(one.difference)}" for name, one in metrics.comparison.items())
-        said["Nats per step, held out"] = ", ".join(each)
-    return said
-
-
-def division(counts: Counts) -> str:
-    """The numbers of demonstrations that train, tune, and are held out."""
-    held_out = "each held out from a fit without it" if counts.left_out else f"{counts.valid} held out"
-    return f"{counts.train} for training, {counts.tune} for tuning, {held_out}"
-
-
-def _explained(metrics: Metrics) -> str:
+def explained(metrics: Metrics) -> str:
+    """How the model explains held-out demonstrations, beside its baselines where there are any."""
     ours, held_out, per_step = method(metrics.model), len(metrics.valid), metrics.log_likelihood_per_step
     name = capital(ours)
     if not held_out:
@@ -154,15 +270,9 @@ def _explained(metrics: Metrics) -> str:
     if not metrics.comparison:
         give, value = verb(name, "give", "gives"), number(per_step.valid)
         return f"{name} {give} held-out demonstrations {value} nats per step; no baseline was trained to compare with."
-    differences = {method(other): compared.difference for other, compared in metrics.comparison.items()}
-    said = [explains(name, differences, held_out)]
-    if metrics.demonstrations.left_out:
-        said.append("Every demonstration trains the model; each is held out from a fit without it.")
-    if metrics.worth:
-        said.append(worth_of(metrics))
-    if metrics.seeds:
-        said.append(over_seeds(metrics.seeds, ours, held_out, sound(metrics), brief(metrics)))
-    return " ".join(said)
+    text = explains(name, {method(other): one.difference for other, one in metrics.comparison.items()}, held_out)
+    left_out = "Every demonstration trains the model; each is held out from a fit without it."
+    return f"{text} {left_out}" if metrics.demonstrations.left_out else text
 
 
 def explains(name: str, differences: Mapping[str, Difference], held_out: int) -> str:
@@ -172,177 +282,105 @@ def explains(name: str, differences: Mapping[str, Difference], held_out: int) ->
 
     :param differences: the paired difference by the other model's name.
     """
-    clauses = [_clause(other, difference, held_out) for other, difference in differences.items()]
+    clauses = []
+    for other, lead in differences.items():
+        way = direction(lead, held_out)
+        by = number(abs(lead.nats_per_step)) + (f" ± {number(lead.standard_error)}" if way != "few" else "")
+        sign: Direction = "better" if lead.nats_per_step > 0 else "worse"
+        known: Direction = "unclear" if way in ("unclear", "same") else sign
+        clauses.append(said("model", known, by=by, other=other, lead=with_error(lead)))
     text = f"{name} {verb(name, 'explain', 'explains')} held-out demonstrations {listed(clauses)}"
-    if held_out == 1:
-        return f"{text} (1 held-out demonstration, one fit of each model)."
+    if held_out < FEWEST:
+        held = "1 held-out demonstration is" if held_out == 1 else f"{held_out} held-out demonstrations are"
+        return f"{text} ({held} too few for an error; one fit of each model)."
     return f"{text} (± is one standard error over {held_out} held-out demonstrations, for one fit of each model)."
 
 
-def brief(metrics: Metrics) -> str:
-    """The median segment in words where the options of every level are too short for skills; else empty."""
-    rate = metrics.control_frequency
-    short = bool(metrics.segments) and all(one.brief(rate) for one in metrics.segments)
-    return duration(rate, metrics.segments[0].median) if short else ""
+def tested(metrics: Metrics) -> str:
+    """The test of options that last against the mixture, over training seeds where there are several.
 
-
-def decided(found: Worth, held_out: int, brief: str = "") -> str:
-    """The verdict of one fit on options that last, by the direction of their lead.
-
-    :param brief: as of :func:`brief`.
+    Empty without a mixture, or where either of them fell apart.
     """
-    direction = _direction(found.memory, held_out)
-    if brief and direction > 0:
-        return (
-            f"In this fit very short options explain held-out controls better: they switch every {brief}, and are no "
-            "skills."
-        )
-    return DECIDED[direction]
+    found, seeds, held_out = metrics.worth, metrics.seeds, len(metrics.valid)
+    if not Models.of(metrics).sound() or not (found or (seeds and "memory" in seeds.worth)):
+        return ""
+    few, brief = twitches(metrics.segments, metrics.control_frequency), all(own.brief for own in metrics.segments)
+    short = few if metrics.segments and brief else ""
+    if seeds and "memory" in seeds.worth:
+        memory = seeds.worth["memory"]
+        errors = [error for error in seeds.standard_error["memory"] if error is not None]
+        low, high = wider_interval(memory, float(np.mean(errors)) if errors else 0.0, held_out)
+        lead = f"{signed(float(np.mean(memory)))} [{interval((low, high))}] nats per step"
+        way = "few" if held_out < FEWEST else _direction(low, high, SMALLEST)
+        text = _lasting(way, lead, held_out, short, len(seeds.training_seeds))
+    else:
+        assert found
+        text = lasting(found, method(metrics.model), held_out, metrics.control_frequency, short)
+    return f"{text} {success(metrics)}".strip()
 
 
-DECIDED = {
-    1: "In this fit options that last explain held-out controls better; one fit of each model is no verdict.",
-    0: "This fit does not show that options that last are worth anything.",
-    -1: "In this fit options that last explain held-out controls worse than the same policies without memory.",
-}
-"""The verdict of one fit on options that last, by the direction of their lead."""
-
-
-def worth_of(metrics: Metrics) -> str:
-    """:func:`worth` of a run; empty without a mixture."""
-    ours, held_out, rate = method(metrics.model), len(metrics.valid), metrics.control_frequency
-    return worth(metrics.worth, ours, held_out, sound(metrics), rate, brief(metrics)) if metrics.worth else ""
-
-
-def worth(
-    found: Worth, ours: str, held_out: int, sound: bool = True, frequency: float | None = None, brief: str = ""
-) -> str:
-    """The worth of several policies and of options that last, in one fit of each model.
+def lasting(found: Worth, ours: str, held_out: int, frequency: float | None = None, brief: str = "") -> str:
+    """The test of one fit: options that last against the mixture.
 
     :param ours: what the hierarchy is called.
-    :param sound: whether neither model fell apart; otherwise nothing is concluded.
-    :param brief: as of :func:`brief`.
+    :param brief: a sentence where the options are too short for skills; else empty.
     """
-    total = signed(found.total.nats_per_step) if found.total else ""
-    parts = _divided(found, ours, f"{total} nats per step", "Held-out nats per step", with_error)
-    if not sound:
-        return parts
-    said = decided(found, held_out, brief)
-    rows = found.steps_in_a_row
+    way, rows = direction(found.memory, held_out), found.steps_in_a_row
+    known = with_error(found.memory) if way != "few" else signed(found.memory.nats_per_step)
+    text = _lasting(way, f"{known} nats per step", held_out, brief)
     if rows and all(row.options <= row.mixture for row in rows):
         own, mixture = (duration(frequency, steps) for steps in (rows[0].options, rows[0].mixture))
-        said += f" Options stay active no longer ({own}) than the mixture keeps to one policy ({mixture})."
-    return f"{parts} {said}"
+        text += f" {capital(ours)} stay active no longer ({own}) than the mixture keeps to one policy ({mixture})."
+    return text
 
 
-def success_worth(rollouts: Rollouts, ours: str) -> str:
-    """The same worth in rollouts, in this fit and over its training seeds; empty without a mixture.
+def _lasting(way: Direction, lead: str, held_out: int, brief: str, seeds: int = 1) -> str:
+    known: Direction = "brief" if way == "better" and brief else way
+    several = {"seeds": str(seeds)} if seeds > 1 else {}
+    return said("controls", known, lead=lead, held_out=str(held_out), brief=brief.rstrip("."), **several)
 
-    The verdict is by :func:`wider_interval`, with the error over episodes.
 
-    :param ours: what the hierarchy is called.
+def twitches(segments: Sequence[Segments], frequency: float | None) -> str:
+    """How often the options of the lowest level switch, in a sentence, with the share of twitches where they do often.
+
+    Empty without options.
     """
-    found = rollouts.worth
-    if found is None:
+    if not segments:
         return ""
-    pair, total = found.memory, more_successes(found.total) if found.total else ""
-    successes = f"uccesses in {pair.trials} episodes"
-    text = _divided(found, ours, f"{total} s{successes}", f"S{successes}", of_episodes)
-    if rollouts.seeds is None:
-        return f"{text} One fit of each model is no verdict."
-    seeds = rollouts.seeds
-    discordant, lead = pair.only_ours + pair.only_theirs, pair.only_ours - pair.only_theirs
-    error = math.sqrt(discordant - lead**2 / pair.trials) / pair.trials
-    low, high = wider_interval(seeds.worth["memory"], error, pair.trials)
-    decided = "options that last help" if low > 0 else "options that last harm" if high < 0 else "inconclusive"
-    parts = listed(_parts(seeds.worth, ours, 100, 0))
-    return f"{text} Over {len(seeds.training_seeds)} training seeds: {parts} points of success. In rollouts: {decided}."
+    own, least = segments[0], "0.5 s" if frequency else "5 steps or a fiftieth of their demonstration"
+    each = number(own.number / own.demonstrations, 1)
+    text = f"A demonstration has {each} segments of {duration(frequency, own.median)} (the median)"
+    share = f"; {percent(own.twitches / own.number)} of all are twitches, shorter than {least}" if own.often else ""
+    return f"{text}{share}."
 
 
-def _divided(found: Worth | SuccessWorth, ours: str, total: str, memory_alone: str, said: Callable[[Any], str]) -> str:
-    """The parts of the advantage over a flat policy; the part of memory alone where there is none."""
-    lasting = f"{said(found.memory)} from options that last ({ours} − mixture)"
-    if found.flat is None:
-        return f"{memory_alone}: {lasting}."
-    flat = method(found.flat)
-    experts = f"{said(found.experts)} come from several policies (mixture − {flat})"
-    return f"Of {total} over {flat}, {experts} and {lasting}."
-
-
-def _parts(worth: Mapping[str, Sequence[float]], ours: str, scale: float = 1, digits: int = 2) -> list[str]:
-    """The parts of the worth over training seeds, each with its 95 % t interval."""
-    names = {"memory": f"{ours} − mixture", "experts": "mixture − flat"}
-    return [f"{names[part]} {mean_and_interval(worth[part], scale, digits)}" for part in worth if part in names]
-
-
-def over_seeds(found: Seeds, ours: str, held_out: int, sound: bool = True, brief: str = "") -> str:
-    """The parts of the worth over training seeds, and the verdict, which is about options that last.
-
-    :param ours: what the hierarchy is called.
-    :param held_out: number of held-out demonstrations.
-    :param sound: as of :func:`worth`.
-    :param brief: as of :func:`brief`.
-    """
-    parts = _parts(found.worth, ours)
-    said = f": {listed(parts)} nats per step" if parts else ""
-    text = f"Over {len(found.training_seeds)} training seeds, with the same demonstrations held out{said}."
-    if "memory" not in found.worth or not sound:
-        return text
-    memory = found.worth["memory"]
-    low, high = _range(memory, found.standard_error["memory"], held_out)
-    wider = f" Over held-out demonstrations it is {interval((low, high))}." if high > mean_interval(memory)[1] else ""
-    return f"{text}{wider} {_verdict(low, high, brief)}"
-
-
-def _range(memory: Sequence[float], errors: Sequence[float | None], held_out: int) -> tuple[float, float]:
-    """The interval of the worth of options that last over seeds or, where wider, over held-out demonstrations.
-
-    :param errors: standard errors over held-out demonstrations; None where there is one.
-    """
-    known = [error for error in errors if error is not None]
-    return wider_interval(memory, float(np.mean(known)) if known else 0.0, held_out)
-
-
-def _verdict(low: float, high: float, brief: str) -> str:
-    """The verdict on options that last by the interval of their worth and :data:`SMALLEST`."""
-    if low > -SMALLEST and high < SMALLEST:
-        return f"So options that last make no difference here: less than {SMALLEST} nats per step."
-    if low > 0 and brief:
-        return (
-            f"So very short options explain these demonstrations better: they switch every {brief}, and are no skills."
-        )
-    if low > 0:
-        return "So options that last are worth it on these demonstrations."
-    if high < 0:
-        return "So options that last explain these demonstrations worse than the same policies without memory."
-    return "It is inconclusive whether options that last are worth anything here."
-
-
-def _direction(difference: Difference, held_out: int) -> int:
-    """1 or -1 where the 95 % interval of a difference leaves out 0, else 0."""
-    mean, error = difference.nats_per_step, difference.standard_error
-    if error is None or abs(mean) <= error * t_quantile(held_out - 1):
-        return 0
-    return 1 if mean > 0 else -1
-
-
-def _clause(other: str, difference: Difference, held_out: int) -> str:
-    mean, error = difference.nats_per_step, difference.standard_error
-    direction = "better" if mean > 0 else "worse"
-    if error is None:
-        return f"{number(abs(mean))} nats per step {direction} than {other} (error unknown)"
-    if not _direction(difference, held_out):
-        return f"with no clear difference from {other} ({with_error(difference)} nats per step)"
-    return f"{number(abs(mean))} ± {number(error)} nats per step {direction} than {other}"
+# --- success ----------------------------------------------------------------------------------------------------------
 
 
 def success(metrics: Metrics) -> str:
-    """Success in rollouts in one sentence; empty where there are none."""
+    """Success in rollouts, and the test of options against the mixture by it."""
     rates = metrics.rollouts.success_rates if metrics.rollouts else {}
     if metrics.rollouts is None or metrics.model not in rates:
-        return ""
+        return said("success", "few")
     ours = method(metrics.model)
     text = f"In rollouts {ours} {verb(ours, 'succeed', 'succeeds')} in {rate(rates.pop(metrics.model), 'episodes')}"
     others = [f"{method(name)} in {rate(summary)}" for name, summary in rates.items()]
-    said = f"{text}{'; ' if others else ''}{listed(others) if others else ''}."
-    return f"{said} {success_worth(metrics.rollouts, ours)}".rstrip()
+    told = f"{text}{'; ' if others else ''}{listed(others) if others else ''}."
+    found, seeds = metrics.rollouts.worth, metrics.rollouts.seeds
+    if found is None:
+        return told
+    return f"{told} {_succeeds(found, () if seeds is None else seeds.worth['memory'])}"
+
+
+def _succeeds(found: SuccessWorth, memory: Sequence[float]) -> str:
+    """The test by success: of one fit by McNemar's test, or over training seeds, with the error over episodes."""
+    pair = found.memory
+    lead = pair.only_ours - pair.only_theirs
+    if not memory:
+        way: Direction = "unclear" if pair.p_value >= 0.05 else "better" if lead > 0 else "worse"
+        p = f"p = {p_value(pair.p_value)}".replace("= <", "<")
+        return said("success", way, lead=f"{more_successes(pair)} of {pair.trials} episodes ({p})")
+    error = math.sqrt(pair.only_ours + pair.only_theirs - lead**2 / pair.trials) / pair.trials
+    low, high = wider_interval(memory, error, pair.trials)
+    points = f"{signed(100 * float(np.mean(memory)), 0)} [{interval((low, high), 100, 0)}] points of success"
+    return said("success", _direction(low, high), seeds=str(len(memory)), lead=points)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -30,6 +30,7 @@ from ddco_pyro.metrics import (
     HeldOut,
     InARow,
     Listed,
+    Marginal,
     Metrics,
     PerStep,
     Segments,
@@ -40,8 +41,12 @@ from ddco_pyro.metrics import (
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.outputs import Outputs
 from ddco_pyro.names import MIXTURE
+from ddco_pyro.spec import LearnedStd, Spec, with_overrides
 from ddco_pyro.statistics import mean_run, paired, worth
+from ddco_pyro.training.data import tuning_split
 from ddco_pyro.training.labels import choices, used
+from ddco_pyro.training.networks import Dimensions as Sizes
+from ddco_pyro.training.restarts import train_model
 
 
 class NotFinite(Failed):
@@ -202,6 +207,45 @@ def evaluate(
     )
 
 
+CONSTANT: Mapping[str, Any] = {
+    "hierarchy": None,
+    "baseline": {"kind": "flat", "policy": {"network": "constant"}},
+    "compare_with": [],
+    "observations": ["nothing"],
+    "control.power": 1,
+    "training": {"optimizer": {"name": "em"}, "tune_fraction": 0, "starts": ["random"]},
+    "report": {},
+}
+"""What makes a spec one of a policy that reads no observation."""
+
+
+def marginal(spec: Spec, size: Sizes, parts: Mapping[str, Demonstrations]) -> Marginal | None:
+    """The density of the control without observations, of the same kinds, fitted to the demonstrations that train.
+
+    :param parts: as of :func:`evaluate`.
+    :returns: None where no demonstration is held out.
+    """
+    if "valid" not in parts:
+        return None
+    own = {"control.std": spec.control.std} | {
+        f"control.parts.{n}.std": p.std for n, p in enumerate(spec.control.parts)
+    }
+    stds = {path: std if isinstance(std, LearnedStd) else LearnedStd(learn=True) for path, std in own.items() if std}
+    learned = {path: {"learn": True, "floor": std.floor} for path, std in stds.items()}
+    train = _unseen(tuning_split(spec, size, parts["train"])[0])
+    model = train_model(with_overrides(spec, {**CONSTANT, **learned}), Sizes.of(train), train).hierarchy
+    values = {
+        name: float(sum(piece.log_likelihood.sum() for piece in infer(model, _unseen(part))) / sum(part.lengths))
+        for name, part in parts.items()
+    }
+    return Marginal(**values, controls=len(model.scaling.varying))
+
+
+def _unseen(demos: Demonstrations) -> Demonstrations:
+    """Demonstrations with a constant in place of their observations."""
+    return Demonstrations(tuple(replace(one, observations={"nothing": np.zeros((len(one), 1))}) for one in demos))
+
+
 def _worth(fit: Fit, values: Mapping[str, np.ndarray], ours: _Part, valid: Demonstrations) -> Worth | None:
     """The parts of the hierarchy's advantage on held-out demonstrations; None without a mixture."""
     found = worth(fit.name, values, valid.lengths)
@@ -228,7 +272,7 @@ def _options(
 
     alike = divergences(pieces(), on_event, len(demos))
     whole = Posterior(*(tuple(map(torch.cat, zip(*kind, strict=True))) for kind in zip(*sums, strict=True)))
-    return option_use(whole, paths), [segments_of(level) for level in paths], alike
+    return option_use(whole, paths), [segments_of(level, demos.frequency) for level in paths], alike
 
 
 def _worst_first(

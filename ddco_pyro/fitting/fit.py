@@ -22,7 +22,7 @@ from ddco_pyro.data.labels import label_names
 from ddco_pyro.errors import path_of
 from ddco_pyro.events import OnEvent, ignore
 from ddco_pyro.fitting.digest import record, recorded
-from ddco_pyro.fitting.evaluation import evaluate
+from ddco_pyro.fitting.evaluation import evaluate, marginal
 from ddco_pyro.fitting.fitted import Fit, left_out, load
 from ddco_pyro.fitting.names import accepted, matched, read_names, write_names
 from ddco_pyro.fitting.run import (
@@ -225,6 +225,7 @@ def _fit_model(
             parameters=parameters(hierarchy),
             training=trained.summary,
             contained=contained,
+            marginal=marginal(spec, size, split) if name is None else None,
             seconds={},
             versions=_versions(),
         )

@@ -9,13 +9,12 @@ from ddco_pyro.data.arrays import Observed
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
 from ddco_pyro.data.sources import open_source
-from ddco_pyro.drawing import words
 from ddco_pyro.drawing.figures import style
-from ddco_pyro.drawing.page import Block, Facts, Page, Text, footnote
+from ddco_pyro.drawing.page import Block, Page, Text, Warned, footnote
 from ddco_pyro.drawing.shown import paths_of, pictures, stored_pictures
-from ddco_pyro.evaluation import effort, verdicts
+from ddco_pyro.evaluation import verdicts
+from ddco_pyro.evaluation.options import beside_equal_parts
 from ddco_pyro.fitting.fitted import Fit
-from ddco_pyro.metrics import Metrics, Rate
 from ddco_pyro.names import method
 from ddco_pyro.report import agreement, inputs, likelihood, options, rollouts, skills, training
 from ddco_pyro.report.trajectories import activity
@@ -37,15 +36,15 @@ def write_report(fit: Fit, demos: Demonstrations) -> Path:
         shown = pictures(ordered) or _stored(fit, ordered)
         follows = followed(ordered, shown, segmented, paths, options.MOST_STEPS)
         drawn = timelines(segmented, follows, options.MOST_STEPS)
+        drawings = skills.Shown(ordered, shown, paths)
+        every = skills.skills(fit, segmented)
     with style():
         learning = training.learning(fit)  # or a history is damaged, and no figure is written
-        warned = training.warnings(fit)
         sections = [
-            None if warned is None or warned.folded else warned,
-            skills.section(fit, ordered, shown, paths, active) if active else None,
+            likelihood.test(metrics),
+            skills.section(fit, ordered, every, drawings, active) if active else None,
             options.segments(drawn, len(metrics.demonstrations_by_likelihood)) if segmented else None,
             agreement.section(fit, demos),
-            likelihood.parts(metrics),
             rollouts.success(fit),
             rollouts.films(fit),
             likelihood.section(fit),
@@ -54,10 +53,10 @@ def write_report(fit: Fit, demos: Demonstrations) -> Path:
             options.section(fit, demos, active, paths) if active else None,
             inputs.branches(fit),
             learning,
-            warned if warned and warned.folded else None,
             training.particulars(fit),
         ]
-    write_text(path, Page(title(fit), header(fit, metrics), sections, subtitle=subtitle(fit)).html())
+    tiles = skills.overview(fit, every, drawings) if active else []
+    write_text(path, Page(title(fit), [*tiles, *header(fit)], sections, subtitle=subtitle(fit)).html())
     return path
 
 
@@ -83,24 +82,10 @@ def _stored(fit: Fit, demos: Demonstrations) -> list[Observed]:
         return stored_pictures(source, dict(zip(demos.names, demos.lengths, strict=True)))
 
 
-def header(fit: Fit, metrics: Metrics) -> list[Block]:
-    """The verdict, success in rollouts, and the main numbers."""
-    counts = metrics.demonstrations
-    facts = {
-        **verdicts.leads(metrics),
-        **agreement.in_short(fit),
-        "Demonstrations": verdicts.division(counts),
-        "Parameters": str(metrics.parameters),
-        "Training": effort.spent(metrics.training),
-    }
-    supervisor = counts.supervisor.get("success")
-    if isinstance(supervisor, Rate):
-        facts["Supervisor’s own success"] = f"{words.rate(supervisor, 'demonstrations')}, 95 % interval"
-    blocks: list[Block] = [Text(verdicts.headline(metrics), "verdict")]
-    if success := verdicts.success(metrics):
-        blocks.append(Text(success))
-    held_out = "used neither in training nor in tuning, which decides when to stop"
-    if counts.left_out:
-        held_out = "each demonstration by the fit that was trained and tuned without it"
-    explained = f"Held out: {held_out}. A nat is the unit of log-likelihood: {words.NAT}."
-    return [*blocks, Facts(facts), footnote(explained)]
+def header(fit: Fit) -> list[Block]:
+    """The skills' lengths, how they agree with labels, and what is doubtful; of a policy, how likely it is."""
+    metrics = fit.metrics
+    texts = [verdicts.twitches(metrics.segments, metrics.control_frequency) or verdicts.explained(metrics)]
+    texts += [text for text, worse in beside_equal_parts(metrics) if not worse]
+    found = training.doubts(fit)
+    return [*map(Text, texts), *(Warned(*sign) for sign in found), *([] if found else [footnote(training.NO_DOUBT)])]

@@ -61,24 +61,6 @@ def section(fit: Fit, demos: Demonstrations) -> Section | None:
     return Section("agreement", "Agreement with ground truth", blocks)
 
 
-def in_short(fit: Fit) -> dict[str, str]:
-    """NMI and accuracy of each level: names and values for the head of the page."""
-    record, said = fit.metrics.agreement, {}
-    if not record or fit.spec.hierarchy is None:
-        return {}
-    for place, label in enumerate(record.labels):
-        parts = {"held out": record.valid, "in training": record.train}
-        found = {part: scores[place] for part, scores in parts.items() if scores is not None}
-        each = [
-            f"NMI {number(one.nmi)}, accuracy {percent(one.matched_globally.accuracy)} {part}"
-            for part, one in found.items()
-            if one is not None
-        ]
-        level = f"{list(fit.names)[place]}: " if len(record.labels) > 1 else ""
-        said[f"{level}Labels “{label}”"] = "; ".join(each) or "–"
-    return said
-
-
 def confusion_table(record: Confusion, names: Sequence[str], labels: Sequence[str]) -> Table:
     """Share of each label's steps in each option, and the label of each option.
 

@@ -9,8 +9,9 @@ from matplotlib.figure import Figure
 
 from ddco_pyro.data.controls import ControlDimension
 from ddco_pyro.drawing.figures import Interval, Panel, interval_plot, save
-from ddco_pyro.drawing.page import Block, Cell, Section, Table, Text, footnote, note
+from ddco_pyro.drawing.page import Block, Cell, Section, Table, Text, Warned, footnote, note
 from ddco_pyro.drawing.words import (
+    NAT,
     about,
     capital,
     duration,
@@ -20,8 +21,8 @@ from ddco_pyro.drawing.words import (
     of_episodes,
     with_error,
 )
-from ddco_pyro.evaluation.effort import effort
-from ddco_pyro.evaluation.verdicts import verdict
+from ddco_pyro.evaluation.effort import effort, unconverged
+from ddco_pyro.evaluation.verdicts import explained, faults, tested, verdict
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Compared, Metrics
 from ddco_pyro.names import method
@@ -158,19 +159,35 @@ def dimensions(fit: Fit) -> Section:
     return Section("dimensions", "Log-likelihood by control dimension", blocks, folded=True)
 
 
-# --- what options are worth ------------------------------------------------------------------------------------------
+# --- the test against the mixture -------------------------------------------------------------------------------------
 
 
-PARTS_EXPLAINED = (
-    "A mixture has the options’ policies and the gate that chooses among them, and chooses anew at every step. The "
-    "mixture’s lead over one flat policy is the worth of several policies and of their parameters. The options’ lead "
-    "over the mixture is the worth of options that last. This fit: ± one standard error over held-out demonstrations, "
-    "p by McNemar’s exact test. Training seeds: mean with its 95 % interval."
+EXPLAINED = (
+    f"A nat is the unit of log-likelihood: {NAT}. A mixture has the options’ policies and the gate that chooses among "
+    "them, and chooses anew at every step. Mixture − flat: what several policies, and their parameters, add to one. "
+    "Options − mixture: what options that last add. This fit: ± one standard error over held-out demonstrations, p by "
+    "McNemar’s exact test. Training seeds: mean with its 95 % interval."
 )
 
 
-def parts(metrics: Metrics) -> Section | None:
-    """The parts in held-out log-likelihood and in success, a row each; None where the run has no mixture."""
+def test(metrics: Metrics) -> Section | None:
+    """Options against the mixture, or a model against its baselines: a sentence and a table; None without any."""
+    if not metrics.comparison:
+        return None
+    found, blocks = parts(metrics), list[Block]()
+    blocks.append(Text(tested(metrics) if found and tested(metrics) else explained(metrics)))
+    blocks.append(found or table(metrics))
+    others = {name: one.training for name, one in metrics.comparison.items()}
+    blocks += [Warned(*sign) for sign in (*faults(metrics), *unconverged(others))]
+    held_out = "used neither in training nor in tuning, which decides when to stop"
+    if metrics.demonstrations.left_out:
+        held_out = "each demonstration by the fit that was trained and tuned without it"
+    title = "Options against the mixture" if found else "The model against its baselines"
+    return Section("test", title, [*blocks, footnote(f"Held out: {held_out}. {EXPLAINED}")])
+
+
+def parts(metrics: Metrics) -> Table | None:
+    """What several policies and what lasting adds, in log-likelihood and success; None without a mixture."""
     found, seeds, rollouts = metrics.worth, metrics.seeds, metrics.rollouts
     if not found:
         return None
@@ -195,4 +212,4 @@ def parts(metrics: Metrics) -> Section | None:
         for part, name in parts.items()
         if getattr(found, part)
     ]
-    return Section("worth", "What options are worth", [Table(["Part", *columns], rows), footnote(PARTS_EXPLAINED)])
+    return Table(["Part", *columns], rows)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +17,7 @@ from ddco_pyro.drawing.page import (
     Block,
     Card,
     Cell,
+    Columns,
     Drawing,
     Facts,
     Film,
@@ -128,16 +129,70 @@ def aligned(chosen: Sequence[Instance], most: int = FRAMES) -> np.ndarray:
     return steps
 
 
-def section(
-    fit: Fit, demos: Demonstrations, pictures: Sequence[Observed], paths: Sequence[PathSpec], activity: Activity
-) -> Section:
+@dataclass(frozen=True)
+class Skill:
+    """One option in the demonstrations of a fit.
+
+    :param found: its segments, as of :func:`instances`.
+    :param labels: the labels that it stands for, with their agreement, by name of labels.
+    """
+
+    level: str
+    choice: int
+    name: Cell
+    share: float
+    use: Use
+    found: Sequence[Instance]
+    labels: Mapping[str, str]
+
+
+def skills(fit: Fit, segmented: Segmented) -> list[Skill]:
+    """The options that a most likely path has, of the highest level first."""
+    return [
+        Skill(
+            level,
+            choice,
+            Cell(numbered_name(choice, names), colour=option_colour(choice)),
+            use[choice].steps / sum(one.steps for one in use),
+            use[choice],
+            found,
+            {
+                one.labels: agreeing(one)
+                for one in fit.metrics.named_by_labels
+                if (one.level, one.option) == (level, choice)
+            },
+        )
+        for (level, names), use in reversed(list(zip(fit.names.items(), fit.metrics.options, strict=True)))
+        for choice in range(len(names))
+        if (found := instances(segmented, level, choice))
+    ]
+
+
+def overview(fit: Fit, every: Sequence[Skill], shown: Shown) -> list[Block]:
+    """Each skill in a tile: its picture, name, share of the steps, and median length."""
+    blocks, frequency = list[Block](), fit.metrics.control_frequency
+    for level in (levels := dict.fromkeys(one.level for one in every)):
+        tiles = []
+        for one in (skill for skill in every if skill.level == level):
+            length = one.use.length or 0.0
+            lasts = f"{length / frequency:.2g} s" if frequency else duration(None, length)
+            label = "".join(f"; {labels}: {told}" for labels, told in one.labels.items())
+            text = note(f"{percent(one.share)} of the steps, {lasts} each{label}")
+            tiles.append(Card(one.name, [*shown.first(one.found, one.choice), text]))
+        blocks += [Text(f"Level “{level}”", "heading")] if len(levels) > 1 else []
+        blocks.append(Columns(tiles))
+        names, used = fit.names[level], {one.choice for one in every if one.level == level}
+        if unused := [numbered_name(choice, names) for choice in range(1, len(names)) if choice not in used]:
+            blocks.append(note(f"Never active on a most likely path: {', '.join(unused)}."))
+    return blocks
+
+
+def section(fit: Fit, demos: Demonstrations, every: Sequence[Skill], shown: Shown, activity: Activity) -> Section:
     """Every option of every level, the highest level first, then the order of the options.
 
     :param demos: in the order of their segments.
-    :param pictures: of each demonstration; empty for none.
     """
-    shown, segmented = _Shown(demos, pictures, paths), activity.segmented
-    reads = deciding(fit, demos)
+    segmented, reads = activity.segmented, deciding(fit, demos)
     blocks: list[Block] = [note(shown.explained())]
     whole = {
         (one.level, one.choice): one
@@ -147,26 +202,18 @@ def section(
     for place, (level, names) in reversed(list(enumerate(fit.names.items()))):
         if len(fit.names) > 1:
             blocks.append(Text(f"Level “{level}”", "heading"))
-        counts = transitions(segmented, level)
-        use = fit.metrics.options[place]
-        shares = [row.steps / sum(one.steps for one in use) for row in use]
-        every = {choice: instances(segmented, level, choice) for choice in range(len(names))}
-        present = [choice for choice, found in every.items() if found]
-        for choice in present:
-            facts = _facts(use[choice], shares[choice], every[choice], counts, names, segmented.frequency)
-            labels = [one for one in fit.metrics.named_by_labels if (one.level, one.option) == (level, choice)]
-            facts |= {f"Label {one.labels}, agreement": agreeing(one) for one in labels}
+        counts, present = transitions(segmented, level), {one.choice: one for one in every if one.level == level}
+        for choice, one in present.items():
+            facts = _facts(one.use, one.share, one.found, counts, names, segmented.frequency)
+            facts |= {f"Label {labels}, agreement": told for labels, told in one.labels.items()}
             if finding := whole.get((1 + place, choice)):
                 facts["No skill"] = finding.deed(segmented.frequency)
             facts |= {what: values[choice] for what, values in reads.get(level, {}).items() if choice in values}
             facts = {what: said.replace(" %", "\N{NO-BREAK SPACE}%") for what, said in facts.items()}
-            title = Cell(numbered_name(choice, names), colour=option_colour(choice))
-            blocks.append(Card(title, [Facts(facts), *shown.blocks(every[choice], choice)]))
-        if unused := [numbered_name(choice, names) for choice in range(1, len(names)) if not every[choice]]:
-            blocks.append(note(f"Never active on a most likely path: {', '.join(unused)}."))
+            blocks.append(Card(one.name, [Facts(facts), *shown.blocks(one.found, choice)]))
         onset = {
-            choice: np.mean([one.start / len(segmented.segments[one.row]) for one in every[choice]])
-            for choice in present
+            choice: np.mean([each.start / len(segmented.segments[each.row]) for each in one.found])
+            for choice, one in present.items()
         }
         order = sorted(present, key=onset.__getitem__)
         caption = (
@@ -176,8 +223,9 @@ def section(
             "mean onset: "
             f"{', '.join(names[choice] for choice in order)}."
         )
+        shares = [present[choice].share if choice in present else 0.0 for choice in range(len(names))]
         blocks.append(Drawing(transition_graph(counts, shares, names, order), caption))
-    return Section("skills", "Skills", blocks)
+    return Section("skills", "Skills one by one", blocks)
 
 
 def _facts(
@@ -205,7 +253,7 @@ def _frequent(counts: np.ndarray, names: Sequence[str], most: int = 2) -> str:
     return ", ".join(f"{names[place]} {percent(counts[place] / counts.sum())}" for place in first if counts[place])
 
 
-class _Shown:
+class Shown:
     """Pictures and films of segments, from what demonstrations have."""
 
     def __init__(self, demos: Demonstrations, pictures: Sequence[Observed], paths: Sequence[PathSpec]) -> None:
@@ -232,6 +280,25 @@ class _Shown:
             f"middle and last step of a segment. {typical}"
         )
 
+    def first(self, found: Sequence[Instance], choice: int) -> list[Block]:
+        """The most typical segment of an option: its middle picture, its path, or its first control."""
+        (one, *_), colour = found, option_colour(choice)
+        where = f"{self.demos[one.row].name} {one.start}–{one.end - 1}"
+        if self.pictures:
+            middle = frames(self.pictures[one.row], [(one.start + one.end - 1) // 2], SHEET_HEIGHT)[0]
+            return [Picture(data_uri(jpeg(middle), "image/jpeg"), f"Middle picture of {where}", "")]
+        if self.drawn:
+            rows = list(dict.fromkeys([one.row, *range(len(self.demos))]))[:MOST_PATHS]
+            return [Drawing(typical_paths([self.paths[row] for row in rows], [(0, one.start, one.end)], colour), "")]
+        return [Drawing(curves(dict([*self.controls(found[:INSTANCES]).items()][:1]), colour), "")]
+
+    def controls(self, chosen: Sequence[Instance]) -> dict[str, list[np.ndarray]]:
+        """Each number of the control over the steps of instances."""
+        every = [
+            self.demos[one.row].actions.reshape(len(self.demos[one.row]), -1)[one.start : one.end] for one in chosen
+        ]
+        return {f"control[{n}]": [array[:, n].astype(float) for array in every] for n in range(every[0].shape[1])}
+
     def blocks(self, found: Sequence[Instance], choice: int) -> list[Block]:
         """A contact sheet and a film of the most typical segments of an option."""
         chosen, colour = found[:INSTANCES], option_colour(choice)
@@ -245,11 +312,7 @@ class _Shown:
             shown = list(dict.fromkeys([*(one.row for one in chosen[:SHOWN]), *range(len(self.demos))]))[:MOST_PATHS]
             segments = [(shown.index(one.row), one.start, one.end) for one in chosen[:SHOWN]]
             return [Drawing(typical_paths([self.paths[row] for row in shown], segments, colour), where)]
-        controls = [
-            self.demos[one.row].actions.reshape(len(self.demos[one.row]), -1)[one.start : one.end] for one in chosen
-        ]
-        each = {f"control[{n}]": [array[:, n].astype(float) for array in controls] for n in range(controls[0].shape[1])}
-        return [Drawing(curves(dict(list(each.items())[:6]), colour), caption)]
+        return [Drawing(curves(dict([*self.controls(chosen).items()][:6]), colour), caption)]
 
 
 def sheet_of(pictures: Sequence[Observed], chosen: Sequence[Instance], where: str) -> Picture:

@@ -1,4 +1,4 @@
-"""Training in the report: learning curves, warnings, and how the run was made."""
+"""Training in the report: learning curves, what is doubtful, and how the run was made."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from ddco_pyro.drawing.figures import INK, blank, save
-from ddco_pyro.drawing.page import Block, Code, Columns, Facts, Folded, Section, Text, Warned, note
-from ddco_pyro.drawing.words import number
-from ddco_pyro.evaluation import effort
+from ddco_pyro.drawing.page import Code, Columns, Facts, Folded, Section, note
+from ddco_pyro.drawing.words import number, rate
+from ddco_pyro.evaluation import effort, verdicts
 from ddco_pyro.evaluation.options import degeneracies
 from ddco_pyro.fitting.fitted import Fit
-from ddco_pyro.metrics import read_table, refit
+from ddco_pyro.metrics import Counts, Rate, read_table, refit
 from ddco_pyro.names import method
 from ddco_pyro.spec import dump_spec
 
@@ -135,48 +135,50 @@ def _limits(values: np.ndarray) -> tuple[float, float]:
     return low - margin, top + margin
 
 
-# --- warnings ---------------------------------------------------------------------------------------------------------
+# --- doubts -----------------------------------------------------------------------------------------------------------
 
 
-def warnings(fit: Fit) -> Section | None:
-    """Signs of too short a training and of a degenerate solution, folded where there are none.
+def doubts(fit: Fit) -> list[tuple[str, str]]:
+    """What is doubtful about a model, and what to do: its training, its likelihood, and its options."""
+    metrics = fit.metrics
+    found = [*effort.unconverged({metrics.model: metrics.training}), *verdicts.doubts(metrics)]
+    return [*found, *(degeneracies(metrics, fit.spec, fit.names) if fit.spec.hierarchy else ())]
 
-    None for a converged policy without options.
-    """
-    blocks: list[Block] = [Warned(*sign) for sign in effort.unconverged(fit.metrics)]
-    if fit.spec.hierarchy is None:
-        return Section("warnings", "Warnings", blocks) if blocks else None
-    signs = degeneracies(fit.metrics, fit.spec, fit.names)
-    blocks += [Warned(*sign) for sign in signs]
-    problems = bool(blocks)
-    if not signs:
-        blocks.append(
-            Text(
-                "No sign of a degenerate solution. Every option is used (at least 1 % of all steps) and none dominates "
-                "(more than 90 %). No two options act alike (differ by less than 0.1 nats per step). No option ends at "
-                "once again and again (lasts less than 1.5 steps, with three selections or more in a demonstration). "
-                "No option takes some demonstrations whole (at least 90 % of their steps, or two thirds of no more "
-                "than half of the demonstrations). "
-                "Options do not switch all the time (six segments or more in a demonstration, most of them below "
-                "0.5 s, or 5 steps where the rate is unknown). "
-                "No caller emits the control itself most of the time."
-            )
-        )
-    return Section("warnings", "Warnings", blocks, folded=not problems)
+
+NO_DOUBT = (
+    "Training converged, and the model predicts held-out controls better than the mean and the spread of each control "
+    "do. Every option is used (at least 1 % of all steps) and none dominates (more than 90 %). No two options act "
+    "alike (differ by less than 0.1 nats per step). No option ends at once again and again (lasts less than 1.5 steps, "
+    "with three selections or more in a demonstration). No option takes some demonstrations whole (at least 90 % of "
+    "their steps, or two thirds of no more than half of the demonstrations). Options do not switch all the time (six "
+    "segments or more in a demonstration, most of them below 0.5 s, or 5 steps or a fiftieth of their demonstration "
+    "where the rate is unknown). No caller emits the control itself most of the time."
+)
+"""What was looked at where nothing is doubtful."""
 
 
 # --- particulars ------------------------------------------------------------------------------------------------------
 
 
+def held_out(counts: Counts) -> str:
+    """``10 held out``: the demonstrations that no model of the run was trained on."""
+    return "each held out from a fit without it" if counts.left_out else f"{counts.valid} held out"
+
+
 def particulars(fit: Fit) -> Section:
-    """Seconds, engine check, versions and the spec."""
+    """Demonstrations, parameters, effort, seconds, engine check, versions and the spec."""
     seconds = {name: number(value, 1) for name, value in fit.metrics.seconds.items()}
     check = {name: f"{value:.1e}" for name, value in dict(fit.metrics.engine_check).items()}
     differences = "Largest relative difference of the two inference engines."
+    counts, supervisor = fit.metrics.demonstrations, fit.metrics.demonstrations.supervisor.get("success")
+    model = {"Parameters": str(fit.metrics.parameters), "Training": effort.spent(fit.metrics.training)}
+    model["Demonstrations"] = f"{counts.train} for training, {counts.tune} for tuning, {held_out(counts)}"
+    if isinstance(supervisor, Rate):
+        model["Supervisor’s own success"] = f"{rate(supervisor, 'demonstrations')}, 95 % interval"
     facts = [
         Facts(seconds, "Seconds"),
         Facts(check, "Engine check", differences),
         Facts(fit.metrics.versions, "Versions"),
     ]
     spec = Folded("The whole spec, with its defaults", [Code(dump_spec(fit.spec))])
-    return Section("particulars", "How this run was made", [Columns(facts), spec], folded=True)
+    return Section("particulars", "How this run was made", [Facts(model), Columns(facts), spec], folded=True)

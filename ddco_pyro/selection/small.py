@@ -130,7 +130,7 @@ def lasting(spec: Spec, demos: Demonstrations, steps: float | None, on_event: On
                 values.append(event.tune)
 
         found = fit(with_overrides(sketch, overrides(spec, power, constant, window)), some, on_event=heard)
-        return Lasting(power, constant, window, segments_of(found.segment(some)[0]), values[-1])
+        return Lasting(power, constant, window, segments_of(found.segment(some)[0], demos.frequency), values[-1])
 
     def tried(power: float, constant: bool) -> Lasting:
         tries = [begun(power, constant, window) for window in (windows if power < USUAL else [0])]
@@ -138,7 +138,7 @@ def lasting(spec: Spec, demos: Demonstrations, steps: float | None, on_event: On
         on_event(LengthTried(power, constant, found.segments.median))
         return found
 
-    return unasked(tried, demos.frequency) if steps is None else asked(tried, steps)
+    return unasked(tried) if steps is None else asked(tried, steps)
 
 
 def _sketch(spec: Spec) -> Spec:
@@ -198,15 +198,15 @@ def in_steps(place: str, length: str, frequency: float | None) -> float:
     return value * frequency if seconds and frequency else value
 
 
-def unasked(tried: Callable[[float, bool], Lasting], frequency: float | None) -> Lasting:
-    """The first power of :data:`LADDER` whose segments are not :meth:`~ddco_pyro.metrics.Segments.brief`.
+def unasked(tried: Callable[[float, bool], Lasting]) -> Lasting:
+    """The first power of :data:`LADDER` whose segments are not :attr:`~ddco_pyro.metrics.Segments.brief`.
 
     Where that leaves few segments in a demonstration, options are about to become one. Then it is a power between this
     one and the one before, and where that leaves few segments, too, the one before.
     """
     found = before = tried(LADDER[0], False)
     for power in LADDER[1:]:
-        if not found.segments.brief(frequency):
+        if not found.segments.brief:
             break
         before, found = found, tried(power, power == LADDER[-1])
     if before is found or not _few(found):

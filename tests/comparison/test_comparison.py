@@ -22,6 +22,7 @@ from ddco_pyro.comparison.page import write
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.rollouts import roll_out
+from ddco_pyro.metrics import Marginal
 from ddco_pyro.report import write_report
 from ddco_pyro.spec import with_overrides
 from ddco_pyro.training.data import demonstrations, train_and_valid
@@ -114,15 +115,23 @@ def row(name, rank, each, model="ddco", in_training=1.0):
 
 
 def test_a_run_that_fell_apart_comes_first_in_the_verdict():
-    """And nothing is concluded from its lead over a mixture that fell apart, too."""
+    """By the density without observations; nothing is concluded from its lead over a mixture that fell apart, too."""
     runs = [("a", "flat", [4.0] * 4, 4.1), ("b", "ddco", [-9.0, -8.0] * 2, 6.0), ("c", "mixture", [-20.0] * 4, 5.0)]
     rows = [row(name, rank, each, model, own) for rank, (name, model, each, own) in enumerate(runs)]
-    said = page.verdict(Comparison(rows, tuple("klmn"), (1, 1, 1, 1), [], [], "b"))
-    assert said.startswith(
-        "b fell apart on held-out demonstrations: −8.50 nats per step there, 6.00 in training. c fell"
-    )
+    known = Marginal(train=0.0, valid=-1.0, controls=2)
+    said = page.verdict(Comparison(rows, tuple("klmn"), (1, 1, 1, 1), [], [], "b", known))
+    assert said.startswith("b fell apart on held-out demonstrations: −8.50 nats per step there, 6.00 in training.")
+    assert "c fell apart" in said
     assert "b is below a by 12.50 ± 0.29 nats per step" in said
-    assert "explain held-out controls" not in said
+    assert "options that last" not in said
+
+
+def test_one_run_of_each_model_tests_options_against_the_mixture():
+    runs = [("a", "ddco", [4.0, 4.1, 4.2, 4.1]), ("b", "mixture", [3.0, 3.1, 3.0, 3.1])]
+    rows = [row(name, rank, each, model, 4.1) for rank, (name, model, each) in enumerate(runs)]
+    said = page.verdict(Comparison(rows, tuple("klmn"), (1, 1, 1, 1), [], [], "a"))
+    assert "options that last predict held-out controls better than the mixture does: +1.05 ± " in said
+    assert "Success was not measured." in said
 
 
 def test_demonstrations_are_listed_worst_first_by_the_best_hierarchy(toy_run, found, folders, held_out):

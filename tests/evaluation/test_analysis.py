@@ -314,17 +314,22 @@ def test_signs_of_a_degenerate_solution(levels, found):
         ([24] * 6, 50.0, True),
         ([25] * 6, 50.0, False),
         ([4] * 6, 8.0, False),
+        ([5] * 79, None, True),  # 395 steps: a fiftieth is 7.9
+        ([5] * 79, 10.0, False),
+        ([8] * 39 + [40] * 40, None, False),  # a fiftieth is 38
     ],
 )
 def test_options_that_switch_all_the_time_are_a_sign(lengths, rate, brief):
-    """Half a second where the rate is known, else five steps, for a level of a hierarchy whose options last."""
+    """Half a second where the rate is known, else five steps, or a fiftieth of the demonstration if that is more."""
     path = np.concatenate([np.full(steps, 1 + n % 2) for n, steps in enumerate(lengths)])
-    segments = segments_of([path, path])
-    assert (segments.median, segments.number) == (np.median(lengths), 2 * len(lengths))
-    found = [
-        one for one in diagnose([level(0.0, 0.5, 0.5)], segments=[segments], frequency=rate) if one.kind == "brief"
-    ]
-    assert found == ([Finding("brief", 1, 0, float(np.median(lengths)))] if brief else [])
+    segments = segments_of([path, path], rate)
+    least = 0.5 * rate if rate else max(5, len(path) / 50)
+    twitches = sum(steps < least for steps in lengths)
+    assert (segments.median, segments.number, segments.twitches) == (np.median(lengths), 2 * len(lengths), 2 * twitches)
+    found = [one for one in diagnose([level(0.0, 0.5, 0.5)], segments=[segments]) if one.kind == "brief"]
+    assert found == (
+        [Finding("brief", 1, 0, float(np.median(lengths)), times=twitches / len(lengths))] if brief else []
+    )
 
 
 @pytest.mark.parametrize(("demonstrations", "found"), [(100, True), (48, True), (47, False)])
@@ -332,7 +337,7 @@ def test_an_option_of_most_steps_of_some_demonstrations_is_a_sign(demonstrations
     """Two thirds count where no more than half of the demonstrations have the option."""
     own = use([(1, 300), (2, 130)], [(2, 40)])[0]
     own[1] = own[1].model_copy(update={"having": 24})
-    signs = diagnose([own], segments=[Segments(median=100, number=200, demonstrations=demonstrations)])
+    signs = diagnose([own], segments=[Segments(median=100, number=200, demonstrations=demonstrations, twitches=0)])
     assert [one.kind for one in signs] == (["whole"] if found else [])
 
 

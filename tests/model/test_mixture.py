@@ -11,12 +11,10 @@ from oracle import brute_force
 from toy_task import SPEC
 
 import ddco_pyro
-from ddco_pyro.drawing import words
 from ddco_pyro.evaluation import verdicts
 from ddco_pyro.evaluation.inferred import runs, started
 from ddco_pyro.inference import log_likelihood
 from ddco_pyro.inference.engines import compare_engines
-from ddco_pyro.metrics import Worth
 from ddco_pyro.model.tables import always_ends
 from ddco_pyro.selection.grid import candidates
 from ddco_pyro.spec import SpecError, parse_spec, with_overrides
@@ -162,20 +160,6 @@ def test_the_worth_of_a_hierarchy_has_two_parts():
     assert worth("ddco", {name: values[name] for name in ("ddco", "mixture")}, (2, 3)).total is None
 
 
-@pytest.mark.parametrize(
-    ("memory", "error", "said"),
-    [(0.5, 0.1, "explain held-out controls better"), (0.1, 0.1, "does not show that options that last are worth"),
-     (-0.5, 0.1, "explain held-out controls worse than"), (0.5, None, "does not show that options that last")],
-)  # fmt: skip
-def test_the_verdict_is_about_options_that_last(memory, error, said):
-    parts = {"memory": memory, "experts": 2.0, "total": 2.0 + memory}
-    found = {name: {"nats_per_step": value, "standard_error": error} for name, value in parts.items()}
-    text = verdicts.worth(Worth(**found, flat="flat", steps_in_a_row=[{"options": 3.0, "mixture": 4.0}]), "DDCO", 10)
-    assert text.startswith(f"Of {words.signed(2.0 + memory)} nats per step over flat, +2.00 ± {words.number(error)} ")
-    assert said in text
-    assert text.endswith("Options stay active no longer (3 steps) than the mixture keeps to one policy (4 steps).")
-
-
 def test_a_run_says_what_lasting_is_worth(run):
     """By the likelihoods of what it held out, computed anew."""
     held_out = run.demonstrations.select(row.name for row in run.metrics.valid)
@@ -184,7 +168,7 @@ def test_a_run_says_what_lasting_is_worth(run):
     assert found.memory.nats_per_step == pytest.approx((ours - mixture) / sum(held_out.lengths))
     (path,) = run.segment(held_out)
     assert found.steps_in_a_row[0].options == pytest.approx(mean_run(path))
-    assert verdicts.worth(found, "options", len(held_out)) in verdicts.verdict(run.metrics)
+    assert verdicts.lasting(found, "options", len(held_out)) in verdicts.verdict(run.metrics)
 
 
 def test_its_segments_are_runs_of_one_expert():

@@ -63,7 +63,7 @@ def test_options_last_as_long_as_is_asked(long):
 
 def test_long_options_are_found_where_no_length_is_asked():
     demos = skills_within_which_speed_varies()
-    assert not lasting(parse_spec(yaml.safe_load(SPEC)), demos, None).segments.brief(None)
+    assert not lasting(parse_spec(yaml.safe_load(SPEC)), demos, None).segments.brief
 
 
 @pytest.mark.parametrize(

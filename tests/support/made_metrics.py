@@ -53,3 +53,33 @@ def made_metrics(held_out: int = 1, **fields: Any) -> Metrics:
         "versions": {},
     }
     return Metrics.model_validate(fixed | fields)
+
+
+def scored(
+    train: dict[str, float], valid: dict[str, list[float]], marginal: float, controls: int, **more: Any
+) -> Metrics:
+    """Metrics of models with these log-likelihoods of held-out demonstrations of one step, the run's model first.
+
+    :param marginal: of the density without observations on held-out demonstrations, nats per step.
+    """
+    ours, *others = valid
+    mean = {name: sum(values) / len(values) for name, values in valid.items()}
+    each = range(len(valid[ours]))
+    rows = [
+        {
+            "name": f"demo_{n}",
+            "part": "valid",
+            "steps": 1,
+            "log_likelihood_per_step": {k: v[n] for k, v in valid.items()},
+        }
+        for n in each
+    ]
+    return made_metrics(
+        len(each),
+        model=ours,
+        log_likelihood_per_step={"train": train[ours], "valid": mean[ours]},
+        demonstrations_by_likelihood=rows,
+        comparison={k: compared(mean[ours] - mean[k], 0.05, train=train[k], valid=mean[k]) for k in others},
+        marginal={"train": marginal, "valid": marginal, "controls": controls},
+        **more,
+    )
