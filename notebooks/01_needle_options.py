@@ -57,12 +57,6 @@ figures = needle.folder / "figures"
 Image(figures / "trajectories.png")
 
 # %% [markdown]
-# How sure the model is of it, step by step, in some of the demonstrations that it was not trained with:
-
-# %%
-Image(figures / "posterior.png")
-
-# %% [markdown]
 # ## How are they used?
 
 # %%

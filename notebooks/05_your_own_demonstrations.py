@@ -80,10 +80,10 @@ write_report(mine, demos)
 Markdown(verdicts.verdict(mine.metrics))
 
 # %% [markdown]
-# The options over time, beside the phases that the expert itself says it is in (the model has not seen them):
+# The way of the hand, coloured by the most likely option; the report beside it has the options over time:
 
 # %%
-Image(mine.folder / "figures" / "posterior.png")
+Image(mine.folder / "figures" / "trajectories.png")
 
 # %%
 agreement = mine.metrics.agreement

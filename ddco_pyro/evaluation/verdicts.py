@@ -32,9 +32,9 @@ from ddco_pyro.statistics import paired, t_quantile, wider_interval
 SMALLEST = 0.01
 """The smallest useful difference in nats per step: each step's control is exp(0.01) times as probable, 1 % more."""
 
-LOST = 0.5
+LOST = 1.0
 """Nats per step and control dimension, from training to held-out demonstrations, from which on a model may have fallen
-apart: a control is 1.6 times less probable there."""
+apart: a control is e = 2.7 times less probable there."""
 
 FEWEST = 3
 """Fewest held-out demonstrations of which an interval is told."""
@@ -364,7 +364,8 @@ def success(metrics: Metrics) -> str:
         return said("success", "few")
     ours = method(metrics.model)
     text = f"In rollouts {ours} {verb(ours, 'succeed', 'succeeds')} in {rate(rates.pop(metrics.model), 'episodes')}"
-    others = [f"{method(name)} in {rate(summary)}" for name, summary in rates.items()]
+    beside = {MIXTURE: rates[MIXTURE]} if MIXTURE in rates else rates
+    others = [f"{method(name)} in {rate(summary)}" for name, summary in beside.items()]
     told = f"{text}{'; ' if others else ''}{listed(others) if others else ''}."
     found, seeds = metrics.rollouts.worth, metrics.rollouts.seeds
     if found is None:

@@ -10,7 +10,7 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
 from ddco_pyro.data.sources import open_source
 from ddco_pyro.drawing.figures import style
-from ddco_pyro.drawing.page import Block, Page, Text, Warned, footnote
+from ddco_pyro.drawing.page import Block, Folded, Page, Text, Warned, note
 from ddco_pyro.drawing.shown import paths_of, pictures, stored_pictures
 from ddco_pyro.evaluation import verdicts
 from ddco_pyro.evaluation.options import beside_equal_parts
@@ -88,4 +88,8 @@ def header(fit: Fit) -> list[Block]:
     texts = [verdicts.twitches(metrics.segments, metrics.control_frequency) or verdicts.explained(metrics)]
     texts += [text for text, worse in beside_equal_parts(metrics) if not worse]
     found = training.doubts(fit)
-    return [*map(Text, texts), *(Warned(*sign) for sign in found), *([] if found else [footnote(training.NO_DOUBT)])]
+    return [
+        *map(Text, texts),
+        *(Warned(*sign) for sign in found),
+        *([] if found else [Folded("No sign of a doubtful fit", [note(training.SOUND)])]),
+    ]

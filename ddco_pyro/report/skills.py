@@ -32,7 +32,7 @@ from ddco_pyro.drawing.words import duration, percent
 from ddco_pyro.evaluation.options import diagnose
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Use
-from ddco_pyro.names import numbered_name
+from ddco_pyro.names import numbered_name, option_name
 from ddco_pyro.report.inputs import deciding
 from ddco_pyro.report.options import agreeing
 from ddco_pyro.report.trajectories import Activity
@@ -176,9 +176,10 @@ def overview(fit: Fit, every: Sequence[Skill], shown: Shown) -> list[Block]:
         for one in (skill for skill in every if skill.level == level):
             length = one.use.length or 0.0
             lasts = f"{length / frequency:.2g} s" if frequency else duration(None, length)
-            label = "".join(f"; {labels}: {told}" for labels, told in one.labels.items())
-            text = note(f"{percent(one.share)} of the steps, {lasts} each{label}")
-            tiles.append(Card(one.name, [*shown.first(one.found, one.choice), text]))
+            label = "".join(f"; label {told}" for told in one.labels.values())
+            text = note(f"{percent(one.share)} of steps, {lasts} each{label}")
+            name = Cell(option_name(one.choice, fit.names[level]), colour=one.name.colour)
+            tiles.append(Card(name, [*shown.first(one.found, one.choice), text]))
         blocks += [Text(f"Level “{level}”", "heading")] if len(levels) > 1 else []
         blocks.append(Columns(tiles))
         names, used = fit.names[level], {one.choice for one in every if one.level == level}

@@ -145,7 +145,7 @@ def doubts(fit: Fit) -> list[tuple[str, str]]:
     return [*found, *(degeneracies(metrics, fit.spec, fit.names) if fit.spec.hierarchy else ())]
 
 
-NO_DOUBT = (
+SOUND = (
     "Training converged, and the model predicts held-out controls better than the mean and the spread of each control "
     "do. Every option is used (at least 1 % of all steps) and none dominates (more than 90 %). No two options act "
     "alike (differ by less than 0.1 nats per step). No option ends at once again and again (lasts less than 1.5 steps, "

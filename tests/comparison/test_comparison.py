@@ -101,7 +101,7 @@ def test_rows_are_what_az_compare_would_say(found, folders, held_out):
 def test_the_verdict_says_whether_a_difference_is_outside_its_error(each, said):
     """By hand, trajectories of one step: ± is the standard deviation of the four differences by the root of four."""
     apart, error = sum(each), 2 * float(np.std(each, ddof=1))
-    rows = [row("a", 0, each), replace(row("b", 1, [0.0] * 4), difference=apart, dse=error)]
+    rows = [row("a", 0, each), replace(row("b", 1, [0.0] * 4, in_training=0.1), difference=apart, dse=error)]
     found = Comparison(rows, tuple("klmn"), (1, 1, 1, 1), [], [], "a")
     assert page.verdict(found) == (
         f"a explains held-out demonstrations {said} (± is one standard error over 4 held-out demonstrations, for one "
@@ -128,7 +128,7 @@ def test_a_run_that_fell_apart_comes_first_in_the_verdict():
 
 def test_one_run_of_each_model_tests_options_against_the_mixture():
     runs = [("a", "ddco", [4.0, 4.1, 4.2, 4.1]), ("b", "mixture", [3.0, 3.1, 3.0, 3.1])]
-    rows = [row(name, rank, each, model, 4.1) for rank, (name, model, each) in enumerate(runs)]
+    rows = [row(name, rank, each, model, 3.5) for rank, (name, model, each) in enumerate(runs)]
     said = page.verdict(Comparison(rows, tuple("klmn"), (1, 1, 1, 1), [], [], "a"))
     assert "options that last predict held-out controls better than the mixture does: +1.05 ± " in said
     assert "Success was not measured." in said

@@ -188,12 +188,12 @@ def test_the_top_of_the_page_is_skills_their_agreement_and_what_is_doubtful(labe
     for use in found.metrics.options[0][1:]:
         if use.length:
             share = words.percent(use.steps / sum(one.steps for one in found.metrics.options[0]))
-            assert f'<p class="note">{share} of the steps, {use.length / 20:.2g} s each' in header
+            assert f'<p class="note">{share} of steps, {use.length / 20:.2g} s each' in header
     ours, equal = (words.number(scores[0].nmi) for scores in (
         found.metrics.agreement.valid, found.metrics.agreement.equal_valid
     ))  # fmt: skip
     assert f"NMI {ours} against {equal}" in header or f"NMI {equal} against {ours}" in header
-    assert header.index("of the steps") < header.index(" against ")
+    assert header.index("of steps") < header.index(" against ")
     assert [text for text, _ in training.doubts(found)] == [
         html.unescape(text) for text in re.findall('<div class="warning"><p><strong>(.*?)</strong>', header)
     ]
