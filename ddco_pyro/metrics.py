@@ -247,13 +247,6 @@ class Below(Record):
         return self.objective > self.CLOSE or self.nats > self.NEAR
 
 
-class InARow(Record):
-    """Mean steps in a row of one choice, in a level of the hierarchy and of the mixture."""
-
-    options: Finite
-    mixture: Finite
-
-
 class Against(Record):
     """Successes of two methods from the same initial states (McNemar's test)."""
 
@@ -274,8 +267,6 @@ class Parts(Record, Generic[T]):
 
 class Worth(Parts[Difference]):
     """The parts in nats per step."""
-
-    steps_in_a_row: LeftOut[list[InARow]] = []
 
 
 class SuccessWorth(Parts[Against]):

@@ -139,9 +139,3 @@ def _parts(ours: str, values: Mapping[str, Any], difference: Callable[[Any, Any]
     if flat is not None:
         pairs |= {"experts": (MIXTURE, flat), "total": (ours, flat)}
     return {name: difference(values[one], values[other]) for name, (one, other) in pairs.items()} | {"flat": flat}
-
-
-def mean_run(choices: Sequence[np.ndarray]) -> float:
-    """Mean number of steps in a row with one choice, over sequences of choices [T]."""
-    runs = sum(1 + int(np.count_nonzero(np.diff(sequence))) for sequence in choices)
-    return sum(map(len, choices)) / runs

@@ -247,19 +247,13 @@ def warnings(fit: Fit) -> None:
         say(f"warning: {what} {advice}")
 
 
-ONE_FIT = (
-    "± is one standard error over the held-out demonstrations of one fit; other training seeds give other fits: "
-    "repeat them with --seeds 5."
-)
-
-
 def log_likelihoods(fit: Fit) -> None:
     """Log-likelihood of the model and of its baselines, the test against the mixture, and what is doubtful of it."""
     from ddco_pyro.report.likelihood import parts, stds, table
 
     metrics = fit.metrics
     if said := verdicts.tested(metrics):
-        say(said if metrics.seeds else f"{said} {ONE_FIT}")
+        say(said)
     if found := parts(metrics):
         show(found)
     show(table(metrics, 3, "log-likelihood, nats per step (higher is better)"))

@@ -16,7 +16,7 @@ from ddco_pyro.drawing import words
 from ddco_pyro.drawing.figures import Interval, Panel, interval_plot, save, style
 from ddco_pyro.drawing.page import Block, Cell, Page, Picture, Section, Table, Text, note
 from ddco_pyro.evaluation import effort, verdicts
-from ddco_pyro.evaluation.agreement import UNMATCHED, measure_names
+from ddco_pyro.evaluation.agreement import EXPLAINED, UNMATCHED, measure_names
 from ddco_pyro.metrics import Rate
 from ddco_pyro.names import HIERARCHY, method
 from ddco_pyro.report.likelihood import SHOWN
@@ -25,13 +25,6 @@ from ddco_pyro.statistics import worth
 
 FILES = ("compare.png", "compare.json", "compare.md", "compare.html")
 """The files of a comparison."""
-
-AGREEMENT = (
-    "Agreement of options with labels on the same trajectories, 1 where it is perfect; runs are not ranked by it. NMI: "
-    "normalised mutual information. ARI: adjusted Rand index, 0 by chance. Boundary F1: the steps at which segments "
-    "begin, within so many steps. Accuracy: share of steps that agree where each option stands for one label. Equal "
-    "lengths: what equal parts of each demonstration reach, as many as options."
-)
 
 
 def write(compared: Comparison, folder: Path) -> Path:
@@ -52,7 +45,9 @@ def page(compared: Comparison, picture: Picture, folder: Path) -> Page:
     likelihood: list[Block] = [run_table(compared), note(_explanation(compared)), picture]
     sections = [Section("likelihood", "Held-out log-likelihood", likelihood)]
     if agreement := agreement_table(compared):
-        sections.append(Section("agreement", "Agreement with labels", [agreement, note(AGREEMENT)]))
+        sections.append(
+            Section("agreement", "Agreement with labels", [agreement, note(f"Held-out trajectories. {EXPLAINED}")])
+        )
     links = _links(compared, folder)
     listed = (
         "All of them were held out by every run. Nats per step, the least likely under "
@@ -126,7 +121,7 @@ def verdict(compared: Comparison) -> str:
     runs = [row.model for row in compared.rows]
     alone = {row.model: each[row.name] for row in compared.rows if runs.count(row.model) == 1}
     if models.sound() and (found := worth(HIERARCHY, alone, compared.steps)):
-        told.append(verdicts.lasting(found, method(HIERARCHY), len(steps)))
+        told.append(verdicts.lasting(found, len(steps)))
         told += [] if compared.rollouts else [verdicts.said("success", "few")]
     rising = effort.rising(row.name for row in compared.rows if not row.training.converged)
     return f"{' '.join(told)}{rising}"

@@ -34,12 +34,6 @@ def option_rgb(choice: int) -> tuple[int, int, int]:
     return red, green, blue
 
 
-def is_bright(colour: str) -> bool:
-    """Whether black is read better than white on a hex colour."""
-    red, green, blue = bytes.fromhex(colour[1:])
-    return 0.299 * red + 0.587 * green + 0.114 * blue > 140
-
-
 def legend(choices: Iterable[int], names: Sequence[str] = ()) -> list[Patch]:
     """Legend handles that name the colours of choices.
 

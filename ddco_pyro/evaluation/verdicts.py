@@ -15,9 +15,8 @@ from ddco_pyro.drawing.words import (
     duration,
     interval,
     listed,
-    more_successes,
     number,
-    p_value,
+    of_episodes,
     percent,
     rate,
     signed,
@@ -41,64 +40,44 @@ FEWEST = 3
 
 Direction = Literal["better", "worse", "same", "unclear", "brief", "few"]
 
-SENTENCES: Mapping[tuple[str, Direction, Literal["one", "several"]], str] = {
+OVER = {"one": "In this fit", "several": "Over {seeds} training seeds"}
+"""How sentences on a test begin, by the number of training seeds."""
+
+SENTENCES: Mapping[tuple[str, Direction], str] = {
     # options that last against the mixture
-    ("controls", "better", "one"): "In this fit options that last predict held-out controls better than the mixture "
-    "does: {lead}. One fit of each model is no verdict.",
-    ("controls", "worse", "one"): "In this fit options that last predict held-out controls worse than the mixture "
-    "does: {lead}. One fit of each model is no verdict.",
-    ("controls", "same", "one"): "In this fit options that last predict held-out controls as well as the mixture "
-    "does: {lead}.",
-    ("controls", "unclear", "one"): "This fit does not show whether options that last predict held-out controls better "
+    ("controls", "better"): "{over} options that last predict held-out controls better than the mixture does: {lead}.",
+    ("controls", "worse"): "{over} options that last predict held-out controls worse than the mixture does: {lead}.",
+    ("controls", "same"): "{over} options that last predict held-out controls as well as the mixture does: {lead}.",
+    ("controls", "unclear"): "{over} it is inconclusive whether options that last predict held-out controls better "
     "than the mixture does: {lead}.",
-    ("controls", "brief", "one"): "In this fit very short options predict held-out controls better than the mixture "
-    "does: {lead}. {brief}, and they are no skills.",
-    ("controls", "few", "one"): "Too few demonstrations ({held_out}) are held out to compare options that last with "
-    "the mixture: {lead}.",
-    ("controls", "better", "several"): "Over {seeds} training seeds options that last predict held-out controls better "
-    "than the mixture does: {lead}.",
-    ("controls", "worse", "several"): "Over {seeds} training seeds options that last predict held-out controls worse "
-    "than the mixture does: {lead}.",
-    ("controls", "same", "several"): "Over {seeds} training seeds options that last predict held-out controls as well "
-    "as the mixture does: {lead}.",
-    ("controls", "unclear", "several"): "Over {seeds} training seeds it is inconclusive whether options that last "
-    "predict held-out controls better than the mixture does: {lead}.",
-    ("controls", "brief", "several"): "Over {seeds} training seeds very short options predict held-out controls better "
-    "than the mixture does: {lead}. {brief}, and they are no skills.",
-    ("controls", "few", "several"): "Too few demonstrations ({held_out}) are held out to compare options that last "
-    "with the mixture over {seeds} training seeds: {lead}.",
-    ("success", "better", "one"): "In this fit options succeed more often than the mixture: {lead}. One fit of each "
-    "model is no verdict.",
-    ("success", "worse", "one"): "In this fit options succeed less often than the mixture: {lead}. One fit of each "
-    "model is no verdict.",
-    ("success", "unclear", "one"): "This fit does not show whether options succeed more often than the mixture: "
-    "{lead}.",
-    ("success", "better", "several"): "Over {seeds} training seeds options succeed more often than the mixture: "
-    "{lead}.",
-    ("success", "worse", "several"): "Over {seeds} training seeds options succeed less often than the mixture: {lead}.",
-    ("success", "unclear", "several"): "Over {seeds} training seeds it is inconclusive whether options succeed more "
-    "often than the mixture: {lead}.",
-    ("success", "few", "one"): "Success was not measured.",
+    ("controls", "brief"): "{over} very short options predict held-out controls better than the mixture does: {lead}. "
+    "{brief}, and they are no skills.",
+    ("controls", "few"): "Too few demonstrations ({held_out}) are held out to compare options that last with the "
+    "mixture: {lead}.",
+    ("success", "better"): "{over} options succeed more often than the mixture: {lead}.",
+    ("success", "worse"): "{over} options succeed less often than the mixture: {lead}.",
+    ("success", "unclear"): "{over} it is inconclusive whether options succeed more often than the mixture: {lead}.",
+    ("success", "few"): "Success was not measured.",
     # a model against another one
-    ("model", "better", "one"): "{by} nats per step better than {other}",
-    ("model", "worse", "one"): "{by} nats per step worse than {other}",
-    ("model", "unclear", "one"): "with no clear difference from {other} ({lead} nats per step)",
+    ("model", "better"): "{by} nats per step better than {other}",
+    ("model", "worse"): "{by} nats per step worse than {other}",
+    ("model", "unclear"): "with no clear difference from {other} ({lead} nats per step)",
     # options against labels and against equal parts of each demonstration
-    ("labels", "better", "one"): "Options agree better with labels “{labels}” than equal parts of each demonstration "
+    ("labels", "better"): "Options agree better with labels “{labels}” than equal parts of each demonstration "
     "do: NMI {ours} against {equal}, accuracy {accuracy} against {equal_accuracy}, {part}.",
-    ("labels", "worse", "one"): "Equal parts of each demonstration agree better with labels “{labels}” than options "
+    ("labels", "worse"): "Equal parts of each demonstration agree better with labels “{labels}” than options "
     "do: NMI {equal} against {ours}, accuracy {equal_accuracy} against {accuracy}, {part}.",
     # doubts
-    ("held out", "worse", "one"): "{name} fell apart on held-out demonstrations: {valid} nats per step there, {train} "
+    ("held out", "worse"): "{name} fell apart on held-out demonstrations: {valid} nats per step there, {train} "
     "in training. That is {loss} less for each of {controls} controls.",
-    ("marginal", "worse", "one"): "{name} {predict} held-out controls worse than the mean and the spread of each "
+    ("marginal", "worse"): "{name} {predict} held-out controls worse than the mean and the spread of each "
     "control do: {valid} against {marginal} nats per step.",
-    ("flat", "worse", "one"): "{name} {are} below {other} by {by} nats per step on held-out demonstrations.",
-    ("contained", "worse", "one"): "In training {name} {are} less likely than the {other} that they contain, by {by} "
+    ("flat", "worse"): "{name} {are} below {other} by {by} nats per step on held-out demonstrations.",
+    ("contained", "worse"): "In training {name} {are} less likely than the {other} that they contain, by {by} "
     "nats per step.",
 }
-"""Sentences by what was measured, in which direction, and over one fit or several training seeds. {lead} is always
-options minus the mixture."""
+"""Sentences by what was measured and in which direction; :data:`OVER` says over how many training seeds. {lead} is
+always options minus the mixture."""
 
 ADVICE: Mapping[str, str] = {
     "held out": "Such a fit follows its training demonstrations too closely, and comparisons with it say nothing. Take "
@@ -209,7 +188,8 @@ class Models:
 
 def said(measure: str, way: Direction, **values: str) -> str:
     """A sentence of :data:`SENTENCES`."""
-    return SENTENCES[measure, way, "several" if "seeds" in values else "one"].format(**values)
+    over = OVER["several" if "seeds" in values else "one"].format(**values)
+    return SENTENCES[measure, way].format(over=over, **values)
 
 
 def direction(lead: Difference, held_out: int) -> Direction:
@@ -304,34 +284,29 @@ def tested(metrics: Metrics) -> str:
     found, seeds, held_out = metrics.worth, metrics.seeds, len(metrics.valid)
     if not Models.of(metrics).sound() or not (found or (seeds and "memory" in seeds.worth)):
         return ""
-    few, brief = twitches(metrics.segments, metrics.control_frequency), all(own.brief for own in metrics.segments)
-    short = few if metrics.segments and brief else ""
+    short = twitches(metrics.segments, metrics.control_frequency) if all(own.brief for own in metrics.segments) else ""
     if seeds and "memory" in seeds.worth:
         memory = seeds.worth["memory"]
         errors = [error for error in seeds.standard_error["memory"] if error is not None]
         low, high = wider_interval(memory, float(np.mean(errors)) if errors else 0.0, held_out)
-        lead = f"{signed(float(np.mean(memory)))} [{interval((low, high))}] nats per step"
         way = "few" if held_out < FEWEST else _direction(low, high, SMALLEST)
+        lead = f"{signed(float(np.mean(memory)))}{f' [{interval((low, high))}]' * (way != 'few')} nats per step"
         text = _lasting(way, lead, held_out, short, len(seeds.training_seeds))
     else:
         assert found
-        text = lasting(found, method(metrics.model), held_out, metrics.control_frequency, short)
+        text = lasting(found, held_out, short)
     return f"{text} {success(metrics)}".strip()
 
 
-def lasting(found: Worth, ours: str, held_out: int, frequency: float | None = None, brief: str = "") -> str:
+def lasting(found: Worth, held_out: int, brief: str = "") -> str:
     """The test of one fit: options that last against the mixture.
 
-    :param ours: what the hierarchy is called.
     :param brief: a sentence where the options are too short for skills; else empty.
     """
-    way, rows = direction(found.memory, held_out), found.steps_in_a_row
+    way = direction(found.memory, held_out)
     known = with_error(found.memory) if way != "few" else signed(found.memory.nats_per_step)
     text = _lasting(way, f"{known} nats per step", held_out, brief)
-    if rows and all(row.options <= row.mixture for row in rows):
-        own, mixture = (duration(frequency, steps) for steps in (rows[0].options, rows[0].mixture))
-        text += f" {capital(ours)} stay active no longer ({own}) than the mixture keeps to one policy ({mixture})."
-    return text
+    return f"{text} One fit of each model is no verdict; repeat it with --seeds 5."
 
 
 def _lasting(way: Direction, lead: str, held_out: int, brief: str, seeds: int = 1) -> str:
@@ -379,8 +354,7 @@ def _succeeds(found: SuccessWorth, memory: Sequence[float]) -> str:
     lead = pair.only_ours - pair.only_theirs
     if not memory:
         way: Direction = "unclear" if pair.p_value >= 0.05 else "better" if lead > 0 else "worse"
-        p = f"p = {p_value(pair.p_value)}".replace("= <", "<")
-        return said("success", way, lead=f"{more_successes(pair)} of {pair.trials} episodes ({p})")
+        return said("success", way, lead=f"{of_episodes(pair)} of {pair.trials} episodes")
     error = math.sqrt(pair.only_ours + pair.only_theirs - lead**2 / pair.trials) / pair.trials
     low, high = wider_interval(memory, error, pair.trials)
     points = f"{signed(100 * float(np.mean(memory)), 0)} [{interval((low, high), 100, 0)}] points of success"

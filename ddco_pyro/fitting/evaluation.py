@@ -28,7 +28,6 @@ from ddco_pyro.metrics import (
     Compared,
     Dimensions,
     HeldOut,
-    InARow,
     Listed,
     Marginal,
     Metrics,
@@ -36,13 +35,11 @@ from ddco_pyro.metrics import (
     Segments,
     TrainedLabels,
     Use,
-    Worth,
 )
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.outputs import Outputs
-from ddco_pyro.names import MIXTURE
 from ddco_pyro.spec import LearnedStd, Spec, with_overrides
-from ddco_pyro.statistics import mean_run, paired, worth
+from ddco_pyro.statistics import paired, worth
 from ddco_pyro.training.data import tuning_split
 from ddco_pyro.training.labels import choices, used
 from ddco_pyro.training.networks import Dimensions as Sizes
@@ -195,7 +192,7 @@ def evaluate(
             for name in contained
         },
         training=training,  # type: ignore[arg-type]  # validated
-        worth=_worth(fitted, held_out, ours["valid"], valid) if valid else None,
+        worth=worth(fitted.name, held_out, valid.lengths) if valid else None,
         branches=branch_use(fitted.hierarchy, infer(fitted.hierarchy, valid or demos)),
         options=options,
         segments=segments,
@@ -244,16 +241,6 @@ def marginal(spec: Spec, size: Sizes, parts: Mapping[str, Demonstrations]) -> Ma
 def _unseen(demos: Demonstrations) -> Demonstrations:
     """Demonstrations with a constant in place of their observations."""
     return Demonstrations(tuple(replace(one, observations={"nothing": np.zeros((len(one), 1))}) for one in demos))
-
-
-def _worth(fit: Fit, values: Mapping[str, np.ndarray], ours: _Part, valid: Demonstrations) -> Worth | None:
-    """The parts of the hierarchy's advantage on held-out demonstrations; None without a mixture."""
-    found = worth(fit.name, values, valid.lengths)
-    if found is None:
-        return None
-    pairs = zip(ours.segments, _Part.of(fit.baselines[MIXTURE], valid, held_out=True).segments, strict=True)
-    rows = [InARow(options=mean_run(own), mixture=mean_run(mixture)) for own, mixture in pairs]
-    return found.model_copy(update={"steps_in_a_row": rows})
 
 
 def _options(

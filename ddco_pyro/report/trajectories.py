@@ -1,4 +1,4 @@
-"""Which options are active when, as arrays for figures, and trajectories in space coloured by it (SM 1.3, figure B)."""
+"""Which options are active when, and trajectories in space coloured by it (SM 1.3, figure B)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
-from torch import Tensor
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.labels import label_names
@@ -29,33 +28,31 @@ from ddco_pyro.spec import PathSpec
 
 @dataclass(frozen=True)
 class LevelActivity:
-    """One level over N demonstrations of at most T steps, C = 1 + k choices, control first.
+    """One level over N demonstrations.
 
     :param names: the name of each choice, control first.
-    :param active: u_t, the posterior probability of each choice [N, T, C]; 0 past a demonstration's end.
-    :param path: choices of the most likely path [N, T]; -1 past the end.
+    :param paths: choices of the most likely path of each demonstration [T].
     """
 
     name: str
     names: Sequence[str]
-    active: np.ndarray
-    path: np.ndarray
+    paths: Sequence[np.ndarray]
 
     @property
     def choices(self) -> list[int]:
         """The choices that can occur: without control where it is never chosen."""
-        return [choice for choice in range(self.active.shape[2]) if choice or self.active[..., 0].any()]
+        control = any((path == 0).any() for path in self.paths)
+        return [choice for choice in range(len(self.names)) if choice or control]
 
 
 @dataclass(frozen=True)
 class Activity:
-    """All levels, lowest first, over the same demonstrations of ``lengths`` [N] steps.
+    """All levels, lowest first, over the same demonstrations.
 
     :param segmented: their segments, in the order and with the numbers of ``demonstrations_by_likelihood``.
     """
 
     levels: tuple[LevelActivity, ...]
-    lengths: np.ndarray
     segmented: Segmented
 
     @property
@@ -68,23 +65,20 @@ class Activity:
         """The name of each choice, control first: those of all levels, the highest level first."""
         each: dict[int, list[str]] = {}
         for level in reversed(self.levels):
-            for choice in range(level.active.shape[2]):
+            for choice in range(len(level.names)):
                 each.setdefault(choice, []).append(option_name(choice, level.names))
         return [" / ".join(dict.fromkeys(each[choice])) for choice in sorted(each)]
 
 
 def activity(fit: Fit, demos: Demonstrations) -> Activity:
     """The activity of a fit with at least one level."""
-    steps, pieces, segments = max(demos.lengths), [], dict[str, Segments]()
+    paths, segments = [list[np.ndarray]() for _ in fit.names], dict[str, Segments]()
     labels = {demo.name: {name: demo.labels[name] for name in fit.spec.demonstrations.label_names} for demo in demos}
     for piece in fit.infer(demos):
-        arrays = zip(piece.posterior.u, piece.path.choices, strict=True)
-        pieces.append([(_padded(u.float(), steps), _padded(h, steps, -1)) for u, h in arrays])
+        for own, level in zip(paths, piece.path.choices, strict=True):
+            own += [row[:steps].numpy() for row, steps in zip(level, piece.lengths, strict=True)]
         segments |= {demo.name: demo for demo in of_piece(fit, piece, labels, intervals=True)}
-    levels = tuple(
-        LevelActivity(name, names, *map(np.concatenate, zip(*arrays, strict=True)))
-        for (name, names), arrays in zip(fit.names.items(), zip(*pieces, strict=True), strict=True)
-    )
+    levels = tuple(LevelActivity(*named, own) for named, own in zip(fit.names.items(), paths, strict=True))
     rows = {row.name: row for row in fit.metrics.demonstrations_by_likelihood}  # held out, where it trains too
     ordered = [
         replace(segments[name], log_likelihood=row.log_likelihood_per_step[fit.name], held_out=row.part == "valid")
@@ -92,13 +86,7 @@ def activity(fit: Fit, demos: Demonstrations) -> Activity:
         if name in segments
     ]
     segmented = of_run(fit, ordered, demos.frequency, label_names(demos.attributes))
-    return Activity(levels, np.array(demos.lengths), segmented)
-
-
-def _padded(values: Tensor, steps: int, end: float = 0.0) -> np.ndarray:
-    """[N, T', ...] to [N, steps, ...]."""
-    missing = [(0, 0), (0, steps - values.shape[1])] + [(0, 0)] * (values.ndim - 2)
-    return np.pad(values.numpy(), missing, constant_values=end)
+    return Activity(levels, segmented)
 
 
 # --- figure -----------------------------------------------------------------------------------------------------------
@@ -161,7 +149,7 @@ def panel(
     for row in chosen:
         length = places[row].shape[1]
         steps = np.arange(0, length, -(-length // MOST_POINTS))
-        path = level.path[row][steps]
+        path = level.paths[row][steps]
         starts = np.flatnonzero(np.diff(path, prepend=-1))
         for start, end in zip(starts, [*starts[1:], len(steps) - 1], strict=True):
             for number, points in enumerate(places[row]):

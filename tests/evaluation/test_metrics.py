@@ -77,7 +77,7 @@ def test_a_single_held_out_demonstration_has_no_error_and_every_file_is_json(tmp
     read = strictly((tmp_path / "run" / "metrics.json").read_text())
     for metrics in (run.metrics, again.metrics, Metrics.model_validate(read)):
         assert metrics.comparison["flat"].difference.standard_error is None
-    assert "(error unknown) (1 held-out demonstration" in verdicts.verdict(run.metrics)
+    assert "(1 held-out demonstration is too few for an error" in verdicts.verdict(run.metrics)
     page = write_report(run, run.demonstrations).read_text()
     assert "± –" in page
 
