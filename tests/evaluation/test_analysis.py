@@ -117,14 +117,6 @@ def test_a_paired_difference_is_the_ratio_of_sums():
     assert found.nats_per_step == pytest.approx(4 / 10)
 
 
-def test_with_equal_lengths_its_error_is_that_of_the_mean():
-    random = np.random.default_rng(1)
-    difference = random.normal(3, 2, 40)
-    found = paired(difference, np.zeros(40), np.full(40, 7.0))
-    assert found.nats_per_step == pytest.approx(difference.mean() / 7)
-    assert found.standard_error == pytest.approx(difference.std(ddof=1) / math.sqrt(40) / 7)
-
-
 def test_its_error_covers_the_truth_as_often_as_it_says():
     """Repeated draws of demonstrations of unequal length: the spread of the estimate is the standard error."""
     random = np.random.default_rng(2)
