@@ -70,8 +70,8 @@ class EngineCheck(NamedTuple):
 def compare_engines(outputs: Outputs, actions: Tensor, lengths: Tensor) -> EngineCheck:
     """Compare value and gradient of the fused engine with Pyro's enumeration of the program, in float64.
 
-    Gradients are with respect to the networks' outputs. The fused engine eliminates tables; the program scores the
-    controls [N, T, A] by the emissions themselves.
+    Gradients are with respect to the networks' outputs. The fused engine eliminates logits and densities; the program
+    scores the controls [N, T, A] by the emissions themselves.
     """
     controls = actions.double()
 
@@ -79,7 +79,7 @@ def compare_engines(outputs: Outputs, actions: Tensor, lengths: Tensor) -> Engin
         return enumerated(said.tables(controls), lengths, said.emissions, controls)
 
     truth, slopes = _with_gradient(outputs, by_program)
-    value, gradient = _with_gradient(outputs, lambda said: log_likelihood(said.tables(controls), lengths))
+    value, gradient = _with_gradient(outputs, lambda said: log_likelihood(said.logits(controls), lengths))
     return EngineCheck(
         float((value - truth).abs() / truth.abs().clamp(min=1.0)),
         float((gradient - slopes).abs().max() / slopes.abs().max().clamp(min=1.0)),

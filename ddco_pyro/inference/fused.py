@@ -34,13 +34,11 @@ class Eliminate(torch.autograd.Function):
     """Log-likelihoods of tables; the gradient with respect to a log-table is the posterior of its entries."""
 
     @staticmethod
-    def forward(ctx: Any, depth: int, power: float, lengths: Tensor, *leaves: Tensor | None) -> Tensor:
+    def forward(ctx: Any, depth: int, power: float, logits: bool, lengths: Tensor, *leaves: Tensor | None) -> Tensor:
         """log p(ξ), [N]."""
-        tables = Tables.of(depth, leaves, power)
-        found = posteriors(tables, lengths, marginals=any(ctx.needs_input_grad[3 * depth + 4 :]))
-        selection, termination, control = found.tables.selection, found.tables.termination, found.tables.control
-        evidence = found.marginals or tables.evidence
-        ctx.posteriors = *selection, *termination, *(power * acting for acting in control), *evidence
+        tables = Tables.of(depth, leaves, power, logits)
+        found = _eliminated(tables, lengths, any(ctx.needs_input_grad[3 * depth + 5 :]), gradient=True)
+        ctx.gradients = *found.tables.leaves(), *(found.marginals or tables.evidence)
         ctx.save_for_backward(*leaves)
         return found.value
 
@@ -54,13 +52,13 @@ class Eliminate(torch.autograd.Function):
         leaves = ctx.saved_tensors
         with torch.no_grad():
             gradients = [
-                (posterior * upstream.reshape(-1, *(1,) * (posterior.dim() - 1))).to(leaf.dtype) if needed else None
-                for posterior, leaf, needed in zip(ctx.posteriors, leaves, ctx.needs_input_grad[3:], strict=True)
+                (gradient * upstream.reshape(-1, *(1,) * (gradient.dim() - 1))).to(leaf.dtype) if needed else None
+                for gradient, leaf, needed in zip(ctx.gradients, leaves, ctx.needs_input_grad[4:], strict=True)
             ]
         if torch.is_grad_enabled():
             inputs = [part for part in (upstream, *leaves) if part is not None and part.requires_grad]
             gradients = [None if one is None else _Refuse.apply(one, *inputs) for one in gradients]
-        return None, None, None, *gradients
+        return None, None, None, None, *gradients
 
 
 class _Refuse(torch.autograd.Function):
@@ -82,7 +80,7 @@ def log_likelihood(tables: Tables, lengths: Tensor) -> Tensor:
     """log p(ξ), [N] float64, of tables on the CPU."""
     if not tables.depth:
         return logspace.log_likelihood(complete(tables, lengths))  # nothing is latent
-    value: Tensor = Eliminate.apply(tables.depth, tables.power, lengths, *tables.leaves())
+    value: Tensor = Eliminate.apply(tables.depth, tables.power, tables.logits, lengths, *tables.leaves())
     return value
 
 
@@ -91,32 +89,37 @@ def posteriors(tables: Tables, lengths: Tensor, marginals: bool = False) -> Elim
 
     :param marginals: whether those of the choices are wanted, too.
     """
+    return _eliminated(tables, lengths, marginals, gradient=False)
+
+
+def _eliminated(tables: Tables, lengths: Tensor, marginals: bool, gradient: bool) -> Elimination:
+    """The posteriors, or the derivatives of log p(ξ) with respect to the tables' entries."""
     with torch.no_grad():
         number, steps = len(lengths), tables.steps
-        alive = torch.arange(steps) < lengths[:, None]
         if not tables.depth:
+            alive = torch.arange(steps) < lengths[:, None]
             sums = logspace.log_likelihood(complete(tables, lengths))
             return Elimination(sums, Tables((), (), (alive.double().unsqueeze(-1),)), ())
-        structure, rows = Structure.of(tables.sizes), logarithms(tables)
-        shift = torch.zeros(number, dtype=torch.float64)
-        controls = 1 + sum(tables.sizes) - tables.depth
-        for scaled in (rows[..., structure.columns - controls : structure.columns], rows[..., structure.columns :]):
-            shift += _scale(scaled, alive)
-        rows.exp_()
-        columns = structure.columns + (sum(tables.sizes) if marginals else 0)
-        found = torch.zeros(number, steps, columns, dtype=torch.float64)
+        structure, rows = Structure.of(tables.sizes), side_by_side(tables)
+        gains = structure.columns + (sum(tables.sizes) if marginals else 0)
+        found = torch.empty(number, steps, gains, dtype=torch.float64)
         value, exact = np.empty(number), np.empty(number, np.bool_)
-        given = lengths.numpy(), rows.flatten(0, 1).numpy(), found.flatten(0, 1).numpy(), value, exact
+        order = lengths.argsort(stable=True)
+        blocks = np.array([int(lengths[block].sum()) for block in order.split(kernel.LANES)])
+        given = order.numpy(), lengths.numpy(), rows.numpy(), found.numpy(), value, exact
 
         def some(first: int, last: int) -> None:
-            longest, size = int(lengths[first:last].max()), structure.entries
-            room = np.empty((longest + 1, size)), np.empty((longest, size)), np.empty(longest), np.empty(size)
-            kernel.eliminate(first, last, steps, *given, *room, structure.columns, *structure.tables)
+            longest = int(lengths[order[: last * kernel.LANES][-1]])
+            room = kernel.room_for(longest, rows.shape[2], gains, structure.entries)
+            kernel.eliminate(
+                first, last, *given, room, tables.power, tables.logits, gradient, structure.columns, *structure.tables,
+                structure.groups, structure.inert,
+            )  # fmt: skip
 
-        kernel.on_threads(some, given[0])
-        elimination = Elimination(torch.from_numpy(value) + shift, *_split(tables, found, marginals))
+        kernel.on_threads(some, blocks)
+        elimination = Elimination(torch.from_numpy(value), *_split(tables, found, marginals))
     for n in np.flatnonzero(~exact).tolist():
-        _repeat_in_log_space(tables, n, int(lengths[n]), elimination)
+        _repeat_in_log_space(tables, n, int(lengths[n]), elimination, gradient)
     return elimination
 
 
@@ -129,48 +132,44 @@ def predicted(tables: Tables, lengths: Tensor) -> Tensor:
     if not tables.depth:
         return found
     structure = Structure.of(tables.sizes)
-    given = lengths.numpy(), logarithms(tables).flatten(0, 1).numpy(), found.reshape(-1, len(structure.actors)).numpy()
+    given = lengths.numpy(), logarithms(tables).numpy(), found.flatten(2).numpy()
 
     def some(first: int, last: int) -> None:
         longest, size = int(lengths[first:last].max()), structure.entries
         room = np.empty((longest + 1, size)), np.empty((longest, size))
-        kernel.predict(first, last, tables.steps, *given, *room, structure.columns, *structure.tables)
+        kernel.predict(first, last, *given, *room, structure.columns, *structure.tables)
 
     kernel.on_threads(some, given[0])
     return found
 
 
 def logarithms(tables: Tables) -> Tensor:
-    """The tables of all levels side by side, in the columns of :class:`~ddco_pyro.inference.kernel.Structure`."""
-    evidence = tables.joint_evidence()
-    each = [*_side_by_side(tables), *([] if evidence is None else [evidence.flatten(2)])]
-    sizes = [table.shape[2:].numel() for table in each]
-    rows = torch.empty(*each[0].shape[:2], sum(sizes), dtype=torch.float64)
-    for place, table in zip(rows.split(sizes, -1), each, strict=True):
-        place.unflatten(2, table.shape[2:]).copy_(table.detach())
+    """Log-probabilities side by side, in the columns of :class:`~ddco_pyro.inference.kernel.Structure`, float64.
+
+    Densities of controls count β times.
+    """
+    rows = side_by_side(tables.normalised())
     if tables.power != 1:
-        controls = sum(sizes[2 * tables.depth : 3 * tables.depth + 1])
-        rows[..., sum(sizes[: 2 * tables.depth]) :][..., :controls] *= tables.power
+        columns = Structure.of(tables.sizes).columns
+        rows[..., columns - 1 - sum(tables.sizes) + tables.depth : columns] *= tables.power
     return rows
 
 
-def _side_by_side(tables: Tables) -> list[Tensor]:
+def side_by_side(tables: Tables) -> Tensor:
+    """The tables of all levels and the joint evidence as they are, float64 [N, T, columns]."""
+    evidence = tables.joint_evidence()
+    each = [*_in_order(tables), *([] if evidence is None else [evidence])]
+    return torch.cat([table.detach().flatten(2).double() for table in each], -1)
+
+
+def _in_order(tables: Tables) -> list[Tensor]:
     *levels, meta_policy = tables.control
     return [*tables.selection, *tables.termination, meta_policy, *levels]
 
 
-def _scale(logarithms: Tensor, alive: Tensor) -> Tensor | float:
-    """Scale steps so that the largest entry is 0, where it is finite; the sum of the scales of each trajectory, [N]."""
-    if not logarithms.shape[-1]:
-        return 0.0
-    top = logarithms.amax(-1, keepdim=True).nan_to_num_(0.0, 0.0, 0.0)
-    logarithms -= top
-    return (top.squeeze(-1) * alive).sum(1)
-
-
 def _split(tables: Tables, rows: Tensor, marginals: bool) -> tuple[Tables, tuple[Tensor, ...]]:
     """Rows of posteriors as tables in the shapes of these ones, and the marginals of each level."""
-    each = _side_by_side(tables)
+    each = _in_order(tables)
     sizes = [*(table.shape[2:].numel() for table in each), *(tables.sizes if marginals else ())]
     parts = rows.split(sizes, -1)
     shaped = [part.unflatten(2, table.shape[2:]) for part, table in zip(parts, each, strict=False)]
@@ -181,17 +180,18 @@ def _split(tables: Tables, rows: Tensor, marginals: bool) -> tuple[Tables, tuple
     )
 
 
-def _repeat_in_log_space(tables: Tables, n: int, length: int, elimination: Elimination) -> None:
+def _repeat_in_log_space(tables: Tables, n: int, length: int, elimination: Elimination, gradient: bool) -> None:
     """Eliminate a trajectory in log space and write the results into ``elimination``."""
-    alone = tables.trajectory(n, length)
+    alone = tables.trajectory(n, length) if gradient else tables.trajectory(n, length).normalised()
     leaves = [None if leaf is None else leaf.detach().double().requires_grad_() for leaf in alone.leaves()]
     with torch.enable_grad():
-        chain = complete(Tables.of(tables.depth, leaves, tables.power), torch.tensor([length]))
+        chain = complete(Tables.of(tables.depth, leaves, tables.power, alone.logits), torch.tensor([length]))
         value = logspace.log_likelihood(chain)
         assert chain.emission is not None  # log_likelihood has scored it
         needed = [leaf for leaf in leaves[: 3 * tables.depth + 1] if leaf is not None]
         *each, joint = torch.autograd.grad(value.sum(), [*needed, chain.emission], materialize_grads=True)
-    each = [*each[: 2 * tables.depth], *(part / tables.power for part in each[2 * tables.depth :])]
+    if not gradient:
+        each = [*each[: 2 * tables.depth], *(part / tables.power for part in each[2 * tables.depth :])]
     elimination.value[n] = value.detach()[0]
     for into, posterior in zip(elimination.tables.leaves(), each, strict=True):
         assert into is not None

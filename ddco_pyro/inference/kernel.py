@@ -1,14 +1,15 @@
 """The recursions of the AHMM over a trajectory, compiled; O(D·S) a step for S joint choices.
 
-:func:`_predict` and :func:`_act` are the forward recursion in any semiring. :func:`eliminate` runs them over
-probabilities and goes back for the gradient. :func:`trace` runs them over logarithms and goes back along paths.
+:func:`eliminate` goes forward over probabilities and back for the gradient, with :data:`LANES` trajectories side by
+side. :func:`_predict` and :func:`_act` are the same forward recursion over logarithms of one trajectory;
+:func:`trace` goes back from there along paths.
 
 :class:`Structure` numbers joint choices and messages. Row t of ``messages`` [1 + T, M] begins with the forward mass of
 the joint choices at t - 1. Above level 1 the row has the mass that terminated at every level below, at t. Row t of
 ``spread`` [T, M] has the mass that comes down again: the selected mass and the kept mass.
 
-Tables of all levels stand side by side in rows [N·T, columns]: selections, terminations, the meta-policy's control, the
-options' controls, and factors of the joint choices where there is evidence.
+Tables of all levels stand side by side in rows [N, T, columns]: selections, terminations, the meta-policy's control,
+the options' controls, and factors of the joint choices where there is evidence.
 
 All compiled functions are in this file, so that numba's cache, which looks at the file of an entry point, is right.
 Arrays are allocated by callers and indexed in full: numba takes seconds to compile allocations and slices.
@@ -20,11 +21,13 @@ import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numba
 import numpy as np
 import torch
+from llvmlite import ir
+from numba.extending import intrinsic
 
 Array = np.ndarray
 
@@ -35,7 +38,7 @@ TOLERANCE = 1e-9
 """Allowed error of Σ_s α_t(s) β_t(s) = 1. Rounding changes the sum by less than 1e-12 over 10 000 steps."""
 
 ROUNDED = 1e-7
-"""Products of the masses of steps above it are multiplied on, since the logarithm of each takes longer."""
+"""Products of the masses of steps between it and 1 / it are multiplied on: the logarithm of each takes longer."""
 
 SMALL, LARGE = 1e-300, 1e300
 """Mass of a step, and backward messages, beyond which a trajectory is done in log space."""
@@ -58,6 +61,9 @@ class Structure(NamedTuple):
     :param choices: for each joint choice, the columns of its choices in a row of posteriors, which has marginals in
         place of the factors, [S, D].
     :param above: for each message entry below level D + 1, the entry of its caller, [M - 1].
+    :param groups: the first column and the number of columns of each choice that is made: each selection and each
+        termination, whose probabilities sum to 1, and last of the controls, [G, 2].
+    :param inert: the logarithms of a step that keeps every choice, [columns].
     """
 
     columns: int
@@ -65,6 +71,8 @@ class Structure(NamedTuple):
     actors: Array
     choices: Array
     above: Array
+    groups: Array
+    inert: Array
 
     @classmethod
     @cache
@@ -92,7 +100,12 @@ class Structure(NamedTuple):
             above.append(starts[level + 1] + each.repeat(size))
         columns = int(control[-1])
         choices = np.ascontiguousarray(columns + digits + _offsets(sizes)[:-1])
-        return cls(columns, np.concatenate(callers), actors, choices, np.concatenate(above))
+        numbers = [size for size, number in zip(sizes, calling, strict=True) for _ in range(number)]
+        numbers += [2] * sum(size - 1 for size in sizes) + [columns - int(termination[-1])]
+        groups = np.stack([_offsets(numbers)[:-1], numbers], 1)
+        inert = np.full(columns, -np.inf)
+        inert[groups[:-1, 0]] = inert[control[0] :] = 0.0
+        return cls(columns, np.concatenate(callers), actors, choices, np.concatenate(above), groups, inert)
 
     @property
     def entries(self) -> int:
@@ -130,14 +143,297 @@ entry: Callable[[Callable[..., None]], Callable[..., None]] = numba.njit(  # num
     error_model="numpy", fastmath={"contract"}, nogil=True, cache=True
 )
 
-SUM, LOG_SUM, LARGEST = range(3)
-"""Semirings: sums of probabilities; sums, and maxima, of their logarithms."""
+# --- trajectories side by side ---------------------------------------------------------------------------------------
+
+LANES = 8
+"""Trajectories side by side: numbers of one vector instruction."""
+
+ONE, ZERO, POWER, TOTAL, TERM, TOP, PRODUCT, FOUND, LEAST, WORST, FIXED = range(11)
+"""Rows of a room with a meaning of their own."""
+
+
+def lanewise(compute: Callable[..., Any]) -> Callable[[Array, int, int, int], None]:
+    """A compiled ``f(room, out, a, b)`` over rows of :data:`LANES` numbers of a flat array.
+
+    LLVM does not know that rows are apart, and would make no vector instruction of a loop over them.
+    """
+
+    @intrinsic  # type: ignore[untyped-decorator]
+    def over_lanes(typing: Any, room: Any, out: Any, a: Any, b: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
+            vector = ir.VectorType(ir.DoubleType(), LANES)
+            data = context.make_array(room)(context, builder, arguments[0]).data
+            data = builder.bitcast(data, vector.as_pointer())
+            into, *of = [builder.gep(data, [row]) for row in arguments[1:]]
+            values = [builder.load(place, align=8) for place in (into, *of)]
+            builder.store(compute(builder, *values), into, align=8)
+            return context.get_dummy_value()
+
+        return numba.void(room, numba.intp, numba.intp, numba.intp), generate
+
+    return cast(Callable[[Array, int, int, int], None], over_lanes)
+
+
+FUSED = ("contract",)
+multiply = lanewise(lambda make, out, a, b: make.fmul(a, b, FUSED))
+accumulate = lanewise(lambda make, out, a, b: make.fadd(out, make.fmul(a, b, FUSED), FUSED))
+reduce = lanewise(lambda make, out, a, b: make.fsub(out, make.fmul(a, b, FUSED), FUSED))
+add = lanewise(lambda make, out, a, b: make.fadd(a, b, FUSED))
+subtract = lanewise(lambda make, out, a, b: make.fsub(a, b, FUSED))
+divide = lanewise(lambda make, out, a, b: make.fdiv(a, b))
+largest = lanewise(lambda make, out, a, b: make.select(make.fcmp_ordered(">", a, b), a, b))
+smallest = lanewise(lambda make, out, a, b: make.select(make.fcmp_ordered("<", a, b), a, b))
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def _as_float(typing: Any, bits: Any) -> Any:
+    """The float64 with these bits."""
+    return numba.float64(bits), lambda context, builder, _, given: builder.bitcast(given[0], ir.DoubleType())
+
+
+@inner
+def _exponentials(room: Array, first: int, last: int) -> None:
+    """exp of the numbers of some rows, 0 below -708; relative error 2e-16. LLVM makes vector instructions of it."""
+    values = room[LANES * first : LANES * last]
+    for i in range(len(values)):
+        x = values[i]
+        within = min(max(x, -708.0), 708.0)
+        power = math.floor(within * 1.4426950408889634 + 0.5)
+        r = within - power * 6.93147180369123816490e-01 - power * 1.90821492927058770002e-10
+        q = 2.505210838544172e-08
+        q = q * r + 2.755731922398589e-07
+        q = q * r + 2.7557319223985893e-06
+        q = q * r + 2.48015873015873e-05
+        q = q * r + 0.0001984126984126984
+        q = q * r + 0.001388888888888889
+        q = q * r + 0.008333333333333333
+        q = q * r + 0.041666666666666664
+        q = q * r + 0.16666666666666666
+        q = q * r + 0.5
+        q = q * r + 1.0
+        q = q * r + 1.0
+        values[i] = 0.0 if x < -708.0 else q * _as_float((np.int64(power) + 1023) << 52) + (x - x)  # NaN stays NaN
+
+
+@inner
+def _lower(room: Array, first: int, number: int) -> None:
+    """Subtract from some rows the largest of them, where it is finite; it is in :data:`TOP`."""
+    multiply(room, TOP, first, ONE)
+    for c in range(first + 1, first + number):
+        largest(room, TOP, TOP, c)
+    for i in range(LANES * TOP, LANES * TOP + LANES):
+        room[i] = room[i] if abs(room[i]) < np.inf else 0.0
+    for c in range(first, first + number):
+        subtract(room, c, c, TOP)
+
+
+@inner
+def _load(
+    room: Array, p: int, t: int, block: int, order: Array, lengths: Array, rows: Array, logits: bool, powered: bool,
+    columns: int, groups: Array, inert: Array,
+) -> None:  # fmt: skip
+    """Fill the probabilities at step t of a block. Past its end a trajectory keeps every choice."""
+    controls, number = groups[len(groups) - 1, 0], rows.shape[2]
+    for lane in range(LANES):
+        at = block * LANES + lane
+        n = order[min(at, len(order) - 1)]
+        if at < len(order) and t < lengths[n]:
+            for c in range(number):
+                room[LANES * (p + c) + lane] = rows[n, t, c]
+        else:
+            for c in range(number):
+                room[LANES * (p + c) + lane] = inert[c] if c < columns else 0.0
+    for c in range(p + controls, p + columns if powered else 0):
+        multiply(room, c, c, POWER)
+    for g in range(0 if logits else len(groups) - 1, len(groups)):
+        _lower(room, p + groups[g, 0], groups[g, 1])
+    add(room, FOUND, FOUND, TOP)
+    if number > columns:
+        _lower(room, p + columns, number - columns)
+        add(room, FOUND, FOUND, TOP)
+    _exponentials(room, p, p + number)
+    for g in range(len(groups) - 1 if logits else 0):
+        first, last = p + groups[g, 0], p + groups[g, 0] + groups[g, 1]
+        add(room, TOTAL, first, first + 1)
+        for c in range(first + 2, last):
+            add(room, TOTAL, TOTAL, c)
+        divide(room, TERM, ONE, TOTAL)
+        for c in range(first, last):
+            multiply(room, c, c, TERM)
+
+
+@inner
+def _forward(
+    room: Array, p: int, m: int, spread: int, after: int, t: int, weights: int, callers: Array, actors: Array
+) -> None:
+    """Fill the spread mass at t and, not yet scaled, level 1 of the messages ``after``; its sum is :data:`TOTAL`.
+
+    :param p: row of the first probability at t; ``m`` of the first message, ``weights`` of the first factor, or 0.
+    """
+    choices, last = len(actors), len(callers) - 1
+    for i in range(len(callers) if t > 0 else 0):
+        above, below, ends = m + choices + i, m + callers[i, 0], p + callers[i, 3]
+        multiply(room, above, below, ONE)  # choice 0 lasts one step
+        for j in range(1, callers[i, 1]):
+            accumulate(room, above, below + j, ends + 2 * j - 1)
+    multiply(room, spread + choices + last, m + choices + last, ONE)
+    for i in range(last, -1, -1):
+        below, calls, mass = callers[i, 0], callers[i, 2], spread + choices + i
+        multiply(room, spread + below, mass, ONE if calls < 0 else p + calls)
+        for j in range(1, callers[i, 1]):
+            arrived = spread + below + j
+            multiply(room, arrived, mass, ZERO if calls < 0 else p + calls + j)
+            if t > 0 and calls >= 0:
+                accumulate(room, arrived, m + below + j, p + callers[i, 3] + 2 * j - 2)
+    multiply(room, TOTAL, ZERO, ZERO)
+    for s in range(choices):
+        multiply(room, after + s, spread + s, ZERO if actors[s] < 0 else p + actors[s])
+        if weights > 0:
+            multiply(room, after + s, after + s, weights + s)
+        add(room, TOTAL, TOTAL, after + s)
+
+
+@inner
+def _backward(
+    room: Array, p: int, m: int, spread: int, after: int, back: int, gain: int, scale: int, t: int, weights: int,
+    marginals: bool, callers: Array, actors: Array, choices: Array,
+) -> None:  # fmt: skip
+    """Adjoint of :func:`_forward`: ``back`` goes from β_t to β of t - 1. Posteriors are added to ``gain``.
+
+    :data:`TOTAL` is Σ_s α_t(s) β_t(s).
+    """
+    multiply(room, TOTAL, ZERO, ZERO)
+    for s in range(len(actors)):
+        if actors[s] < 0:
+            multiply(room, back + s, ZERO, ZERO)
+            continue
+        multiply(room, TERM, after + s, back + s)
+        add(room, TOTAL, TOTAL, TERM)
+        add(room, gain + actors[s], gain + actors[s], TERM)
+        for d in range(choices.shape[1] if marginals else 0):
+            add(room, gain + choices[s, d], gain + choices[s, d], TERM)
+        multiply(room, back + s, back + s, scale)
+        multiply(room, back + s, back + s, p + actors[s])
+        if weights > 0:
+            multiply(room, back + s, back + s, weights + s)
+    for i in range(len(callers)):
+        below, calls, over = back + callers[i, 0], callers[i, 2], back + len(actors) + i
+        multiply(room, over, below, ONE if calls < 0 else ZERO)
+        for j in range(callers[i, 1] if calls >= 0 else 0):
+            multiply(room, TERM, below + j, p + calls + j)
+            add(room, over, over, TERM)
+            accumulate(room, gain + calls + j, spread + len(actors) + i, TERM)
+    for i in range(len(callers) - 1 if t > 0 else -1, -1, -1):
+        below, ends, over = callers[i, 0], callers[i, 3], back + len(actors) + i
+        multiply(room, back + below, over, ONE)
+        for j in range(1, callers[i, 1]):
+            kept, mass = back + below + j, m + below + j
+            multiply(room, kept, kept, p + ends + 2 * j - 2)
+            multiply(room, TERM, over, p + ends + 2 * j - 1)
+            accumulate(room, gain + ends + 2 * j - 2, mass, kept)
+            accumulate(room, gain + ends + 2 * j - 1, mass, TERM)
+            add(room, kept, kept, TERM)
+
+
+@entry
+def eliminate(
+    first: int, last: int, order: Array, lengths: Array, rows: Array, posterior: Array, value: Array, exact: Array,
+    room: Array, power: float, logits: bool, gradient: bool, columns: int, callers: Array, actors: Array,
+    choices: Array, above: Array, groups: Array, inert: Array,
+) -> None:  # fmt: skip
+    """Of blocks ``first`` to ``last`` of :data:`LANES` trajectories, fill ``value``, ``exact`` and the posteriors.
+
+    Each step is scaled to a mass of 1. Underflow there matters only where the past makes next to impossible what the
+    future demands. Then Σ_s α_t(s) β_t(s) is not 1, and the trajectory is not ``exact``.
+
+    :param order: of the trajectories, [N]; those of a block should be about as long.
+    :param rows: log-probabilities; of selections and terminations logits where ``logits`` says so.
+    :param posterior: or the derivative of log p(ξ) with respect to ``rows``, where ``gradient`` says so.
+    :param value: log p(ξ), [N]; ``exact`` likewise.
+    :param room: of :func:`room_for`.
+    """
+    number, size, gains = rows.shape[2], len(above) + 1, posterior.shape[2]
+    back, gain, begin = FIXED, FIXED + size, FIXED + size + gains
+    stride, controls, marginals = number + 2 * size + 1, groups[len(groups) - 1, 0], gains > columns
+    for i in range(LANES):
+        room[LANES * ONE + i], room[LANES * ZERO + i], room[LANES * POWER + i] = 1.0, 0.0, power
+    for block in range(first, last):
+        longest, many = 0, min(LANES, len(order) - block * LANES)
+        for lane in range(many):
+            longest = max(longest, lengths[order[block * LANES + lane]])
+        multiply(room, FOUND, ZERO, ZERO)
+        multiply(room, WORST, ZERO, ZERO)
+        multiply(room, PRODUCT, ONE, ONE)
+        multiply(room, LEAST, ONE, ONE)
+        for i in range(size):
+            multiply(room, begin + number + i, ZERO if i < size - 1 else ONE, ONE)  # at t = 0 everything is selected
+        for t in range(longest):
+            p = begin + t * stride
+            m, spread, scale, after = p + number, p + number + size, p + stride - 1, p + stride + number
+            weights = p + columns if number > columns else 0
+            _load(room, p, t, block, order, lengths, rows, logits, power != 1.0, columns, groups, inert)
+            _forward(room, p, m, spread, after, t, weights, callers, actors)
+            smallest(room, LEAST, LEAST, TOTAL)
+            multiply(room, PRODUCT, PRODUCT, TOTAL)
+            divide(room, scale, ONE, TOTAL)
+            for s in range(len(actors)):
+                multiply(room, after + s, after + s, scale)
+            for lane in range(LANES):
+                product = room[LANES * PRODUCT + lane]
+                if not ROUNDED < product < 1.0 / ROUNDED:  # logarithms are slow
+                    room[LANES * FOUND + lane] += math.log(product)
+                    room[LANES * PRODUCT + lane] = 1.0
+        for i in range(size):
+            multiply(room, back + i, ONE, ONE)
+        for t in range(longest - 1, -1, -1):
+            p = begin + t * stride
+            m, spread, scale, after = p + number, p + number + size, p + stride - 1, p + stride + number
+            weights = p + columns if number > columns else 0
+            for c in range(gains):
+                multiply(room, gain + c, ZERO, ZERO)
+            _backward(
+                room, p, m, spread, after, back, gain, scale, t, weights, marginals, callers, actors, choices
+            )  # fmt: skip
+            subtract(room, TERM, TOTAL, ONE)
+            accumulate(room, WORST, TERM, TERM)
+            for g in range(len(groups) - 1 if gradient and logits else 0):
+                multiply(room, TOTAL, ZERO, ZERO)
+                for c in range(groups[g, 0], groups[g, 0] + groups[g, 1]):
+                    add(room, TOTAL, TOTAL, gain + c)
+                for c in range(groups[g, 0], groups[g, 0] + groups[g, 1]):
+                    reduce(room, gain + c, TOTAL, p + c)
+            for c in range(controls, columns if gradient else 0):
+                multiply(room, gain + c, gain + c, POWER)
+            for lane in range(many):
+                n = order[block * LANES + lane]
+                for c in range(gains if t < lengths[n] else 0):
+                    posterior[n, t, c] = room[LANES * (gain + c) + lane]
+        for lane in range(many):
+            n, most = order[block * LANES + lane], 0.0
+            for i in range(size):  # an overflow at t = 0 shows nowhere else
+                reached = room[LANES * (back + i) + lane]
+                most = reached if not reached <= most else most  # NaN is not
+            value[n] = room[LANES * FOUND + lane] + math.log(room[LANES * PRODUCT + lane])
+            within = room[LANES * LEAST + lane] >= SMALL and room[LANES * WORST + lane] <= TOLERANCE * TOLERANCE
+            exact[n] = within and most <= LARGE and abs(value[n]) < np.inf
+            for t in range(lengths[n], posterior.shape[1]):
+                for c in range(gains):
+                    posterior[n, t, c] = 0.0
+
+
+def room_for(steps: int, columns: int, gains: int, entries: int) -> Array:
+    """Room for :func:`eliminate` over T steps: rows of a step, and of its posteriors, and M messages."""
+    return np.empty(LANES * (FIXED + entries + gains + (steps + 1) * (columns + 2 * entries + 1)))
+
+
+# --- trajectories alone, in logarithms --------------------------------------------------------------------------------
+
+LOG_SUM, LARGEST = range(2)
+"""Semirings: sums of probabilities, and maxima, both of their logarithms."""
 
 
 @inner
 def _plus(semiring: int, first: float, second: float) -> float:
-    if semiring == SUM:
-        return first + second
     larger, smaller = (first, second) if first >= second else (second, first)
     if semiring == LARGEST or smaller == -np.inf:
         return larger
@@ -145,184 +441,74 @@ def _plus(semiring: int, first: float, second: float) -> float:
 
 
 @inner
-def _times(semiring: int, first: float, second: float) -> float:
-    return first * second if semiring == SUM else first + second
-
-
-@inner
-def _begin(semiring: int, messages: Array) -> None:
+def _begin(messages: Array) -> None:
     """Fill ``messages[0]``: at t = 0 everything is selected."""
     for i in range(messages.shape[1]):
-        messages[0, i] = 0.0 if semiring == SUM else -np.inf
-    messages[0, messages.shape[1] - 1] = 1.0 if semiring == SUM else 0.0
+        messages[0, i] = -np.inf
+    messages[0, messages.shape[1] - 1] = 0.0
 
 
 @inner
 def _predict(
-    semiring: int, t: int, row: int, rows: Array, messages: Array, spread: Array, callers: Array, actors: Array
+    semiring: int, t: int, n: int, rows: Array, messages: Array, spread: Array, callers: Array, actors: Array
 ) -> None:
-    """Fill ``messages[t]`` above level 1 and ``spread[t]``: the mass of each joint choice before the control at t.
-
-    :param row: of the trajectory's step t.
-    """
-    last, zero = len(callers) - 1, 0.0 if semiring == SUM else -np.inf
+    """Fill ``messages[t]`` above level 1 and ``spread[t]``: the mass of each joint choice before the control at t."""
+    last = len(callers) - 1
     if t > 0:
         for i in range(len(callers)):
             below, ends = callers[i, 0], callers[i, 3]
             total = messages[t, below]  # choice 0 lasts one step
             for j in range(1, callers[i, 1]):
-                ended = _times(semiring, messages[t, below + j], rows[row, ends + 2 * j - 1])
-                total = _plus(semiring, total, ended)
+                total = _plus(semiring, total, messages[t, below + j] + rows[n, t, ends + 2 * j - 1])
             messages[t, len(actors) + i] = total
     spread[t, len(actors) + last] = messages[t, len(actors) + last]
     for i in range(last, -1, -1):
         below, calls, ends, mass = callers[i, 0], callers[i, 2], callers[i, 3], spread[t, len(actors) + i]
-        spread[t, below] = mass if calls < 0 else _times(semiring, mass, rows[row, calls])
+        spread[t, below] = mass if calls < 0 else mass + rows[n, t, calls]
         for j in range(1, callers[i, 1]):
-            arrived = zero
+            arrived = -np.inf
             if calls >= 0:
-                arrived = _times(semiring, mass, rows[row, calls + j])
+                arrived = mass + rows[n, t, calls + j]
                 if t > 0:
-                    kept = _times(semiring, messages[t, below + j], rows[row, ends + 2 * j - 2])
-                    arrived = _plus(semiring, arrived, kept)
+                    arrived = _plus(semiring, arrived, messages[t, below + j] + rows[n, t, ends + 2 * j - 2])
             spread[t, below + j] = arrived
 
 
 @inner
 def _act(
-    semiring: int, t: int, row: int, rows: Array, columns: int, messages: Array, spread: Array, actors: Array
+    semiring: int, t: int, n: int, rows: Array, columns: int, messages: Array, spread: Array, actors: Array
 ) -> float:
     """Fill level 1 of ``messages[t + 1]``: the mass of each joint choice and the control at t. Its sum."""
-    zero, weighted = 0.0 if semiring == SUM else -np.inf, rows.shape[1] > columns
-    total = zero
+    total, weighted = -np.inf, rows.shape[2] > columns
     for s in range(len(actors)):
-        mass = zero
+        mass = -np.inf
         if actors[s] >= 0:
-            mass = _times(semiring, spread[t, s], rows[row, actors[s]])
+            mass = spread[t, s] + rows[n, t, actors[s]]
             if weighted:
-                mass = _times(semiring, mass, rows[row, columns + s])
+                mass += rows[n, t, columns + s]
             total = _plus(semiring, total, mass)
         messages[t + 1, s] = mass
     return total
 
 
-@inner
-def _adjoint_act(
-    t: int, row: int, scale: float, rows: Array, columns: int, messages: Array, back: Array, posterior: Array,
-    actors: Array, choices: Array,
-) -> float:  # fmt: skip
-    """Adjoint of :func:`_act`: level 1 of ``back`` goes from β_t to the adjoint of ``spread``. Σ_s α_t(s) β_t(s)."""
-    total, weighted, marginals = 0.0, rows.shape[1] > columns, posterior.shape[1] > columns
-    for s in range(len(actors)):
-        if actors[s] < 0:
-            back[s] = 0.0
-        else:
-            both = messages[t + 1, s] * back[s]
-            total += both
-            posterior[row, actors[s]] += both
-            if marginals:
-                for d in range(choices.shape[1]):
-                    posterior[row, choices[s, d]] += both
-            back[s] *= rows[row, actors[s]] * scale
-            if weighted:
-                back[s] *= rows[row, columns + s]
-    return total
-
-
-@inner
-def _adjoint_predict(
-    t: int, row: int, rows: Array, messages: Array, spread: Array, back: Array, posterior: Array, callers: Array,
-    actors: Array,
-) -> None:  # fmt: skip
-    """Adjoint of :func:`_predict`: ``back`` goes from the adjoint of ``spread[t]`` to β of t - 1."""
-    for i in range(len(callers)):
-        below, calls, mass = callers[i, 0], callers[i, 2], spread[t, len(actors) + i]
-        total = back[below]
-        if calls >= 0:
-            total = 0.0
-            for j in range(callers[i, 1]):
-                term = back[below + j] * rows[row, calls + j]
-                total += term
-                posterior[row, calls + j] += mass * term
-        back[len(actors) + i] = total
-    if t > 0:
-        for i in range(len(callers) - 1, -1, -1):
-            below, ends, over = callers[i, 0], callers[i, 3], back[len(actors) + i]
-            back[below] = over
-            for j in range(1, callers[i, 1]):
-                keeping, ending = ends + 2 * j - 2, ends + 2 * j - 1
-                kept, ended, mass = (
-                    back[below + j] * rows[row, keeping],
-                    over * rows[row, ending],
-                    messages[t, below + j],
-                )
-                posterior[row, keeping] += mass * kept
-                posterior[row, ending] += mass * ended
-                back[below + j] = kept + ended
-
-
-@entry
-def eliminate(
-    first: int, last: int, steps: int, lengths: Array, rows: Array, posterior: Array, value: Array, exact: Array,
-    messages: Array, spread: Array, scales: Array, back: Array, columns: int, callers: Array, actors: Array,
-    choices: Array, above: Array,
-) -> None:  # fmt: skip
-    """Of trajectories ``first`` to ``last``, fill ``value``, ``exact`` and the posteriors, which are 0 before.
-
-    Each step is scaled to a mass of 1. Underflow there matters only where the past makes next to impossible what the
-    future demands. Then Σ_s α_t(s) β_t(s) is not 1, and the trajectory is not ``exact``.
-
-    :param steps: T.
-    :param rows: probabilities.
-    :param value: log p(ξ), [N]; ``exact`` likewise.
-    :param messages: room, as ``spread``, ``scales`` [T] and ``back`` [M].
-    """
-    for n in range(first, last):
-        _begin(SUM, messages)
-        found, product, good = 0.0, 1.0, True
-        for t in range(lengths[n]):
-            row = n * steps + t
-            _predict(SUM, t, row, rows, messages, spread, callers, actors)
-            total = _act(SUM, t, row, rows, columns, messages, spread, actors)
-            good = good and total >= SMALL
-            product *= total
-            if not product > ROUNDED:  # logarithms are slow; NaN is not larger
-                found += math.log(product)
-                product = 1.0
-            scales[t] = 1.0 / total
-            for s in range(len(actors)):
-                messages[t + 1, s] *= scales[t]
-        for i in range(len(back)):
-            back[i] = 1.0
-        for t in range(lengths[n] - 1, -1, -1):
-            row = n * steps + t
-            both = _adjoint_act(t, row, scales[t], rows, columns, messages, back, posterior, actors, choices)
-            good = good and abs(both - 1.0) <= TOLERANCE  # NaN is not
-            _adjoint_predict(t, row, rows, messages, spread, back, posterior, callers, actors)
-        for i in range(len(back)):  # an overflow at t = 0 shows nowhere else
-            good = good and back[i] <= LARGE
-        value[n], exact[n] = found + math.log(product), good
-
-
 @entry
 def predict(
-    first: int, last: int, steps: int, lengths: Array, rows: Array, predicted: Array, messages: Array, spread: Array,
+    first: int, last: int, lengths: Array, rows: Array, predicted: Array, messages: Array, spread: Array,
     columns: int, callers: Array, actors: Array, choices: Array, above: Array,
 ) -> None:  # fmt: skip
-    """Of trajectories ``first`` to ``last``, fill the ``predicted`` log-probabilities [N·T, S] of joint choices before
+    """Of trajectories ``first`` to ``last``, fill the ``predicted`` log-probabilities [N, T, S] of joint choices before
     the control of each step.
 
     :param rows: log-probabilities.
     """
     for n in range(first, last):
-        _begin(LOG_SUM, messages)
+        _begin(messages)
         before = 0.0
         for t in range(lengths[n]):
-            row = n * steps + t
-            _predict(LOG_SUM, t, row, rows, messages, spread, callers, actors)
+            _predict(LOG_SUM, t, n, rows, messages, spread, callers, actors)
             for s in range(len(actors)):
-                predicted[row, s] = spread[t, s] - before
-            before = _act(LOG_SUM, t, row, rows, columns, messages, spread, actors)
+                predicted[n, t, s] = spread[t, s] - before
+            before = _act(LOG_SUM, t, n, rows, columns, messages, spread, actors)
 
 
 @inner
@@ -335,7 +521,7 @@ def _share(semiring: int, part: float, whole: float) -> float:
 
 @inner
 def _back(
-    semiring: int, total: float, m: int, n: int, length: int, steps: int, rows: Array, messages: Array, spread: Array,
+    semiring: int, total: float, m: int, n: int, length: int, rows: Array, messages: Array, spread: Array,
     uniforms: Array, joint: Array, ended: Array, callers: Array, actors: Array, above: Array,
 ) -> None:  # fmt: skip
     """Fill a path from its last step to its first.
@@ -349,13 +535,13 @@ def _back(
             entry = s
             break
     for t in range(length - 1, -1, -1):
-        row, level = n * steps + t, 0
+        level = 0
         joint[m, n, t] = entry
         while entry < len(above):
             i = above[entry] - len(actors)
             j = entry - callers[i, 0]
             if t > 0 and j > 0:
-                kept = messages[t, entry] + rows[row, callers[i, 3] + 2 * j - 2]
+                kept = messages[t, entry] + rows[n, t, callers[i, 3] + 2 * j - 2]
                 if uniforms[m, n, t, level] < _share(semiring, kept, spread[t, entry]):
                     break
             entry = above[entry]
@@ -367,7 +553,7 @@ def _back(
             for j in range(callers[i, 1]):
                 part = messages[t, callers[i, 0] + j]
                 if j > 0:
-                    part += rows[row, callers[i, 3] + 2 * j - 1]
+                    part += rows[n, t, callers[i, 3] + 2 * j - 1]
                 left -= _share(semiring, part, mass)
                 if left < 0:
                     entry = callers[i, 0] + j
@@ -376,7 +562,7 @@ def _back(
 
 @entry
 def trace(
-    first: int, last: int, steps: int, semiring: int, lengths: Array, rows: Array, uniforms: Array, joint: Array,
+    first: int, last: int, semiring: int, lengths: Array, rows: Array, uniforms: Array, joint: Array,
     ended: Array, possible: Array, messages: Array, spread: Array, columns: int, callers: Array, actors: Array,
     choices: Array, above: Array,
 ) -> None:  # fmt: skip
@@ -385,22 +571,20 @@ def trace(
 
     ``possible`` [N] says which trajectories have a probability above 0; nothing is filled for others.
 
-    :param steps: T.
     :param rows: log-probabilities.
     :param uniforms: numbers uniform in [0, 1), [M, N, 1 + T, 2·D]; zeros for the most likely path.
     """
     for n in range(first, last):
-        _begin(semiring, messages)
+        _begin(messages)
         total = -np.inf
         for t in range(lengths[n]):
-            row = n * steps + t
-            _predict(semiring, t, row, rows, messages, spread, callers, actors)
-            total = _act(semiring, t, row, rows, columns, messages, spread, actors)
+            _predict(semiring, t, n, rows, messages, spread, callers, actors)
+            total = _act(semiring, t, n, rows, columns, messages, spread, actors)
         possible[n] = total > -np.inf
         if possible[n]:
             for m in range(len(joint)):
                 _back(
-                    semiring, total, m, n, lengths[n], steps, rows, messages, spread, uniforms, joint, ended, callers,
+                    semiring, total, m, n, lengths[n], rows, messages, spread, uniforms, joint, ended, callers,
                     actors, above,
                 )  # fmt: skip
 

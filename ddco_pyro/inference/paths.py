@@ -90,12 +90,12 @@ def _trace(tables: Tables, lengths: Tensor, semiring: int, uniforms: np.ndarray)
     structure, (samples, number, *_) = Structure.of(tables.sizes), uniforms.shape
     joint, ended = np.full((2, samples, number, tables.steps), -1, dtype=np.int64)
     possible = np.empty(number, dtype=np.bool_)
-    given = lengths.numpy(), logarithms(tables).flatten(0, 1).numpy(), uniforms, joint, ended, possible
+    given = lengths.numpy(), logarithms(tables).numpy(), uniforms, joint, ended, possible
 
     def some(first: int, last: int) -> None:
         longest, size = int(lengths[first:last].max()), structure.entries
         room = np.empty((longest + 1, size)), np.empty((longest, size))
-        kernel.trace(first, last, tables.steps, semiring, *given, *room, structure.columns, *structure.tables)
+        kernel.trace(first, last, semiring, *given, *room, structure.columns, *structure.tables)
 
     kernel.on_threads(some, given[0])
     refuse_impossible(torch.from_numpy(possible))

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import logsigmoid, pad
+from torch.nn.functional import pad
 
 from ddco_pyro.model.emissions import Emission
-from ddco_pyro.model.tables import NEVER, Tables, always_ending
+from ddco_pyro.model.tables import NEVER, Tables, always_ending, normalised
 
 TERMINATION_BOUND = 12.0
 """Termination logits lie within ±12 (ψ between 6e-6 and 1 - 6e-6), so no path's probability is ever exactly 0."""
@@ -19,19 +19,6 @@ TERMINATION_BOUND = 12.0
 def bounded(logits: Tensor) -> Tensor:
     """Termination logits within ±``TERMINATION_BOUND``, by a scaled tanh."""
     return TERMINATION_BOUND * torch.tanh(logits / TERMINATION_BOUND)
-
-
-def log_selection(logits: Tensor, control: int) -> Tensor:
-    """Log-softmax over the last dimension, after ``control`` (0 or 1) impossible choices."""
-    return pad(
-        logits - logits.logsumexp(-1, keepdim=True), (control, 0), value=NEVER
-    )  # log_softmax takes three times as long
-
-
-def log_termination(logits: Tensor) -> Tensor:
-    """(log(1 - ψ), log ψ) [..., 2] of logits, which are bounded first."""
-    within = bounded(logits)
-    return logsigmoid(torch.stack([-within, within], dim=-1))
 
 
 @dataclass(frozen=True)
@@ -59,11 +46,16 @@ class CallerOutputs:
         return self.logits.shape[:-1]
 
     @property
-    def selection(self) -> Tensor:
-        """log η [N, T, K, 1 + k] of callers with options below them."""
+    def choices(self) -> Tensor:
+        """Logits of η [N, T, K, 1 + k] of callers with options below them, -inf where control is impossible."""
         if self.logits is None:
             return pad(torch.zeros(*self.shape, 1), (0, self.options), value=NEVER)
-        return log_selection(self.logits, 1 + self.options - self.logits.shape[-1])
+        return pad(self.logits, (1 + self.options - self.logits.shape[-1], 0), value=NEVER)
+
+    @property
+    def selection(self) -> Tensor:
+        """log η [N, T, K, 1 + k] of callers with options below them."""
+        return normalised(self.choices)
 
     def map(self, change: Callable[[Tensor], Tensor]) -> CallerOutputs:
         """The outputs of changed tensors."""
@@ -104,14 +96,22 @@ class Outputs:
     @property
     def termination(self) -> tuple[Tensor, ...]:
         """(log(1 - ψ), log ψ) of each level, [N, T, k, 2]."""
-        levels = zip(self.callers, self.termination_logits, strict=False)  # the meta-policy has none
-        return tuple(always_ending(level.shape) if logit is None else log_termination(logit) for level, logit in levels)
+        return self.tables().termination
 
     def tables(self, actions: Tensor | None = None) -> Tables:
         """The tables for controls [N, T, A] in scaled units; without them, of selections and terminations alone."""
-        selection = tuple(caller.selection for caller in self.callers if caller.options)
+        return self.logits(actions).normalised()
+
+    def logits(self, actions: Tensor | None = None) -> Tables:
+        """The same tables before selections and terminations are normalised, as the fused engine takes them."""
+        selection = tuple(caller.choices for caller in self.callers if caller.options)
+        levels = zip(self.callers, self.termination_logits, strict=False)  # the meta-policy has none
+        termination = tuple(
+            always_ending(level.shape) if logit is None else pad(bounded(logit).unsqueeze(-1), (1, 0))
+            for level, logit in levels
+        )
         control = () if actions is None else tuple(caller.log_density(actions) for caller in self.callers)
-        return Tables(selection, self.termination, control, power=float(self.power))
+        return Tables(selection, termination, control, power=float(self.power), logits=True)
 
     def tensors(self) -> list[Tensor]:
         """All outputs of the networks, each [N, T, ...]."""

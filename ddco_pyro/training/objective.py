@@ -14,6 +14,7 @@ from ddco_pyro.errors import Failed
 from ddco_pyro.inference.engines import log_likelihood
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.outputs import Outputs
 from ddco_pyro.model.tables import Tables
 from ddco_pyro.training.checkpoint import Progress, State, TrainingData
 from ddco_pyro.training.initialization import WAYS, Given
@@ -108,12 +109,12 @@ class Objective:
             self.constants = fitted(pieces, self.data.seed(self.progress.restart, self.progress.stage))
 
     def tables(self, model: Hierarchy, batch: Batch, rows: Tensor, tuning: bool = False) -> Tables:
-        """The tables of demonstrations, with their known choices.
+        """The tables of demonstrations as logits, with their known choices.
 
         :param rows: of the demonstrations among those to train with, or to tune with, [N].
         """
-        tables = model.tabulate(batch, self.stage.discovering)
-        return self.clamped(tables, rows, tuning)
+        outputs: Outputs = model(batch.inputs, self.stage.discovering)
+        return self.clamped(outputs.logits(batch.actions), rows, tuning)
 
     def clamped(self, tables: Tables, rows: Tensor, tuning: bool = False) -> Tables:
         """The tables with known choices clamped, evidence of the others, and ψ = 1 in a stage that is memoryless."""

@@ -137,7 +137,7 @@ def expected(tables: Tables, lengths: Tensor, constants: Constants) -> Tensor:
     An M-step of the networks maximises their sum. The log-probability is that of selections, and of terminations above
     the lowest level. The expectation is over the posterior of ζ_n given the constants.
     """
-    counts = fused.posteriors(constants.within(tables), lengths).tables
+    counts, tables = fused.posteriors(constants.within(tables), lengths).tables, tables.normalised()
     pairs = [
         *zip(tables.selection, counts.selection, strict=True),
         *zip(tables.termination[1:], counts.termination[1:], strict=True),
