@@ -186,9 +186,12 @@ smallest = lanewise(lambda make, out, a, b: make.select(make.fcmp_ordered("<", a
 
 
 @intrinsic  # type: ignore[untyped-decorator]
-def _as_float(typing: Any, bits: Any) -> Any:
+def as_float(typing: Any, bits: Any) -> Any:
     """The float64 with these bits."""
     return numba.float64(bits), lambda context, builder, _, given: builder.bitcast(given[0], ir.DoubleType())
+
+
+_as_float = cast(Callable[[Any], float], as_float)
 
 
 @inner

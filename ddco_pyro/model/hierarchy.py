@@ -19,6 +19,7 @@ from ddco_pyro.model.batch import STEPS_AT_ONCE, Batch
 from ddco_pyro.model.controls import ControlScaling, ControlStd
 from ddco_pyro.model.encoder import ObservationEncoder, Shapes
 from ddco_pyro.model.networks import Inputs, InputShape, Network, State, States, build, build_trunk, named
+from ddco_pyro.model.networks.perceptrons import linear_maps
 from ddco_pyro.model.networks.probe import training_bytes
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
 from ddco_pyro.model.recogniser import Recogniser
@@ -282,9 +283,10 @@ class Hierarchy(nn.Module):
         inputs, states = inputs.loaded().to(self.device), before or self.initial_states(inputs.batch[0])
         after: dict[str, State] = {}
         raw: list[Tensor] = []
+        linear = linear_maps(self.networks(), inputs)
 
         def run(place: str, network: Network, seen: Inputs | Tensor) -> Tensor:
-            output, after[place] = network(seen, states[place])
+            output, after[place] = (linear[place], ()) if place in linear else network(seen, states[place])
             return output
 
         read = inputs if self.trunk is None else run("trunk", self.trunk, inputs)

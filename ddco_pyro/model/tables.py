@@ -130,8 +130,10 @@ class Tables:
         def cut(tables: Sequence[Tensor | None]) -> Any:
             return tuple(None if table is None else table[n : n + 1, :length] for table in tables)
 
-        parts = (cut(part) for part in (self.selection, self.termination, self.control, self.evidence))
-        return Tables(*parts, power=self.power, logits=self.logits)
+        selection, termination, control, evidence = map(
+            cut, (self.selection, self.termination, self.control, self.evidence)
+        )
+        return Tables(selection, termination, control, evidence, self.power, self.logits)
 
 
 def normalised(logits: Tensor) -> Tensor:

@@ -31,7 +31,7 @@ from ddco_pyro.model.emissions import Emission, Information
 from ddco_pyro.model.hierarchy import Caller, Hierarchy
 from ddco_pyro.model.networks.inputs import Inputs
 from ddco_pyro.model.networks.perceptrons import Mlp, StackedLinear
-from ddco_pyro.model.outputs import TERMINATION_BOUND, CallerOutputs, Outputs, bounded
+from ddco_pyro.model.outputs import TERMINATION_BOUND, CallerOutputs, Outputs
 from ddco_pyro.model.tables import Tables
 from ddco_pyro.spec import RidgeSpec
 
@@ -61,8 +61,7 @@ Score = Callable[[Tables, Batch, Tensor], Tensor]
 def is_linear(model: Hierarchy) -> bool:
     """Whether every network of a hierarchy is linear in the observations, or constant, so that EM applies."""
     return model.trunk is None and all(
-        isinstance(network, Mlp) and network.trunk_size is None and len(network.layers) == 1
-        for network in model.networks().values()
+        isinstance(network, Mlp) and network.is_linear for network in model.networks().values()
     )
 
 
@@ -77,20 +76,33 @@ class Features:
         vectors = (inputs.vectors[name].double() for name in reads)
         self.x = torch.cat([*vectors, torch.ones(*inputs.batch, 1, dtype=torch.float64)], dim=-1)
 
-    def moments(self, weights: Tensor) -> Tensor:
-        """Σ_t h_t x_t x_t^T for each column of weights [N·T, W], none below 0: [W, F, F]."""
+    def outputs(self, weights: Sequence[Tensor]) -> list[Tensor]:
+        """W^T x of networks with weights [K, F, n] each: [N, T, K, n] each."""
+        said = self.x.flatten(0, 1) @ torch.cat([own.transpose(0, 1).flatten(1) for own in weights], 1)
+        parts = said.split([own.shape[0] * own.shape[2] for own in weights], 1)
+        shapes = ((*self.x.shape[:2], own.shape[0], own.shape[2]) for own in weights)
+        return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
+
+    def gradients(self, of: Sequence[Tensor]) -> list[Tensor]:
+        """Σ_t x_t g_t^T of the gradients of the outputs of networks, [N, T, K, n] each: [K, F, n] each."""
+        sums = self.x.flatten(0, 1).T @ torch.cat([own.flatten(0, 1).flatten(1) for own in of], 1)
+        parts = sums.split([own.shape[2:].numel() for own in of], 1)
+        return [part.unflatten(1, own.shape[2:]).transpose(0, 1) for part, own in zip(parts, of, strict=True)]
+
+    def moments(self, weights: Sequence[Tensor]) -> Sequence[Tensor]:
+        """Σ_t h_t x_t x_t^T for each column of weights [N·T, W], none below 0: [W, F, F] each."""
         from ddco_pyro.inference.kernel import products  # and numba and pyro, which not every command needs
 
         features = self.x.shape[-1]
         pairs = np.empty((BLOCK, features * (features + 1) // 2))
-        found = torch.zeros(weights.shape[1], pairs.shape[1], dtype=torch.float64)
-        for rows, own in zip(self.x.flatten(0, 1).split(BLOCK), weights.split(BLOCK), strict=True):
+        found = torch.zeros(sum(own.shape[1] for own in weights), pairs.shape[1], dtype=torch.float64)
+        for rows, own in zip(self.x.flatten(0, 1).split(BLOCK), torch.cat([*weights], 1).split(BLOCK), strict=True):
             products(rows.numpy(), pairs)
             found.addmm_(own.T, torch.from_numpy(pairs[: len(rows)]))
         lower = torch.tril_indices(features, features)
-        whole = found.new_empty(weights.shape[1], features, features)
+        whole = found.new_empty(len(found), features, features)
         whole[:, *lower] = whole[:, *lower.flip(0)] = found
-        return whole
+        return whole.split([own.shape[1] for own in weights])
 
 
 @dataclass
@@ -108,11 +120,10 @@ class Sums:
     information: dict[tuple[int, int], Tensor] = field(default_factory=dict)
     counts: dict[tuple[int, int], Tensor] = field(default_factory=dict)
 
-    def add_gradient(self, x: Tensor, gradient: Tensor, std: Tensor | None) -> None:
-        """Add that of a piece: features x [N, T, F], gradients of outputs [N, T, K, n] and of σ."""
-        own = x.flatten(0, 1).T @ gradient.flatten(2).flatten(0, 1)
-        self.gradient = self.gradient + own.unflatten(1, (gradient.shape[2], -1)).transpose(0, 1)
-        self.std = self.std + (0.0 if std is None else std)
+    def add_gradient(self, gradient: Tensor, std: Tensor | None, power: float) -> None:
+        """Add that of a piece: of W, and of σ where densities count ``power`` times."""
+        self.gradient = self.gradient + gradient
+        self.std = self.std + (0.0 if std is None else std / power)
 
     def add_information(self, group: Information, moments: Tensor) -> None:
         """Add that of a piece from the moments of its weights."""
@@ -136,12 +147,6 @@ class Linear:
         assert isinstance(layer, StackedLinear)
         self.layer, self.ridge, self.trained, self.reads = layer, ridge, trained, tuple(network.reads)
         self.weight = torch.cat([layer.weight.detach(), layer.bias.detach()], dim=1).double().cpu()
-
-    def outputs(self, x: Tensor) -> Tensor:
-        """W^T x, [N, T, K, n]."""
-        copies, features, outputs = self.weight.shape
-        joined = self.weight.transpose(0, 1).reshape(features, copies * outputs)
-        return (x.flatten(0, 1) @ joined).reshape(*x.shape[:2], copies, outputs)
 
     def store(self) -> None:
         """Give the network these weights."""
@@ -321,13 +326,18 @@ class Expectation:
     def _expect_piece(
         self, rows: Tensor, piece: Batch, xs: dict[tuple[str, ...], Features], sums: dict[str, Sums]
     ) -> float:
-        levels = self.model.option_levels()[: self._discovering]
+        """The score of a piece. Its gradient in the log-tables is the posterior, from which gradients in logits follow.
+        torch differentiates the densities alone.
+        """
+        levels, power = self.model.option_levels()[: self._discovering], float(self.model.power)
         said: dict[str, Tensor] = {}
-        for name, network in self._networks.items():
-            if network.reads not in xs:
-                xs[network.reads] = Features(piece.inputs, network.reads)
-            said[name] = network.outputs(xs[network.reads].x).requires_grad_()
+        for reads in dict.fromkeys(network.reads for network in self._networks.values()):
+            if reads not in xs:
+                xs[reads] = Features(piece.inputs, reads)
+            weights = {name: network.weight for name, network in self._networks.items() if network.reads == reads}
+            said |= zip(weights, xs[reads].outputs([*weights.values()]), strict=True)
         stds = {name: std.value.clone().requires_grad_() for name, std in self._stds.items()}
+        emitting = {name: said[name].requires_grad_() for name in stds}
         callers = {
             name: caller(said[name], self.model.scaling, stds.get(name)) for name, caller in self._callers.items()
         }
@@ -337,56 +347,54 @@ class Expectation:
         if self._discovering:
             uniform = torch.zeros(*piece.inputs.batch, 1, levels[-1].count, dtype=torch.float64)
             top = CallerOutputs(levels[-1].count, uniform, None)
-        power = float(self.model.power)
         outputs = Outputs((*(callers[f"{name}.policy"] for name in named), top), tuple(logits), power)
-        tables = outputs.tables(piece.actions)
-        value = self._score(tables, piece, rows)
-        every_leaf = *said.values(), *stds.values(), *tables.leaves()
-        wanted = [leaf for leaf in every_leaf if leaf is not None and leaf.requires_grad]
-        found = dict(zip(map(id, wanted), torch.autograd.grad(value, wanted, allow_unused=True), strict=True))
-        of, of_std = ({name: found[id(leaf)] for name, leaf in leaves.items()} for leaves in (said, stds))
-        chosen, ended, acted = (
-            tuple(found.get(id(table)) for table in group)
-            for group in (tables.selection, tables.termination, tables.control)
-        )
+        said_tables = outputs.logits(piece.actions)
+        tables = said_tables.normalised()
+        leaves = [None if leaf is None else leaf.detach().requires_grad_() for leaf in tables.leaves()]
+        value = self._score(Tables.of(tables.depth, leaves, power), piece, rows)
+        wanted = [leaf for leaf in leaves if leaf is not None]
+        found = torch.autograd.grad(value, wanted, allow_unused=True)
+        chosen, ended, acted = found[: len(levels)], found[len(levels) : 2 * len(levels)], found[2 * len(levels) :]
         every = [*(f"{name}.policy" for name in named), *([] if self._discovering else ["meta_policy"])]
-        choosing = [name for name in every if callers[name].options]
-        selection = dict(zip(choosing, chosen, strict=False))
+        acting = {name: own for name, own in zip(every, acted, strict=False) if name in stds and own is not None}
+        by_name = dict(zip(every, tables.control, strict=False))
+        wanted = [leaf[name] for leaf in (emitting, stds) for name in acting]
+        densities = [by_name[name] for name in acting]
+        slopes = torch.autograd.grad(densities, wanted, [*acting.values()], allow_unused=True) if acting else ()
+        of, of_std = (dict(zip(acting, part, strict=True)) for part in (slopes[: len(acting)], slopes[len(acting) :]))
         learned: dict[str, list[Information]] = {}
-        for place, name in enumerate(every):
-            if name not in sums or of[name] is None:
-                continue
-            caller, groups = self._callers[name], list[Information]()
-            of[name][..., caller.sizes[0] :] /= power  # the M-step of policies is the same whatever the power
-            choices, columns = selection.get(name), slice(0, caller.sizes[0])
-            if caller.sizes[0] and choices is not None:
-                asked = choices.sum(-1).double()
-                groups.append(Information.of_logits(columns, asked, said[name].detach()[..., columns]))
-            acting = acted[place]
-            if caller.std is not None and acting is not None:
-                emission = callers[name].emission
-                assert emission is not None  # it has parameters
-                emission, numbers = emission.map(Tensor.detach), said[name].detach()
-                groups.extend(_emitted(caller, emission, numbers, acting / power, piece.actions))
-            std = of_std.get(name)
-            sums[name].add_gradient(xs[self._networks[name].reads].x, of[name], None if std is None else std / power)
-            learned[name] = groups
-        for prefix, end in zip(named, ended, strict=True):
-            name = f"{prefix}.termination"
-            if name in sums and of[name] is not None and end is not None:
-                within = bounded(said[name].detach())
-                slope = 1 - (within / TERMINATION_BOUND).square()
-                ending = within.sigmoid()
-                weight = end.sum(-1, keepdim=True) * ending * (1 - ending) * slope.square()
-                sums[name].add_gradient(xs[self._networks[name].reads].x, of[name], None)
-                learned[name] = [Information(slice(0, 1), weight)]
-        every_group = [(name, group) for name, groups in learned.items() for group in groups]
-        for reads, x in xs.items():
-            its = [(name, group) for name, group in every_group if self._networks[name].reads == reads]
-            if its:
-                weights = [group.weight.flatten(0, 1).flatten(1) for _, group in its]
-                moments = x.moments(torch.cat(weights, dim=1)).split([each.shape[1] for each in weights])
-                for (name, group), part in zip(its, moments, strict=True):
+        with torch.no_grad():
+            selecting = (name for name in every if callers[name].options)
+            for name, posterior, table in zip(selecting, chosen, tables.selection, strict=False):
+                if name in sums and posterior is not None and self._callers[name].sizes[0]:
+                    asked, p = posterior @ torch.ones(posterior.shape[-1], dtype=torch.float64), table.exp()
+                    columns = slice(0, self._callers[name].sizes[0])
+                    of.setdefault(name, torch.zeros_like(said[name]))
+                    of[name][..., columns] = (posterior - asked.unsqueeze(-1) * p)[..., -columns.stop :]
+                    learned[name] = [Information.of_logits(columns, asked, p[..., -columns.stop :])]
+            for name, own in acting.items():
+                if name in sums:
+                    of[name][..., self._callers[name].sizes[0] :] /= power  # M-steps of policies know no power
+                    emission = callers[name].emission
+                    assert emission is not None  # it has parameters
+                    caller, emission = self._callers[name], emission.map(Tensor.detach)
+                    groups = _emitted(caller, emission, said[name].detach(), own / power, piece.actions)
+                    learned.setdefault(name, []).extend(groups)
+            for prefix, end, logit in zip(named, ended, said_tables.termination, strict=True):
+                name = f"{prefix}.termination"
+                if name in sums and end is not None:
+                    slope, ending = 1 - (logit[..., 1:] / TERMINATION_BOUND).square(), logit[..., 1:].sigmoid()
+                    asked = end[..., :1] + end[..., 1:]
+                    of[name] = (end[..., 1:] - asked * ending) * slope
+                    learned[name] = [Information(slice(0, 1), asked * ending * (1 - ending) * slope.square())]
+            for reads, x in xs.items():
+                its = [name for name in of if name in sums and self._networks[name].reads == reads]
+                gradients = x.gradients([of[name] for name in its])
+                pairs = [(name, group) for name in its for group in learned.get(name, ())]
+                each = [group.weight.flatten(0, 1).flatten(1) for _, group in pairs]
+                for name, gradient in zip(its, gradients, strict=True):
+                    sums[name].add_gradient(gradient, of_std.get(name), power)
+                for (name, group), part in zip(pairs, x.moments(each), strict=True):
                     sums[name].add_information(group, part)
         return float(value.detach())
 

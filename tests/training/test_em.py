@@ -274,7 +274,8 @@ def test_the_information_of_logits_is_at_least_fishers():
     """Its difference to diag(p) - pp^T has no negative eigenvalue; of two choices, no smaller one will do."""
     logits, weight = 3 * torch.randn(4, 6, 2, 5, dtype=torch.float64), torch.rand(4, 6, 2, dtype=torch.float64)
     for some in (logits, logits[..., :2]):
-        p, bound = some.softmax(-1), Information.of_logits(slice(0, 5), weight, some).weight
+        p = some.softmax(-1)
+        bound = Information.of_logits(slice(0, 5), weight, p).weight
         fisher = weight[..., None, None] * (p.diag_embed() - p.unsqueeze(-1) * p.unsqueeze(-2))
         assert torch.linalg.eigvalsh(bound.diag_embed() - fisher).min() > -1e-12
     apart = torch.tensor([1.0, -1.0], dtype=torch.float64)

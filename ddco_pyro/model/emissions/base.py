@@ -67,12 +67,11 @@ class Information:
         return replace(self, columns=columns, std=tuple(place + parameters for place in self.std))
 
     @classmethod
-    def of_logits(cls, columns: slice, weight: Tensor, logits: Tensor) -> Self:
-        """At least that of logits [N, T, K, n] of a choice that is made with this weight, [N, T, K].
+    def of_logits(cls, columns: slice, weight: Tensor, p: Tensor) -> Self:
+        """At least that of logits of a choice with these probabilities, [N, T, K, n], made with a weight [N, T, K].
 
         diag(p) - pp^T is the Laplacian of a graph, and so at most twice its own diagonal.
         """
-        p = logits.softmax(-1)
         return cls(columns, 2 * weight.unsqueeze(-1) * p * (1 - p))
 
 

@@ -60,9 +60,9 @@ class Binary(Emission):
 
     def by_dimension(self, actions: Tensor) -> Tensor:
         """The log-probability of each switch's position, [..., K, A]; -inf for values other than 0 and 1."""
-        actions = actions.unsqueeze(-2)
-        position = logsigmoid(torch.where(actions > 0.5, self.logits, -self.logits))
-        return torch.where((actions == 0) | (actions == 1), position, NEVER)
+        actions = actions.unsqueeze(-2).to(self.logits.dtype)
+        position, known = logsigmoid((2 * actions - 1) * self.logits), (actions == 0) | (actions == 1)
+        return position if bool(known.all()) else torch.where(known, position, NEVER)
 
     @property
     def mode(self) -> Tensor:

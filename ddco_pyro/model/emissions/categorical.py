@@ -61,7 +61,7 @@ class Categorical(Emission):
 
     def information(self, acting: Tensor, actions: Tensor) -> Iterator[Information]:
         """That of the logits."""
-        yield Information.of_logits(slice(0, self.numbers), acting, self.logits)
+        yield Information.of_logits(slice(0, self.numbers), acting, self.logits.softmax(-1))
 
     @property
     def shape(self) -> torch.Size:

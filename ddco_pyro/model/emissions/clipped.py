@@ -35,6 +35,10 @@ class Clipped(Gaussian):
         normal = Gaussian(numbers, parameters[..., : len(part.dims)], log_scale)
         return Clipped(normal.mean, normal.std, log_scale, *ends) if part.bounded else normal
 
+    def log_density(self, actions: Tensor) -> Tensor:
+        """log π(a | s), [..., K]."""
+        return self._summed(self._each(actions))
+
     def _each(self, actions: Tensor) -> Tensor:
         """log N(a_d; μ_d, σ_d²) within the bounds, log Φ of what lies beyond on a bound, [..., K·A]."""
         side = self._repeated((actions <= self.low).float() - (actions >= self.high).float()).flatten()

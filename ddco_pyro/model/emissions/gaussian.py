@@ -59,15 +59,23 @@ class Gaussian(Emission):
 
     def log_density(self, actions: Tensor) -> Tensor:
         """log N(a; μ, σ²), [..., K]."""
+        return -0.5 * self._summed(self._errors(actions).square()) - self._offset().sum(-1).to(self.mean.dtype)
+
+    def _summed(self, each: Tensor) -> Tensor:
+        """[..., K·A] to [..., K]: products with zeros and ones take a fifth of the time of broadcasting."""
         callers, size = self.shape[-2:]
-        return self._each(actions) @ torch.eye(callers, dtype=self.mean.dtype).repeat_interleave(size, 0)
+        return each @ torch.eye(callers, dtype=self.mean.dtype).repeat_interleave(size, 0)
 
     def _each(self, actions: Tensor) -> Tensor:
-        """:meth:`by_dimension`, [..., K·A]: products with zeros and ones take a fifth of the time of broadcasting."""
+        """:meth:`by_dimension`, [..., K·A]."""
         return self._scored(self._errors(actions))
 
     def _scored(self, errors: Tensor) -> Tensor:
-        return -0.5 * errors.square() - self._wide(self.std.log() + self.log_scale + 0.5 * LOG_2PI)
+        return -0.5 * errors.square() - self._wide(self._offset())
+
+    def _offset(self) -> Tensor:
+        """log σ √2π in the control's own units."""
+        return self.std.log() + self.log_scale + 0.5 * LOG_2PI
 
     def _errors(self, actions: Tensor) -> Tensor:
         """(a_d - μ_d) / σ_d, [..., K·A]."""

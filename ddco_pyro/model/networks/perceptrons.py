@@ -180,6 +180,11 @@ class Mlp(Network):
         size = shape.features if isinstance(shape, Network) else shape.vector
         self.layers = Perceptrons(copies, size, hidden, dropout, activation)
 
+    @property
+    def is_linear(self) -> bool:
+        """Whether it is K linear maps of vectors, or of none."""
+        return self.trunk_size is None and len(self.layers) == 1
+
     def forward(self, seen: Inputs | Tensor, state: State = ()) -> tuple[Tensor, State]:
         """[N, T, K, features], and the state."""
         if isinstance(seen, Tensor):
@@ -212,6 +217,24 @@ class Constant(Mlp):
     def numpy_form(self) -> NumpyForm:
         """Perceptrons over no vector."""
         return self.layers.numpy_form(vectors((), self.copies))
+
+
+def linear_maps(networks: Mapping[str, Network], inputs: Inputs) -> dict[str, Tensor]:
+    """What the linear networks among these give, [N, T, K, n]: one product for all that read the same vectors."""
+    readers: dict[tuple[str, ...], dict[str, StackedLinear]] = {}
+    for name, network in networks.items():
+        if isinstance(network, Mlp) and network.is_linear and isinstance(layer := network.layers[0], StackedLinear):
+            readers.setdefault(tuple(network.reads), {})[name] = layer
+    given: dict[str, Tensor] = {}
+    for reads, layers in readers.items():
+        weight = torch.cat([layer.weight.transpose(0, 1).flatten(1) for layer in layers.values()], 1)
+        bias = torch.cat([layer.bias.flatten() for layer in layers.values()])
+        vectors = torch.cat([inputs.vectors[name] for name in reads], -1) if reads else inputs.vector[..., :0]
+        said = torch.addmm(bias, vectors.flatten(0, 1), weight).unflatten(0, inputs.batch)
+        parts = said.split([layer.bias.numel() for layer in layers.values()], -1)
+        for part, (name, layer) in zip(parts, layers.items(), strict=True):
+            given[name] = part.unflatten(-1, (layer.bias.shape[0], layer.bias.shape[2]))
+    return given
 
 
 class PerTimestep(Network):
