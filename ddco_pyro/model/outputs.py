@@ -96,7 +96,7 @@ class Outputs:
     @property
     def termination(self) -> tuple[Tensor, ...]:
         """(log(1 - ψ), log ψ) of each level, [N, T, k, 2]."""
-        return self.tables().termination
+        return Tables((), self._endings, logits=True).normalised().termination
 
     def tables(self, actions: Tensor | None = None) -> Tables:
         """The tables for controls [N, T, A] in scaled units; without them, of selections and terminations alone."""
@@ -105,13 +105,17 @@ class Outputs:
     def logits(self, actions: Tensor | None = None) -> Tables:
         """The same tables before selections and terminations are normalised, as the fused engine takes them."""
         selection = tuple(caller.choices for caller in self.callers if caller.options)
+        control = () if actions is None else tuple(caller.log_density(actions) for caller in self.callers)
+        return Tables(selection, self._endings, control, power=float(self.power), logits=True)
+
+    @property
+    def _endings(self) -> tuple[Tensor, ...]:
+        """Logits of going on and of ending, [N, T, k, 2]."""
         levels = zip(self.callers, self.termination_logits, strict=False)  # the meta-policy has none
-        termination = tuple(
+        return tuple(
             always_ending(level.shape) if logit is None else pad(bounded(logit).unsqueeze(-1), (1, 0))
             for level, logit in levels
         )
-        control = () if actions is None else tuple(caller.log_density(actions) for caller in self.callers)
-        return Tables(selection, termination, control, power=float(self.power), logits=True)
 
     def tensors(self) -> list[Tensor]:
         """All outputs of the networks, each [N, T, ...]."""

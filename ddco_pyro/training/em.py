@@ -49,6 +49,8 @@ TOLERANCE = 1e-5
 """EM has converged where a step gains less, in nats per step of the demonstrations."""
 ROUGHLY = 1e-3
 """The same in a stage whose end is a start alone."""
+MOST = 100_000
+"""The most steps that such a stage learns from, of demonstrations spread evenly over their lengths."""
 BLOCK = 512
 """Steps whose features are multiplied at once: the products stay in the cache."""
 BIAS = 1e-6
@@ -193,6 +195,8 @@ class Expectation:
     :param trained: prefixes of the names of the parameters that change.
     :param score: what is maximised of a piece of the demonstrations.
     :param discovering: d has levels 1 to d alone under a uniform meta-policy.
+    :param roughly: whether the end is a start alone, for which :data:`MOST` steps and :data:`ROUGHLY` are enough.
+    :ivar steps: steps of the demonstrations that are learned from, once the first step has begun.
     :ivar value: the penalised log-likelihood of the weights that the last step began at.
     :ivar gain: the larger gain of the last two steps, nats per step; a stretched one that gains nothing may have gone
         too far.
@@ -206,8 +210,10 @@ class Expectation:
         score: Score,
         ridge: RidgeSpec,
         discovering: int | None = None,
+        roughly: bool = False,
     ) -> None:
         self.model, self._score, self._discovering, self._ridge = model, score, discovering, ridge
+        self._roughly, self.steps = roughly, 0
         levels = {f"levels.{number}.policy": level.policy for number, level in enumerate(model.option_levels())}
         self._callers = {**levels, "meta_policy": model.meta_policy}
         self._networks: dict[str, Linear] = {}
@@ -222,9 +228,10 @@ class Expectation:
         self._pieces: list[tuple[Tensor, Batch, dict[tuple[str, ...], Features]]] = []
         self.value, self.gain, self.stretch, self._last = -math.inf, math.inf, 1.0, math.inf
 
-    def converged(self, roughly: bool = False) -> bool:
+    @property
+    def converged(self) -> bool:
         """Whether each of the last two steps gained less than :data:`TOLERANCE`, or roughly: than :data:`ROUGHLY`."""
-        return self.gain < (ROUGHLY if roughly else TOLERANCE)
+        return self.gain < (ROUGHLY if self._roughly else TOLERANCE)
 
     def objective(self, batch: Batch) -> float:
         """The penalised log-likelihood of all demonstrations, nats."""
@@ -232,7 +239,7 @@ class Expectation:
         return value + self._penalty(sums)
 
     def step(self, batch: Batch) -> float:
-        """One EM step over all demonstrations; their log-likelihood before the step, nats.
+        """One EM step over the demonstrations; their log-likelihood before the step, nats.
 
         All steps are over the same demonstrations, whose features are kept.
         Where the last step lowered the penalised log-likelihood, that step is halved first.
@@ -252,7 +259,7 @@ class Expectation:
             self._restore(self._before)
             value, sums = self._expect(batch)
             penalised = value + self._penalty(sums)
-        gain = (penalised - self.value) / batch.steps
+        gain = (penalised - self.value) / self.steps
         self.gain, self._last = max(gain, self._last), gain
         self.value, self._before = penalised, self._state()
         self.stretch = stretch if gain >= TOLERANCE else 1.0
@@ -316,9 +323,10 @@ class Expectation:
         """The E-step: the score, and the sums that the M-step solves for each network that is trained."""
         total, sums = 0.0, {name: Sums() for name, network in self._networks.items() if network.trained}
         if not self._pieces:
-            order = batch.by_length
-            pieces = batch.select(order).pieces(self.model.steps_at_once)
-            self._pieces = [(order[rows], piece, {}) for rows, piece in pieces]
+            order = batch.by_length[:: math.ceil(batch.steps / MOST) if self._roughly else 1]
+            chosen = batch.select(order)
+            self._pieces = [(order[rows], piece, {}) for rows, piece in chosen.pieces(self.model.steps_at_once)]
+            self.steps = chosen.steps
         for piece in self._pieces:
             total += self._expect_piece(*piece, sums)
         return total, sums

@@ -122,7 +122,8 @@ class StageTraining:
         self.whole: Expectation | QuasiNewton | None = None
         optimizer = optimizer_of(self.spec.optimizer, model)
         if optimizer == "em":
-            self.whole = Expectation(model, stage.trained, self._score, self.spec.optimizer.ridge, stage.discovering)
+            ridge, discovering = self.spec.optimizer.ridge, stage.discovering
+            self.whole = Expectation(model, stage.trained, self._score, ridge, discovering, roughly=not last)
         elif optimizer == "lbfgs":
             self.whole = QuasiNewton(model, self._backward_whole, self.spec.optimizer.weight_decay)
         else:
@@ -149,7 +150,7 @@ class StageTraining:
 
     @property
     def _at_optimum(self) -> bool:
-        return self.whole is not None and self.whole.converged(roughly=not self.last)
+        return self.whole is not None and self.whole.converged
 
     @property
     def _tuned(self) -> bool:
@@ -170,9 +171,10 @@ class StageTraining:
         :param cap: the epochs that the stage may take.
         """
         now, train = self.restart.progress, self.data.train
-        place = now.restart, now.stage, now.epoch
+        place, steps = (now.restart, now.stage, now.epoch), train.steps
         if self.whole is not None:
             total = self.whole.step(train) / self.objective.likelihoods
+            steps = self.whole.steps
         else:
             for group in self.optimizer.param_groups:
                 group["lr"] = learning_rate(self.spec.optimizer, now.epoch, cap)
@@ -184,7 +186,7 @@ class StageTraining:
             self.restart.states["best"] = copy_of(self.kept)
         else:
             now.stale += 1
-        ended = EpochEnded(now.restart, self.stage.name, now.epoch, total / train.steps, tune)
+        ended = EpochEnded(now.restart, self.stage.name, now.epoch, total / steps, tune)
         now.history.append(asdict(ended))
         return ended
 

@@ -5,18 +5,15 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable, Mapping
-from copy import deepcopy
-from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
 
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.networks.perceptrons import Mlp, PerTimestep
 from ddco_pyro.spec import OptimizerSpec
-from ddco_pyro.training.em import is_linear
+from ddco_pyro.training.em import TOLERANCE, is_linear
 
 
 def optimizer_of(spec: OptimizerSpec, model: Hierarchy) -> str:
@@ -92,59 +89,50 @@ HISTORY = 20
 """Pairs of steps and changes of the gradient that L-BFGS keeps."""
 EVALUATIONS = 25
 """The most gradients that a line search takes."""
-NOTHING = 1e-9
-"""L-BFGS has converged where a step gains less, in nats per step of the demonstrations."""
 
 
 class QuasiNewton:
     """L-BFGS (Liu and Nocedal 1989) with a line search for the strong Wolfe conditions, over all demonstrations.
 
-    It works on a copy of the model in float64.
-
     :param backward: adds the gradient of minus the log-likelihood per step; the log-likelihood, nats.
     :param decay: L2 penalty.
-    :ivar gain: what the last step gained, nats per step.
+    :ivar steps: steps of the demonstrations, once the first step has begun.
     """
 
     def __init__(self, model: Hierarchy, backward: Callable[[Hierarchy, Batch], float], decay: float) -> None:
-        self.model, self._backward, self._decay, self.gain = model, backward, decay, math.inf
-        self._exact = deepcopy(model).double()
-        self._parameters = list(self._exact.parameters())
+        self.model, self._backward, self._decay, self.steps = model, backward, decay, 0
+        self._gains = [math.inf]
+        self._parameters = list(model.parameters())
         self._optimizer = _uncompiled(torch.optim.LBFGS)(
             self._parameters, max_iter=1, max_eval=EVALUATIONS, history_size=HISTORY, tolerance_grad=0.0,
             tolerance_change=0.0, line_search_fn="strong_wolfe",
         )  # fmt: skip
-        self._batch: Batch | None = None
         self._evaluated: list[tuple[Tensor, float, float, list[Tensor]]] = []
 
-    def converged(self, roughly: bool = False) -> bool:
-        """Whether the last step gained less than :data:`NOTHING`."""
-        return self.gain < NOTHING
+    @property
+    def converged(self) -> bool:
+        """Whether each of the last two steps gained less than EM's tolerance, in nats per step."""
+        return max(self._gains[-2:]) < TOLERANCE
 
     def step(self, batch: Batch) -> float:
         """One step; the log-likelihood before it, nats."""
-        if self._batch is None:
-            inputs = batch.inputs
-            exact = {name: vector.double() for name, vector in inputs.vectors.items()}
-            self._batch = replace(batch, inputs=Inputs(exact, inputs.images, inputs.time))
-        loss, value = self._evaluate()
-        self._optimizer.step(lambda: self._evaluate()[0])
-        self.gain = loss - self._evaluate()[0]
+        self.steps = batch.steps
+        loss, value = self._evaluate(batch)
+        self._optimizer.step(lambda: self._evaluate(batch)[0])
+        self._gains.append(loss - self._evaluate(batch)[0])
         self._evaluated = self._evaluated[-1:]
-        self.model.load_state_dict(self._exact.state_dict())
         return value
 
-    def _evaluate(self) -> tuple[float, float]:
+    def _evaluate(self, batch: Batch) -> tuple[float, float]:
         """The loss and the log-likelihood, with the gradient in the parameters; nothing is computed twice."""
-        assert self._batch is not None  # a step has begun
         weights = nn.utils.parameters_to_vector(self._parameters).detach()
         evaluation = next((before for before in self._evaluated if torch.equal(before[0], weights)), None)
         if evaluation is None:
             self._optimizer.zero_grad()
             with torch.enable_grad():
-                value = self._backward(self._exact, self._batch)
+                value = self._backward(self.model, batch)
             gradients = [p.grad + self._decay * p.detach() for p in self._parameters if p.grad is not None]
-            loss = 0.5 * self._decay * float(weights @ weights) - value / self._batch.steps
+            loss = 0.5 * self._decay * float(weights @ weights) - value / batch.steps
             evaluation = weights, loss, value, gradients
         self._evaluated = [before for before in self._evaluated if before is not evaluation] + [evaluation]
         for parameter, gradient in zip(self._parameters, evaluation[3], strict=True):

@@ -55,6 +55,8 @@ from ddco_pyro.training.stages import StageEnd, plan, starts_of
 
 SOUNDING, BY_GRADIENT = 5, 50
 """Epochs of the last stage before restarts are compared: of EM, and of gradient steps."""
+LIKELY = 50
+"""Epochs in which EM of a restart is likely to converge."""
 BEHIND = 0.1
 """Nats per step and control dimension by which a restart that is stopped is behind the likeliest."""
 BESIDE = "the mixture beside"
@@ -102,8 +104,10 @@ def train_model(
 
 
 def training_began(spec: Spec, name: str | None = None) -> TrainingBegan:
-    """The event with which the training of a model begins."""
+    """The event with which the training of a model begins, with the epochs that are likely to come."""
     epochs = spec.training.epochs
+    if epochs is not None and spec.hierarchy is not None and spec.training.optimizer.name == "em":
+        epochs = min(epochs, LIKELY)
     return TrainingBegan(name or model_name(spec), None if epochs is None else epochs * len(starts_of(spec)))
 
 
