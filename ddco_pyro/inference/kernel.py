@@ -203,18 +203,11 @@ def _exponentials(room: Array, first: int, last: int) -> None:
         within = min(max(x, -708.0), 708.0)
         power = math.floor(within * 1.4426950408889634 + 0.5)
         r = within - power * 6.93147180369123816490e-01 - power * 1.90821492927058770002e-10
-        q = 2.505210838544172e-08
-        q = q * r + 2.755731922398589e-07
-        q = q * r + 2.7557319223985893e-06
-        q = q * r + 2.48015873015873e-05
-        q = q * r + 0.0001984126984126984
-        q = q * r + 0.001388888888888889
-        q = q * r + 0.008333333333333333
-        q = q * r + 0.041666666666666664
-        q = q * r + 0.16666666666666666
-        q = q * r + 0.5
-        q = q * r + 1.0
-        q = q * r + 1.0
+        q = (
+            ((r * (1 / 39916800) + 1 / 3628800) * r + 1 / 362880) * r + 1 / 40320
+        ) * r + 1 / 5040  # Taylor's series to r^11
+        q = ((((q * r + 1 / 720) * r + 1 / 120) * r + 1 / 24) * r + 1 / 6) * r + 1 / 2
+        q = (q * r + 1.0) * r + 1.0
         values[i] = 0.0 if x < -708.0 else q * _as_float((np.int64(power) + 1023) << 52) + (x - x)  # NaN stays NaN
 
 
@@ -236,7 +229,7 @@ def _load(
     columns: int, groups: Array, inert: Array,
 ) -> None:  # fmt: skip
     """Fill the probabilities at step t of a block. Past its end a trajectory keeps every choice."""
-    controls, number = groups[len(groups) - 1, 0], rows.shape[2]
+    controls, number = groups[-1, 0], rows.shape[2]
     for lane in range(LANES):
         at = block * LANES + lane
         n = order[min(at, len(order) - 1)]
@@ -266,14 +259,15 @@ def _load(
 
 
 @inner
-def _forward(
-    room: Array, p: int, m: int, spread: int, after: int, t: int, weights: int, callers: Array, actors: Array
-) -> None:
-    """Fill the spread mass at t and, not yet scaled, level 1 of the messages ``after``; its sum is :data:`TOTAL`.
+def _forward(room: Array, p: int, number: int, columns: int, t: int, callers: Array, actors: Array) -> None:
+    """Fill the rest of step t and level 1 of the messages after it; their sum before they are scaled is :data:`TOTAL`.
 
-    :param p: row of the first probability at t; ``m`` of the first message, ``weights`` of the first factor, or 0.
+    :param p: row of the first of ``number`` probabilities at t. The messages, the spread mass, and one row for the
+        scale follow.
     """
     choices, last = len(actors), len(callers) - 1
+    m, spread = p + number, p + number + choices + len(callers)
+    after, scale = spread + choices + len(callers) + 1 + number, spread + choices + len(callers)
     for i in range(len(callers) if t > 0 else 0):
         above, below, ends = m + choices + i, m + callers[i, 0], p + callers[i, 3]
         multiply(room, above, below, ONE)  # choice 0 lasts one step
@@ -291,20 +285,29 @@ def _forward(
     multiply(room, TOTAL, ZERO, ZERO)
     for s in range(choices):
         multiply(room, after + s, spread + s, ZERO if actors[s] < 0 else p + actors[s])
-        if weights > 0:
-            multiply(room, after + s, after + s, weights + s)
+        if number > columns:
+            multiply(room, after + s, after + s, p + columns + s)
         add(room, TOTAL, TOTAL, after + s)
+    divide(room, scale, ONE, TOTAL)
+    for s in range(choices):
+        multiply(room, after + s, after + s, scale)
 
 
 @inner
 def _backward(
-    room: Array, p: int, m: int, spread: int, after: int, back: int, gain: int, scale: int, t: int, weights: int,
-    marginals: bool, callers: Array, actors: Array, choices: Array,
+    room: Array, p: int, number: int, columns: int, t: int, gain: int, gains: int, callers: Array, actors: Array,
+    choices: Array,
 ) -> None:  # fmt: skip
-    """Adjoint of :func:`_forward`: ``back`` goes from β_t to β of t - 1. Posteriors are added to ``gain``.
+    """Adjoint of :func:`_forward`: the rows from :data:`FIXED` on go from β_t to β of t - 1. Fill ``gain`` with the
+    posteriors.
 
     :data:`TOTAL` is Σ_s α_t(s) β_t(s).
     """
+    size = len(actors) + len(callers)
+    m, spread, back = p + number, p + number + size, FIXED
+    scale, after = spread + size, spread + size + 1 + number
+    for c in range(gains):
+        multiply(room, gain + c, ZERO, ZERO)
     multiply(room, TOTAL, ZERO, ZERO)
     for s in range(len(actors)):
         if actors[s] < 0:
@@ -313,12 +316,12 @@ def _backward(
         multiply(room, TERM, after + s, back + s)
         add(room, TOTAL, TOTAL, TERM)
         add(room, gain + actors[s], gain + actors[s], TERM)
-        for d in range(choices.shape[1] if marginals else 0):
+        for d in range(choices.shape[1] if gains > columns else 0):
             add(room, gain + choices[s, d], gain + choices[s, d], TERM)
         multiply(room, back + s, back + s, scale)
         multiply(room, back + s, back + s, p + actors[s])
-        if weights > 0:
-            multiply(room, back + s, back + s, weights + s)
+        if number > columns:
+            multiply(room, back + s, back + s, p + columns + s)
     for i in range(len(callers)):
         below, calls, over = back + callers[i, 0], callers[i, 2], back + len(actors) + i
         multiply(room, over, below, ONE if calls < 0 else ZERO)
@@ -356,8 +359,7 @@ def eliminate(
     :param room: of :func:`room_for`.
     """
     number, size, gains = rows.shape[2], len(above) + 1, posterior.shape[2]
-    back, gain, begin = FIXED, FIXED + size, FIXED + size + gains
-    stride, controls, marginals = number + 2 * size + 1, groups[len(groups) - 1, 0], gains > columns
+    gain, begin, stride, controls = FIXED + size, FIXED + size + gains, number + 2 * size + 1, groups[-1, 0]
     for i in range(LANES):
         room[LANES * ONE + i], room[LANES * ZERO + i], room[LANES * POWER + i] = 1.0, 0.0, power
     for block in range(first, last):
@@ -372,31 +374,20 @@ def eliminate(
             multiply(room, begin + number + i, ZERO if i < size - 1 else ONE, ONE)  # at t = 0 everything is selected
         for t in range(longest):
             p = begin + t * stride
-            m, spread, scale, after = p + number, p + number + size, p + stride - 1, p + stride + number
-            weights = p + columns if number > columns else 0
             _load(room, p, t, block, order, lengths, rows, logits, power != 1.0, columns, groups, inert)
-            _forward(room, p, m, spread, after, t, weights, callers, actors)
+            _forward(room, p, number, columns, t, callers, actors)
             smallest(room, LEAST, LEAST, TOTAL)
             multiply(room, PRODUCT, PRODUCT, TOTAL)
-            divide(room, scale, ONE, TOTAL)
-            for s in range(len(actors)):
-                multiply(room, after + s, after + s, scale)
             for lane in range(LANES):
                 product = room[LANES * PRODUCT + lane]
                 if not ROUNDED < product < 1.0 / ROUNDED:  # logarithms are slow
                     room[LANES * FOUND + lane] += math.log(product)
                     room[LANES * PRODUCT + lane] = 1.0
         for i in range(size):
-            multiply(room, back + i, ONE, ONE)
+            multiply(room, FIXED + i, ONE, ONE)
         for t in range(longest - 1, -1, -1):
             p = begin + t * stride
-            m, spread, scale, after = p + number, p + number + size, p + stride - 1, p + stride + number
-            weights = p + columns if number > columns else 0
-            for c in range(gains):
-                multiply(room, gain + c, ZERO, ZERO)
-            _backward(
-                room, p, m, spread, after, back, gain, scale, t, weights, marginals, callers, actors, choices
-            )  # fmt: skip
+            _backward(room, p, number, columns, t, gain, gains, callers, actors, choices)
             subtract(room, TERM, TOTAL, ONE)
             accumulate(room, WORST, TERM, TERM)
             for g in range(len(groups) - 1 if gradient and logits else 0):
@@ -414,7 +405,7 @@ def eliminate(
         for lane in range(many):
             n, most = order[block * LANES + lane], 0.0
             for i in range(size):  # an overflow at t = 0 shows nowhere else
-                reached = room[LANES * (back + i) + lane]
+                reached = room[LANES * (FIXED + i) + lane]
                 most = reached if not reached <= most else most  # NaN is not
             value[n] = room[LANES * FOUND + lane] + math.log(room[LANES * PRODUCT + lane])
             within = room[LANES * LEAST + lane] >= SMALL and room[LANES * WORST + lane] <= TOLERANCE * TOLERANCE

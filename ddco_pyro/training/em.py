@@ -131,9 +131,8 @@ class Sums:
         """Add that of a piece from the moments of its weights."""
         place = group.columns.start, group.columns.stop
         self.information[place] = self.information.get(place, 0.0) + moments.unflatten(0, group.weight.shape[2:])
-        self.counts[place] = self.counts.get(place, 0.0) + (group.weight if group.count is None else group.count).sum(
-            (0, 1)
-        )
+        number = group.weight if group.count is None else group.count
+        self.counts[place] = self.counts.get(place, 0.0) + number.sum((0, 1))
         self.groups[place] = group
 
 
@@ -345,7 +344,8 @@ class Expectation:
             weights = {name: network.weight for name, network in self._networks.items() if network.reads == reads}
             said |= zip(weights, xs[reads].outputs([*weights.values()]), strict=True)
         stds = {name: std.value.clone().requires_grad_() for name, std in self._stds.items()}
-        emitting = {name: said[name].requires_grad_() for name in stds}
+        for name in stds:
+            said[name].requires_grad_()
         callers = {
             name: caller(said[name], self.model.scaling, stds.get(name)) for name, caller in self._callers.items()
         }
@@ -356,18 +356,16 @@ class Expectation:
             uniform = torch.zeros(*piece.inputs.batch, 1, levels[-1].count, dtype=torch.float64)
             top = CallerOutputs(levels[-1].count, uniform, None)
         outputs = Outputs((*(callers[f"{name}.policy"] for name in named), top), tuple(logits), power)
-        said_tables = outputs.logits(piece.actions)
-        tables = said_tables.normalised()
+        before = outputs.logits(piece.actions)
+        tables = before.normalised()
         leaves = [None if leaf is None else leaf.detach().requires_grad_() for leaf in tables.leaves()]
         value = self._score(Tables.of(tables.depth, leaves, power), piece, rows)
-        wanted = [leaf for leaf in leaves if leaf is not None]
-        found = torch.autograd.grad(value, wanted, allow_unused=True)
+        found = torch.autograd.grad(value, [leaf for leaf in leaves if leaf is not None], allow_unused=True)
         chosen, ended, acted = found[: len(levels)], found[len(levels) : 2 * len(levels)], found[2 * len(levels) :]
         every = [*(f"{name}.policy" for name in named), *([] if self._discovering else ["meta_policy"])]
         acting = {name: own for name, own in zip(every, acted, strict=False) if name in stds and own is not None}
-        by_name = dict(zip(every, tables.control, strict=False))
-        wanted = [leaf[name] for leaf in (emitting, stds) for name in acting]
-        densities = [by_name[name] for name in acting]
+        densities = [table for name, table in zip(every, tables.control, strict=False) if name in acting]
+        wanted = [leaf[name] for leaf in (said, stds) for name in acting]
         slopes = torch.autograd.grad(densities, wanted, [*acting.values()], allow_unused=True) if acting else ()
         of, of_std = (dict(zip(acting, part, strict=True)) for part in (slopes[: len(acting)], slopes[len(acting) :]))
         learned: dict[str, list[Information]] = {}
@@ -388,7 +386,7 @@ class Expectation:
                     caller, emission = self._callers[name], emission.map(Tensor.detach)
                     groups = _emitted(caller, emission, said[name].detach(), own / power, piece.actions)
                     learned.setdefault(name, []).extend(groups)
-            for prefix, end, logit in zip(named, ended, said_tables.termination, strict=True):
+            for prefix, end, logit in zip(named, ended, before.termination, strict=True):
                 name = f"{prefix}.termination"
                 if name in sums and end is not None:
                     slope, ending = 1 - (logit[..., 1:] / TERMINATION_BOUND).square(), logit[..., 1:].sigmoid()
