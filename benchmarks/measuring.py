@@ -14,7 +14,7 @@ TURN = 0.02
 class Row(NamedTuple):
     """Two measurements and their ratio.
 
-    :param ratio: of the first over the second: the median over pairs that ran one right after the other.
+    :param ratio: of the first over the second.
     """
 
     first: str
@@ -40,9 +40,9 @@ def side_by_side(
     clock: Callable[[], float] = time.process_time,
     warm: bool = True,
 ) -> Row:
-    """Both calls in turns, after each has run once. ``warm`` says whether the first call needs that.
+    """The least times of both calls in turns, after each has run once. ``warm`` says whether the first needs that.
 
-    A turn repeats a short call for :data:`TURN` seconds.
+    A turn repeats a short call for :data:`TURN` seconds. Other processes only add to a time, so minima are compared.
     """
     if warm:
         first()
@@ -52,11 +52,12 @@ def side_by_side(
     def turn(call: Callable[[], object], times: int) -> float:
         return 1e3 / times * seconds(lambda: [call() for _ in range(times)], clock)
 
-    return of_pairs(names, [(turn(*calls[0]), turn(*calls[1])) for _ in range(rounds)])
+    value, other = map(min, zip(*((turn(*calls[0]), turn(*calls[1])) for _ in range(rounds)), strict=True))
+    return Row(*names, value, other, value / other)
 
 
 def of_pairs(names: tuple[str, str], pairs: Iterable[tuple[float, float]], unit: str = "ms") -> Row:
-    """The row of measured pairs."""
+    """The row of measured pairs: medians, and the median of the pairs' ratios."""
     each = list(pairs)
     value, other = (statistics.median(column) for column in zip(*each, strict=True))
     return Row(*names, value, other, statistics.median(one / two for one, two in each), unit)

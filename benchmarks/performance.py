@@ -1,6 +1,6 @@
 """What fits, gradient steps and exact inference cost: ``python benchmarks/performance.py [PART ...]``.
 
-Each part measures pairs that run one right after the other, on one thread. A part's rows go to
+Each part measures pairs that run one right after the other, on one thread and one core. A part's rows go to
 ``benchmarks/results/PART.json`` as soon as they are known, all tables into ``docs/performance.md``, and all ratios into
 ``docs/results/performance.csv``, which pages quote. Parts that are not named are measured unless their result is what
 this very code has given: an interrupted run goes on.
@@ -52,19 +52,29 @@ SIZES = ((100, 15), (50, 200), (50, 2000))
 FEATURES, CONTROLS = 10, 3
 EMISSIONS = ("gaussian", "clipped", "binary")
 
+SECOND, GIGABYTE = "one second", "1000 MiB"
+LARGE = 100, 1500, 14
+CORES = os.sched_getaffinity(0)
+
 AIMS = {
-    "step mlp gaussian 50 × 2000 / networks": ("≤", 1.10),
-    "step linear gaussian 50 × 2000 / networks": ("≤", 2.0),
-    "step linear clipped 50 × 2000 / networks": ("≤", 3.0),
+    "step mlp gaussian 50 × 200 / networks": ("≤", 1.15),
+    "step linear gaussian 50 × 200 / networks": ("≤", 2.3),
+    "step linear clipped 50 × 200 / networks": ("≤", 3.2),
+    "step linear binary 50 × 200 / networks": ("≤", 2.3),
     "Pyro enumeration step 100 × 15 / step": ("≥", 5.0),
     "Pyro enumeration step 50 × 2000 / step": ("≥", 20.0),
     "Pyro enumeration 50 × 2000 / pass": ("≥", 1000.0),
-    "dynamax smoother 50 × 2000 / pass": ("≥", 5.0),
+    "dynamax smoother 100 × 15 / pass": ("≥", 1.0),
+    "dynamax smoother 50 × 200 / pass": ("≥", 1.4),
+    "dynamax smoother 50 × 2000 / pass": ("≥", 1.8),
+    "dynamax EM iteration 50 × 200 / EM iteration": ("≥", 0.8),
     "Pyro DiscreteHMM 50 × 2000 / pass": ("≥", 20.0),
     "4000 steps / 2000 steps": ("≤", 2.1),
     "20 options / 5 options": ("≤", 4.5),
     "most likely path, 3 levels / gradient step": ("≤", 1.0),
-    "pass, one thread / all threads": ("≥", 1.7),
+    "pass, one thread / all threads": ("≥", 1.6),
+    f"init and fit 100 × 1500 × 14, CPU / {SECOND}": ("≤", 90.0),
+    f"init and fit 100 × 1500 × 14, peak memory / {GIGABYTE}": ("≤", 1.0),
     "step mlp / networks": ("≤", 1.5),
     **pictures.AIMS,
 }
@@ -132,7 +142,9 @@ def step(
 
 def by_engine(hierarchy: Hierarchy, engine: Engine = "fused") -> Callable[[Batch], torch.Tensor]:
     """The loss of training."""
-    return lambda piece: -log_likelihood(hierarchy.tabulate(piece), piece.lengths, engine).sum() / piece.steps
+    return lambda piece: (
+        -log_likelihood(hierarchy(piece.inputs).logits(piece.actions), piece.lengths, engine).sum() / piece.steps
+    )
 
 
 def by_funsor(hierarchy: Hierarchy) -> Callable[[Batch], torch.Tensor]:
@@ -228,7 +240,8 @@ def growth() -> Iterator[Row]:
 
 def threads() -> Iterator[Row]:
     """Our pass on one thread over that on all."""
-    ours, every = kernel(*tables_of(50, 2000)), os.cpu_count() or 1
+    os.sched_setaffinity(0, CORES)
+    ours, every = kernel(*tables_of(50, 2000)), len(CORES)
 
     def on(number: int) -> None:
         torch.set_num_threads(number)
@@ -236,6 +249,7 @@ def threads() -> Iterator[Row]:
 
     yield side_by_side(("pass, one thread", "all threads"), partial(on, 1), partial(on, every), 15, time.perf_counter)
     torch.set_num_threads(1)
+    os.sched_setaffinity(0, {max(CORES)})
 
 
 # --- memory -----------------------------------------------------------------------------------------------------------
@@ -317,21 +331,22 @@ def initial_spec(folder: Path) -> Path:
     """What ``init`` writes for the demonstrations of ``$DEMONSTRATIONS``, or for made-up ones of their size."""
     path, spec = Path(os.environ.get("DEMONSTRATIONS", folder / "made.hdf5")).resolve(), folder / "init.yaml"
     if not path.exists():
-        random = np.random.default_rng(0)
-        with h5py.File(path, "w") as file:
-            for number in range(50):
-                state = random.normal(size=(60, 12)).cumsum(0) / 8
-                kind = np.repeat(np.arange(4), 15)
-                controls = np.einsum("tf,tfa->ta", state, GAINS[kind])
-                group = file.create_group(f"data/demo_{number}")
-                group["obs/state"] = state
-                group["actions"] = (controls + 0.1 * random.normal(size=controls.shape)).clip(-1, 1)
+        made(path)
     subprocess.run([COMMAND, "init", path, "--out", spec], check=True, capture_output=True)
     return spec
 
 
-GAINS = np.random.default_rng(1).normal(size=(4, 12, 4), scale=0.5)
-"""Of each of four skills in made-up demonstrations."""
+def made(path: Path, number: int = 50, steps: int = 60, controls: int = 4) -> None:
+    """Write made-up demonstrations of four skills of equal length, each a linear policy."""
+    gains = np.random.default_rng(1).normal(size=(4, 12, controls), scale=0.5)
+    random = np.random.default_rng(0)
+    with h5py.File(path, "w") as file:
+        for demo in range(number):
+            state = random.normal(size=(steps, 12)).cumsum(0) / 8
+            mean = np.einsum("tf,tfa->ta", state, gains[np.repeat(np.arange(4), steps // 4)])
+            group = file.create_group(f"data/demo_{demo}")
+            group["obs/state"] = state
+            group["actions"] = (mean + 0.1 * random.normal(size=mean.shape)).clip(-1, 1)
 
 
 def fits() -> Iterator[Row]:
@@ -369,10 +384,27 @@ def _fit(spec: Path, folder: Path, cache: str) -> tuple[float, float]:
     return wall, sum(after[2:4]) - sum(before[2:4])
 
 
+def large() -> Iterator[Row]:
+    """``init`` and ``fit`` from the shell of as much as a robot with two arms records, with three baselines."""
+    with tempfile.TemporaryDirectory() as name:
+        path, spec = Path(name) / "made.hdf5", Path(name) / "init.yaml"
+        made(path, *LARGE)
+        cpu, peak = 0.0, 0.0
+        for arguments in (["init", path, "--out", spec], ["fit", spec, "--out", Path(name) / "run"]):
+            child = subprocess.Popen([COMMAND, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+            _, status, used = os.wait4(child.pid, 0)
+            assert status == 0
+            cpu, peak = cpu + used.ru_utime + used.ru_stime, max(peak, used.ru_maxrss / 1024)
+        what = "init and fit {} × {} × {}".format(*LARGE)
+        yield of_pairs((f"{what}, CPU", SECOND), [(cpu, 1.0)], "s")
+        yield of_pairs((f"{what}, peak memory", GIGABYTE), [(peak, 1000.0)], "MiB")
+
+
 # --- all parts --------------------------------------------------------------------------------------------------------
 
 PARTS: dict[str, Callable[[], Iterator[Row]]] = {
     "fits": fits,
+    "large": large,
     "em": em,
     "networks": over_networks,
     "engines": over_other_engines,
@@ -436,6 +468,7 @@ def main() -> None:
         return
     if unknown := ", ".join(part for part in asked.parts if part not in PARTS):
         parser.error(f"there is no part {unknown}; there are: {', '.join(PARTS)}")
+    os.sched_setaffinity(0, {max(CORES)})
     for part in asked.parts or PARTS:
         measure(part, again=bool(asked.parts))
     above, _, rest = PAGE.read_text().partition(BEGIN)
