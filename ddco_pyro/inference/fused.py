@@ -6,6 +6,7 @@ in log space. torch computes the tables from the networks' outputs, and takes th
 
 from __future__ import annotations
 
+from functools import reduce
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,11 +24,13 @@ class Elimination(NamedTuple):
     :param value: log p(ξ), [N].
     :param tables: the posterior of each table's entries, in the tables' shapes; without evidence.
     :param marginals: of the choices of each level, [N, T, C_d]; empty where they are not wanted.
+    :param rows: tables and marginals side by side, [N, T, columns].
     """
 
     value: Tensor
     tables: Tables
     marginals: tuple[Tensor, ...]
+    rows: Tensor
 
 
 class Eliminate(torch.autograd.Function):
@@ -38,7 +41,7 @@ class Eliminate(torch.autograd.Function):
         """log p(ξ), [N]."""
         tables = Tables.of(depth, leaves, power, logits)
         found = _eliminated(tables, lengths, any(ctx.needs_input_grad[3 * depth + 5 :]), gradient=True)
-        ctx.gradients = *found.tables.leaves(), *(found.marginals or tables.evidence)
+        ctx.rows, ctx.depth = found.rows, depth
         ctx.save_for_backward(*leaves)
         return found.value
 
@@ -49,11 +52,16 @@ class Eliminate(torch.autograd.Function):
         torch's ``once_differentiable`` refuses a second derivative only where ``upstream`` requires a gradient.
         With respect to the tables it would silently be 0, so each gradient passes through :class:`_Refuse`.
         """
-        leaves = ctx.saved_tensors
+        leaves, needed = ctx.saved_tensors, ctx.needs_input_grad[4:]
         with torch.no_grad():
+            tables = Tables.of(ctx.depth, leaves)
+            widest = reduce(torch.promote_types, (leaf.dtype for leaf in leaves if leaf is not None))
+            rows = (ctx.rows * upstream.reshape(-1, 1, 1)).to(widest)
+            parts, marginals = _split(tables, rows, any(needed[3 * ctx.depth + 1 :]))
+            each = *parts.leaves(), *(marginals or tables.evidence)
             gradients = [
-                (gradient * upstream.reshape(-1, *(1,) * (gradient.dim() - 1))).to(leaf.dtype) if needed else None
-                for gradient, leaf, needed in zip(ctx.gradients, leaves, ctx.needs_input_grad[4:], strict=True)
+                part.to(leaf.dtype) if want and part is not None else None
+                for part, leaf, want in zip(each, leaves, needed, strict=True)
             ]
         if torch.is_grad_enabled():
             inputs = [part for part in (upstream, *leaves) if part is not None and part.requires_grad]
@@ -99,7 +107,8 @@ def _eliminated(tables: Tables, lengths: Tensor, marginals: bool, gradient: bool
         if not tables.depth:
             alive = torch.arange(steps) < lengths[:, None]
             sums = logspace.log_likelihood(complete(tables, lengths))
-            return Elimination(sums, Tables((), (), (alive.double().unsqueeze(-1),)), ())
+            acting = alive.double().unsqueeze(-1)
+            return Elimination(sums, Tables((), (), (acting,)), (), acting)
         structure, rows = Structure.of(tables.sizes), side_by_side(tables)
         gains = structure.columns + (sum(tables.sizes) if marginals else 0)
         found = torch.empty(number, steps, gains, dtype=torch.float64)
@@ -117,7 +126,7 @@ def _eliminated(tables: Tables, lengths: Tensor, marginals: bool, gradient: bool
             )  # fmt: skip
 
         kernel.on_threads(some, blocks)
-        elimination = Elimination(torch.from_numpy(value), *_split(tables, found, marginals))
+        elimination = Elimination(torch.from_numpy(value), *_split(tables, found, marginals), found)
     for n in np.flatnonzero(~exact).tolist():
         _repeat_in_log_space(tables, n, int(lengths[n]), elimination, gradient)
     return elimination
@@ -159,7 +168,7 @@ def side_by_side(tables: Tables) -> Tensor:
     """The tables of all levels and the joint evidence as they are, float64 [N, T, columns]."""
     evidence = tables.joint_evidence()
     each = [*_in_order(tables), *([] if evidence is None else [evidence])]
-    return torch.cat([table.detach().flatten(2).double() for table in each], -1)
+    return torch.cat([table.detach().flatten(2) for table in each], -1).double()
 
 
 def _in_order(tables: Tables) -> list[Tensor]:
