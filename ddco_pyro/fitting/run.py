@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -15,7 +14,7 @@ from ddco_pyro.data.controls import ControlPart
 from ddco_pyro.data.files import Damaged, leftovers, only_one, write_text
 from ddco_pyro.data.tensors import read_tensors, write_tensors
 from ddco_pyro.errors import BadInput
-from ddco_pyro.metrics import refit, write_table
+from ddco_pyro.metrics import refit
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec, SpecError, dump_spec, load_spec
 from ddco_pyro.training.checkpoint import copy_of
@@ -78,11 +77,6 @@ def is_finished(folder: Path) -> bool:
     return all((folder / name).exists() for name in ("model.safetensors", "metrics.json"))
 
 
-def has_model(folder: Path) -> bool:
-    """Whether a trained model is in the folder."""
-    return (folder / "model.safetensors").exists()
-
-
 def write_model(folder: Path, hierarchy: Hierarchy) -> None:
     """Write ``model.safetensors``."""
     metadata = {
@@ -118,11 +112,6 @@ def read_model(folder: Path, spec: Spec) -> Hierarchy:
     except (KeyError, ValueError, RuntimeError) as error:
         raise RunError(f"{path}: is of another spec than spec.yaml; {remedy}") from error
     return hierarchy.eval()
-
-
-def write_history(folder: Path, rows: Sequence[dict[str, Any]]) -> None:
-    """Write ``history.csv``: a row for each epoch of each restart."""
-    write_table(folder / "history.csv", ("restart", "stage", "epoch", "train", "tune"), rows)
 
 
 class Clock:

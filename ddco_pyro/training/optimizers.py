@@ -106,7 +106,7 @@ class QuasiNewton:
     :ivar gain: what the last step gained, nats per step.
     """
 
-    def __init__(self, model: Hierarchy, backward: Callable[[Hierarchy, Batch], float], decay: float) -> None:
+    def __init__(self, model: Hierarchy, backward: Callable[[Hierarchy, Batch, Tensor], float], decay: float) -> None:
         self.model, self._backward, self._decay, self.gain = model, backward, decay, math.inf
         self._exact = deepcopy(model).double()
         self._parameters = list(self._exact.parameters())
@@ -142,7 +142,7 @@ class QuasiNewton:
         if evaluation is None:
             self._optimizer.zero_grad()
             with torch.enable_grad():
-                value = self._backward(self._exact, self._batch)
+                value = self._backward(self._exact, self._batch, self._batch.by_length)
             gradients = [p.grad + self._decay * p.detach() for p in self._parameters if p.grad is not None]
             loss = 0.5 * self._decay * float(weights @ weights) - value / self._batch.steps
             evaluation = weights, loss, value, gradients
