@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import torch
@@ -49,8 +49,10 @@ def claim(folder: Path, spec: Spec, resume: bool = True) -> None:
     """
     text, path = dump_spec(spec), folder / "spec.yaml"
     if path.exists():
-        same = path.read_bytes() == text.encode()
-        if not same and not _is_of(spec, path):
+        same = same_model = path.read_bytes() == text.encode()
+        with suppress(SpecError):  # user code is not imported by reading its name
+            same_model = same or load_spec(path, allow_code=True).model_copy(update={"report": spec.report}) == spec
+        if not same_model:
             raise RunError(f"{folder}: holds a run of another spec; choose another --out or remove it")
         if not resume and is_finished(folder) and (folder / "report.html").exists():  # what `fit` writes last
             raise RunError(
@@ -61,15 +63,6 @@ def claim(folder: Path, spec: Spec, resume: bool = True) -> None:
     elif folder.exists() and set(folder.iterdir()) - set(leftovers(folder)):
         raise RunError(f"{folder}: is not empty and not a run; choose another --out")
     write_text(path, text)
-
-
-def _is_of(spec: Spec, path: Path) -> bool:
-    """Whether a spec differs from that in a file in its ``report`` at most."""
-    try:
-        other = load_spec(path, allow_code=True)  # which imports nothing
-    except SpecError:
-        return False
-    return other.model_copy(update={"report": spec.report}) == spec
 
 
 def is_finished(folder: Path) -> bool:

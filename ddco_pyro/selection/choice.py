@@ -121,7 +121,7 @@ class Choice:
         """
         best = self.best
         for path, own in best.candidate.values.items() if best else ():
-            values = {row.candidate.values[path] for row in self.rows if _is_number(row.candidate.values[path])}
+            values = {value for row in self.rows if type(value := row.candidate.values[path]) in (int, float)}
             count = path.endswith(".count")
             if len(values) < 2 or own not in (min(values), max(values)) or (count and own == 1):
                 continue
@@ -131,10 +131,6 @@ class Choice:
                 f"{point_name({path: own})} is the best, and the {which} of the grid: the likelihood is still rising "
                 f"there, so extend the grid (selection.grid.{path}){skills}"
             )
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def choose(candidates: Sequence[Candidate], fits: Mapping[tuple[int, int], Metrics | str]) -> Choice:

@@ -60,7 +60,7 @@ class Objective:
         self.known: tuple[Known, Known] = {}, {}
         self.evidence: tuple[Known, Known] = {}, {}
         labels = data.labels
-        if labels is not None and labels.matter_in(stage):
+        if labels is not None and (stage.discovering is None or labels.level <= stage.discovering):
             self.known = {labels.level: labels.train}, {labels.level: labels.tune}
             if labels.evidence is not None:
                 self.evidence = {labels.level: labels.evidence[0]}, {labels.level: labels.evidence[1]}
