@@ -113,17 +113,16 @@ def recorded(folder: Path) -> Digest | None:
     return kept
 
 
-def record(folder: Path, demos: Demonstrations) -> None:
+def record(folder: Path, demos: Demonstrations, known: Digest | None = None) -> None:
     """Write the digest of demonstrations into a new run folder, or compare it with the folder's.
 
-    Pictures that a run knows are not read again for the baselines, folds and seeds within its folder.
-
+    :param known: an earlier digest, as in :func:`digest`.
     :raises OtherDemonstrations: the folder is a run of other demonstrations.
     :raises Damaged: ``demonstrations.json`` is damaged.
     """
     kept = recorded(folder)
     if kept is None:
-        write_text(folder / NAME, digest(demos, recorded(folder.parent.parent)).model_dump_json(indent=1) + "\n")
+        write_text(folder / NAME, digest(demos, known).model_dump_json(indent=1) + "\n")
     elif different := difference(kept, digest(demos, kept)):
         raise OtherDemonstrations(
             f"{folder}: is a run of other demonstrations ({different}); bring back those that it was fitted to, or "

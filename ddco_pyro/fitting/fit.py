@@ -16,12 +16,11 @@ import numpy as np
 
 from ddco_pyro.data.controls import measure
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.data.files import leftovers
 from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.labels import label_names
 from ddco_pyro.errors import path_of
 from ddco_pyro.events import OnEvent, ignore
-from ddco_pyro.fitting.digest import record
+from ddco_pyro.fitting.digest import record, recorded
 from ddco_pyro.fitting.evaluation import evaluate, marginal
 from ddco_pyro.fitting.fitted import Fit, left_out, load
 from ddco_pyro.fitting.names import accepted, matched, read_names, write_names
@@ -124,9 +123,6 @@ def fit(
                 given.write(kept)
             if finished:
                 return replace(load(folder, allow_code=True), given=demos)  # the caller has this very spec
-            for part in (folder, *(path for path in folder.rglob("*") if path.is_dir())):
-                for old in leftovers(part):
-                    old.unlink()
         assert demos is not None
         return _fit_models(models, demos, folder, on_event, workers, clock)
 
@@ -169,7 +165,7 @@ def _fit_models(
 
     def baseline(other: str) -> Callable[..., Fit]:
         place = folder and folder / "baselines" / other
-        return partial(_fit_beside, other, (specs[other], models[other][1]), demos, place)
+        return partial(fit_beside, other, (specs[other], models[other][1]), demos, place)
 
     # several long restarts share the processes among themselves
     short = len(spec.training.starts) == 1 or all(_over_all(*model) for model in models.values())
@@ -270,27 +266,31 @@ def _leave_one_out(
     calls = {}
     for name in demos.names:
         others = replace(demos, masks={"valid": (name,)})
-        calls[name] = partial(_fit_beside, f"{model_name(spec)} without {name}", model, others, places.get(name))
+        calls[name] = partial(fit_beside, f"{model_name(spec)} without {name}", model, others, places.get(name))
     with run_all(calls, workers, "trained without a demonstration", on_event) as trained:
         fits = dict(trained)
     return {name: fits[name].hierarchy for name in demos.names}
 
 
-def _fit_beside(
+def fit_beside(
     name: str,
     model: tuple[Spec, Hierarchy],
     demos: Demonstrations,
     folder: Path | None,
-    on_event: OnEvent,
+    on_event: OnEvent = ignore,
     workers: Workers = ALONE,
 ) -> Fit:
-    """The fit of a variant of a model in a folder of its own, loaded where that is done.
+    """The fit of a baseline, of a fold, or without a demonstration: loaded where it is done.
 
     It is without demonstrations, which another process need not send back.
+
+    :param name: of the model in events.
+    :param model: its spec and its networks, as :func:`ddco_pyro.training.networks.check_networks` makes them.
+    :param folder: two below the folder of the run or selection, which has a digest of the same demonstrations.
     """
     if folder:
         claim(folder, model[0])
-        record(folder, demos)
+        record(folder, demos, recorded(folder.parent.parent))
         if is_finished(folder):
             return load(folder, allow_code=True)
     return replace(_fit_models({name: model}, demos, folder, on_event, workers, name=name), given=None)

@@ -29,6 +29,8 @@ class RunError(BadInput):
 def claimed(folder: Path, spec: Spec, resume: bool = True) -> Iterator[None]:
     """Inside, the folder is the run of this spec (:func:`claim`), and no other process works on it.
 
+    What a killed process has left half written is removed.
+
     :raises RunError: the folder is a file, or as :func:`claim`.
     :raises Busy: another process works on the folder.
     """
@@ -36,6 +38,9 @@ def claimed(folder: Path, spec: Spec, resume: bool = True) -> Iterator[None]:
         raise RunError(f"{folder}: is a file; choose another --out")
     with only_one(folder):
         claim(folder, spec, resume)
+        for part in (folder, *(path for path in folder.rglob("*") if path.is_dir())):
+            for old in leftovers(part):
+                old.unlink()
         yield
 
 

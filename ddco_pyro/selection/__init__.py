@@ -16,7 +16,7 @@ from ddco_pyro.data.files import Damaged, json_text, write_text
 from ddco_pyro.errors import Failed, reason
 from ddco_pyro.events import CellDone, CellsBegan, OnEvent, ignore
 from ddco_pyro.fitting.digest import record
-from ddco_pyro.fitting.fit import fit
+from ddco_pyro.fitting.fit import fit_beside
 from ddco_pyro.fitting.fitted import load
 from ddco_pyro.fitting.run import claimed, is_finished
 from ddco_pyro.inference import compile_all
@@ -29,7 +29,7 @@ from ddco_pyro.selection.folds import assign, divide
 from ddco_pyro.selection.grid import Candidate
 from ddco_pyro.spec import Spec, with_overrides
 from ddco_pyro.training import data
-from ddco_pyro.training.networks import Dimensions
+from ddco_pyro.training.networks import Dimensions, check_networks, model_name
 from ddco_pyro.training.processes import one_thread
 
 __all__ = ["Choice", "Selection", "SelectionFailed", "Workers", "check", "final_spec", "known_demonstrations", "select"]
@@ -154,8 +154,11 @@ def _fitted(spec: Spec, demos: Demonstrations, folder: Path) -> Metrics | str:
     A failure does not stop other folds.
     """
     try:
+        spec = with_overrides(spec, WHOLE)
+        demos = data.seen(spec, demos)
         with one_thread():
-            return fit(with_overrides(spec, WHOLE), demos, folder, keep=False).metrics
+            model = spec, check_networks(spec, Dimensions.of(demos))
+            return fit_beside(model_name(spec), model, demos, folder).metrics
     except Damaged:
         raise
     except Exception as error:

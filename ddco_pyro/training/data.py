@@ -195,19 +195,15 @@ def _labels(spec: Spec) -> tuple[str, ...]:
     return tuple(dict.fromkeys((*spec.demonstrations.label_names, *([trained.source] if trained else []))))
 
 
-def _needed(spec: Spec) -> str:
-    """The remedy for a missing file."""
-    read = ["actions", *(f"obs/{key}" for key in spec.observed), *(f"labels/{name}" for name in _labels(spec))]
-    return (
-        "put it there, or fit to another with --set demonstrations.path=FILE; it has to be HDF5 in robomimic's layout, "
-        f"with {', '.join(read)} in each data/<demonstration>"
-    )
-
-
 def _refuse_what_cannot_be_read(spec: Spec, path: Path) -> None:
     """Refuse a missing file, and by its headers a file whose demonstrations do not fit into memory."""
     if not path.exists():
-        raise DemonstrationsError(f"demonstrations.path: {path}: there is no such file; {_needed(spec)}")
+        needed = ["actions", *(f"obs/{key}" for key in spec.observed), *(f"labels/{name}" for name in _labels(spec))]
+        raise DemonstrationsError(
+            f"demonstrations.path: {path}: there is no such file; put it there, or fit to another with --set "
+            f"demonstrations.path=FILE; it has to be HDF5 in robomimic's layout, with {', '.join(needed)} in each "
+            "data/<demonstration>"
+        )
     remedy = "leave observations out, or make its demonstrations fewer, shorter or equally long"
     what = f"{path}: a fit to {', '.join(spec.observed)}"
     refuse_too_much(bytes_of_a_fit(path, spec.observed, spec.demonstrations.exclude), what, remedy)

@@ -72,7 +72,7 @@ def test_the_file_is_what_the_scores_say(finished):
 def test_what_is_there_is_not_done_again(finished, monkeypatch):
     spec, folder, made, _ = finished
     before = (folder / "selection.json").read_bytes()
-    monkeypatch.setattr(selection, "fit", None)
+    monkeypatch.setattr(selection, "fit_beside", None)
     told = Told()
     again = select(spec, folder, told, ONE)
     assert (told.begun, told.pairs) == ([("cross-validation", 8, 8)], [])
@@ -107,7 +107,7 @@ def test_a_fold_that_fails_is_named_and_the_others_go_on(tmp_path, monkeypatch):
 
 def test_where_nothing_is_left_an_unexpected_error_is_told_and_tried_again_next_time(tmp_path, monkeypatch):
     spec = spec_at(tmp_path, grid={"hierarchy.levels.0.count": [2]}, folds=2)
-    monkeypatch.setattr(selection, "fit", lambda *_, **__: 1 / 0)
+    monkeypatch.setattr(selection, "fit_beside", lambda *_, **__: 1 / 0)
     said = "every candidate has failed in some fold; the first reason: unexpected ZeroDivisionError: division by zero"
     with pytest.raises(SelectionFailed, match=said):
         select(spec, tmp_path / "run", Told(), ONE)
