@@ -141,10 +141,10 @@ def _fit_all(
     }
     compile_all()
     with run_all(calls, workers, "trained a fold") as fitted:
-        for pair, found[pair] in fitted:
-            failed = found[pair]
-            name = f"{candidates[pair[0]].name}, fold {pair[1]}"
-            on_event(CellDone(name, failed if isinstance(failed, str) else ""))
+        for pair, metrics in fitted:
+            found[pair] = metrics
+            failed = metrics if isinstance(metrics, str) else ""
+            on_event(CellDone(f"{candidates[pair[0]].name}, fold {pair[1]}", failed))
     return dict(sorted(found.items()))
 
 
