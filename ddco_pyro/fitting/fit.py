@@ -33,7 +33,7 @@ from ddco_pyro.spec import Spec, load_spec, with_overrides
 from ddco_pyro.training.data import demonstrations as read_demonstrations
 from ddco_pyro.training.data import dimensions, known_demonstrations, refuse_unfit, seen, train_and_valid
 from ddco_pyro.training.labels import used
-from ddco_pyro.training.networks import Dimensions, check_models, model_name, parameters
+from ddco_pyro.training.networks import Dimensions, check_models, check_networks, model_name, parameters
 from ddco_pyro.training.optimizers import optimizer_of
 from ddco_pyro.training.processes import Ranks, device_of, repeatable
 from ddco_pyro.training.restarts import train_model, training_began
@@ -158,14 +158,14 @@ def _fit_models(
     :param name: of a baseline, in events.
     """
     clock = clock or Clock()
-    spec, networks = next(iter(models.values()))
+    spec, *_ = next(iter(models.values()))
     specs = {other: its for other, (its, _) in list(models.items())[1:]}
     split, size = train_and_valid(spec, demos), Dimensions.of(demos)
     later = {other for other, its in specs.items() if _shares_recogniser(its)}
 
     def baseline(other: str) -> Callable[..., Fit]:
         place = folder and folder / "baselines" / other
-        return partial(fit_beside, other, (specs[other], models[other][1]), demos, place)
+        return partial(fit_beside, other, specs[other], demos, place)
 
     # several long restarts share the processes among themselves
     short = len(spec.training.starts) == 1 or all(_over_all(*model) for model in models.values())
@@ -191,7 +191,7 @@ def _fit_models(
             write_table(folder / "history.csv", ("restart", "stage", "epoch", "train", "tune"), trained.history)
             write_model(folder, hierarchy)
         alone = workers if _worth_a_process(spec, hierarchy, demos) else ALONE
-        apart = _leave_one_out(spec, networks, demos, folder, on_event, alone)
+        apart = _leave_one_out(spec, demos, folder, on_event, alone)
     fitted = Fit(spec, hierarchy, folder=folder, given=demos, beside=by_name, apart=apart)
     train, valid = len(trained.data.train), len(split.get("valid", ()))
     counts = {"train": train, "tune": len(split["train"]) - train, "valid": valid, "left_out": bool(apart)}
@@ -256,17 +256,17 @@ def _versions() -> dict[str, str]:
 
 
 def _leave_one_out(
-    spec: Spec, networks: Hierarchy, demos: Demonstrations, folder: Path | None, on_event: OnEvent, workers: Workers
+    spec: Spec, demos: Demonstrations, folder: Path | None, on_event: OnEvent, workers: Workers
 ) -> dict[str, Hierarchy]:
     """The model trained without each demonstration, by its name; each is a fit that holds one demonstration out."""
     if not spec.demonstrations.leave_one_out:
         return {}
-    model = with_overrides(spec, {"demonstrations.leave_one_out": False, "compare_with": []}), networks
+    alone = with_overrides(spec, {"demonstrations.leave_one_out": False, "compare_with": []})
     places = left_out(folder, demos) if folder else {}
     calls = {}
     for name in demos.names:
         others = replace(demos, masks={"valid": (name,)})
-        calls[name] = partial(fit_beside, f"{model_name(spec)} without {name}", model, others, places.get(name))
+        calls[name] = partial(fit_beside, f"{model_name(spec)} without {name}", alone, others, places.get(name))
     with run_all(calls, workers, "trained without a demonstration", on_event) as trained:
         fits = dict(trained)
     return {name: fits[name].hierarchy for name in demos.names}
@@ -274,7 +274,7 @@ def _leave_one_out(
 
 def fit_beside(
     name: str,
-    model: tuple[Spec, Hierarchy],
+    spec: Spec,
     demos: Demonstrations,
     folder: Path | None,
     on_event: OnEvent = ignore,
@@ -285,15 +285,15 @@ def fit_beside(
     It is without demonstrations, which another process need not send back.
 
     :param name: of the model in events.
-    :param model: its spec and its networks, as :func:`ddco_pyro.training.networks.check_networks` makes them.
     :param folder: two below the folder of the run or selection, which has a digest of the same demonstrations.
     """
     if folder:
-        claim(folder, model[0])
+        claim(folder, spec)
         record(folder, demos, recorded(folder.parent.parent))
         if is_finished(folder):
             return load(folder, allow_code=True)
-    return replace(_fit_models({name: model}, demos, folder, on_event, workers, name=name), given=None)
+    models = {name: (spec, check_networks(spec, Dimensions.of(demos)))}
+    return replace(_fit_models(models, demos, folder, on_event, workers, name=name), given=None)
 
 
 # --- in other processes -----------------------------------------------------------------------------------------------

@@ -29,7 +29,7 @@ from ddco_pyro.selection.folds import assign, divide
 from ddco_pyro.selection.grid import Candidate
 from ddco_pyro.spec import Spec, with_overrides
 from ddco_pyro.training import data
-from ddco_pyro.training.networks import Dimensions, check_networks, model_name
+from ddco_pyro.training.networks import Dimensions, model_name
 from ddco_pyro.training.processes import one_thread
 
 __all__ = ["Choice", "Selection", "SelectionFailed", "Workers", "check", "final_spec", "known_demonstrations", "select"]
@@ -155,10 +155,8 @@ def _fitted(spec: Spec, demos: Demonstrations, folder: Path) -> Metrics | str:
     """
     try:
         spec = with_overrides(spec, WHOLE)
-        demos = data.seen(spec, demos)
         with one_thread():
-            model = spec, check_networks(spec, Dimensions.of(demos))
-            return fit_beside(model_name(spec), model, demos, folder).metrics
+            return fit_beside(model_name(spec), spec, data.seen(spec, demos), folder).metrics
     except Damaged:
         raise
     except Exception as error:
