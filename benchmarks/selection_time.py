@@ -20,10 +20,11 @@ from typing import Any
 
 from ddco_pyro.data.files import write_text
 from ddco_pyro.events import CellDone, Event
-from ddco_pyro.fitting.run import claim
+from ddco_pyro.fitting.fit import fit
 from ddco_pyro.selection import Workers, folds, grid, select
 from ddco_pyro.spec import load_spec
 from ddco_pyro.training.data import demonstrations
+from ddco_pyro.training.networks import Dimensions
 
 OUT = Path("benchmarks/results")
 GRID = "selection.grid.hierarchy.levels.0.count=[1, 2, 3, 4, 5, 6, 7, 8]"
@@ -33,11 +34,11 @@ SHORT = ("selection.grid.hierarchy.levels.0.count=[2, 3, 4, 5]", "selection.fold
 def one_fold() -> dict[str, Any]:
     """Seconds of CPU that the first of ten folds takes for each candidate of the needle spec."""
     spec = load_spec("specs/needle.yaml", [GRID])
-    divided = folds.divide(demonstrations(spec), spec.selection.folds, spec.seed)
+    fold, *_ = folds.divide(demonstrations(spec), spec.selection.folds, spec.seed)
     seconds = {}
-    for candidate in grid.candidates(spec, divided.dimensions):
+    for candidate in grid.candidates(spec, Dimensions.of(fold)):
         start = time.process_time()
-        folds.score(divided, candidate, 0)
+        fit(candidate.spec, fold)
         seconds[candidate.name] = time.process_time() - start
         print(candidate.name, seconds[candidate.name], flush=True)
     return {"cpu_seconds": seconds, "sum": sum(seconds.values()), "folds": spec.selection.folds}
@@ -50,7 +51,6 @@ def speed_up() -> dict[str, Any]:
     found: dict[str, Any] = {"load_before": os.getloadavg()[0]}
     for jobs in (1, 2):
         with tempfile.TemporaryDirectory() as folder:
-            claim(Path(folder) / "run", spec)
             clock = Clock()
             select(spec, Path(folder) / "run", clock, Workers(jobs))
         found[f"seconds_{jobs}"] = clock.ends[-1] - clock.ends[jobs - 1]

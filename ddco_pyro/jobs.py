@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from ddco_pyro.errors import BadInput, Failed
-from ddco_pyro.events import Event, OnEvent
+from ddco_pyro.events import Event, OnEvent, ignore
 
 Key = TypeVar("Key")
 Result = TypeVar("Result")
@@ -28,11 +28,7 @@ for said in ("A worker stopped", r"\d+ tasks which were still being processed", 
 
 
 def from_outside(doing: str, fewer: str = "--jobs") -> str:
-    """The message for a process that died.
-
-    :param doing: its part of the work.
-    :param fewer: the setting for the number of processes.
-    """
+    """The message for a process that died, which did a part of the work; ``fewer`` sets the number of processes."""
     return (
         f"a process that {doing} was ended from outside (too little memory?); what is done is kept in its folder: "
         f"continue with the same command and --out, with fewer {fewer} if memory was short"
@@ -87,8 +83,7 @@ def run_all(
     """
     number, announced = workers.number(len(calls) + beside), waiting or {}
     if number <= 1:
-        given = () if on_event is None else (on_event,)
-        yield ((key, call(*given)) for key, call in calls.items())
+        yield ((key, call(*([on_event] if on_event else []))) for key, call in calls.items())
         return
     import joblib
 
@@ -103,15 +98,14 @@ def run_all(
     results = parallel(joblib.delayed(_away)(key, call, on_event is not None) for key, call in calls.items())
 
     def completed() -> Iterator[tuple[Key, Result]]:
-        expected = iter(calls)
-        for _ in calls:
-            begun = announced.get(next(expected))
-            if on_event and begun is not None:
-                on_event(begun)
+        tell = on_event or ignore
+        for expected in calls:
+            if begun := announced.get(expected):
+                tell(begun)
             key, result, events = next(results)
             for event in events:
-                if on_event and event != begun:
-                    on_event(event)
+                if event != begun:
+                    tell(event)
             yield key, result
 
     with without_lost_calls():
@@ -127,12 +121,8 @@ def run_all(
 def without_lost_calls() -> Iterator[None]:
     """Inside, nothing is said of an error in loky's thread, which misses calls that were given up."""
     show = threading.excepthook
-
-    def shown(error: threading.ExceptHookArgs) -> None:
-        if not (error.exc_type is KeyError and ".loky." in type(error.thread).__module__):
-            show(error)
-
-    threading.excepthook = shown
+    lost = lambda error: error.exc_type is KeyError and ".loky." in type(error.thread).__module__  # noqa: E731
+    threading.excepthook = lambda error: None if lost(error) else show(error)
     try:
         yield
     finally:

@@ -140,7 +140,7 @@ class Effort(Record):
 
 
 class Stage(Record):
-    """The end of a stage of training (:class:`ddco_pyro.training.stages.StageEnd`)."""
+    """The end of a stage of training (:func:`ddco_pyro.training.stages.stage_end`)."""
 
     stage: str
     epochs: int

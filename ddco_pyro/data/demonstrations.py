@@ -167,15 +167,6 @@ def not_demonstrations(given: object) -> DemonstrationsError:
     )
 
 
-def bytes_of_a_fit(path: str | Path, observations: Sequence[str], exclude: Sequence[str] = ()) -> float:
-    """Bytes that a fit to these observations needs, by the file's headers alone.
-
-    :raises DemonstrationsError: the file cannot be read, or lacks an observation.
-    """
-    with stored(Path(path), observations, (), exclude) as (found, *_):
-        return needed(found)
-
-
 Stored = tuple[list[Demonstration], dict[str, tuple[str, ...]], Mapping[str, Attribute]]
 """Demonstrations as their file stores them, the masks, and the attributes of the file."""
 

@@ -19,10 +19,6 @@ from ddco_pyro.metrics import Record, read_record
 
 NAME = "demonstrations.json"
 
-TRAINED = ("checkpoints", "model.safetensors", "folds.json")
-"""Files that a run or a selection has as soon as training begins."""
-
-
 FORMAT = 4
 """The version of the run folder's format."""
 
@@ -33,12 +29,6 @@ class OtherDemonstrations(BadInput):
 
 class OtherVersion(BadInput):
     """A run folder has another format."""
-
-    def __init__(self, folder: Path, version: int) -> None:
-        super().__init__(
-            f"{folder}: this run was written by version {version} of the run folder's format, and version {FORMAT} is "
-            "read here: fit again"
-        )
 
 
 class Digest(Record):
@@ -112,15 +102,15 @@ def recorded(folder: Path) -> Digest | None:
     :raises Damaged: ``demonstrations.json`` is damaged.
     :raises OtherVersion: the folder was written in another format.
     """
-    path = folder / NAME
-    if path.exists():
-        kept = read_record(path, Digest, "fit again into another --out")
-        if kept.format != FORMAT:
-            raise OtherVersion(folder, kept.format)
-        return kept
-    if any((folder / name).exists() for name in TRAINED):
-        raise OtherVersion(folder, 1)
-    return None
+    if not (path := folder / NAME).exists():
+        return None
+    kept = read_record(path, Digest, "fit again into another --out")
+    if kept.format != FORMAT:
+        raise OtherVersion(
+            f"{folder}: this run was written by version {kept.format} of the run folder's format, and version {FORMAT} "
+            "is read here: fit again"
+        )
+    return kept
 
 
 def record(folder: Path, demos: Demonstrations, known: Digest | None = None) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -91,19 +91,6 @@ class Draws:
         )
 
 
-class Chain(NamedTuple):
-    """The draws from one model for N demonstrations.
-
-    :param paths: choices and terminations of each demonstration, [2, D, draw, T].
-    :param active: the posterior u of each demonstration, the levels' choices beside each other, [T, Σ (1 + k_d)].
-    """
-
-    demonstrations: tuple[str, ...]
-    log_likelihood: np.ndarray
-    paths: list[np.ndarray]
-    active: list[torch.Tensor]
-
-
 def draw(
     models: Sequence[Iterable[Inferred]],
     names: Mapping[str, Sequence[str]],
@@ -122,26 +109,32 @@ def draw(
     check_whole("draws", draws, 1)
     check_whole("seed", seed)
     chains = [_chain(model, draws, (seed, number)) for number, model in enumerate(models)]
-    first = chains[0]
-    shape = len(names), len(chains), draws, len(first.paths), max(path.shape[-1] for path in first.paths)
+    demonstrations, _, first, ours = chains[0]
+    shape = len(names), len(chains), draws, len(first), max(path.shape[-1] for path in first)
     options = np.full(shape, -1, dtype=np.int8 if max(map(len, names.values())) <= 128 else np.int16)
     starts = np.zeros(shape, dtype=bool)
-    for number, chain in enumerate(chains):
-        for level, order in enumerate(matched(first.active, chain.active, [len(own) for own in names.values()])):
-            for n, (choices, ends) in enumerate(chain.paths):
+    for number, (_, _, paths, active) in enumerate(chains):
+        for level, order in enumerate(matched(ours, active, [len(own) for own in names.values()])):
+            for n, (choices, ends) in enumerate(paths):
                 options[level, number, :, n, : choices.shape[-1]] = order[choices[level]]
                 starts[level, number, :, n, : choices.shape[-1]] = ends[level] == 1
     return Draws(
         dict(zip(names, options, strict=True)),
         dict(zip(names, starts, strict=True)),
-        np.stack([chain.log_likelihood for chain in chains]),
-        first.demonstrations,
+        np.stack([values for _, values, _, _ in chains]),
+        tuple(demonstrations),
         dict(names),
         tuple(seeds),
     )
 
 
-def _chain(model: Iterable[Inferred], draws: int, seed: tuple[int, int]) -> Chain:
+def _chain(
+    model: Iterable[Inferred], draws: int, seed: tuple[int, int]
+) -> tuple[list[str], np.ndarray, list[np.ndarray], list[torch.Tensor]]:
+    """The demonstrations and log p(ξ) under a model, with the draws [2, D, draw, T] of choices and terminations.
+
+    At last the posterior u of each demonstration, the levels' choices beside each other, [T, Σ (1 + k_d)].
+    """
     names: list[str] = []
     paths: list[np.ndarray] = []
     values, active = [], []
@@ -151,7 +144,7 @@ def _chain(model: Iterable[Inferred], draws: int, seed: tuple[int, int]) -> Chai
         for n, length in enumerate(piece.lengths):
             paths.append(piece.draws(n, draws, (*seed, len(paths))))
             active.append(torch.cat([level[n, :length] for level in piece.posterior.u], dim=1))
-    return Chain(tuple(names), np.concatenate(values), paths, active)
+    return names, np.concatenate(values), paths, active
 
 
 def matched(ours: Sequence[torch.Tensor], theirs: Sequence[torch.Tensor], sizes: Sequence[int]) -> list[np.ndarray]:

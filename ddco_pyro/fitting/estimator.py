@@ -8,7 +8,6 @@ from numbers import Integral
 from typing import Any, Self
 
 import numpy as np
-import torch
 from sklearn.base import BaseEstimator
 from sklearn.utils import check_array, check_random_state
 from sklearn.utils.validation import check_is_fitted, validate_data
@@ -107,7 +106,8 @@ class OptionSegmenter(BaseEstimator):
     def predict_proba(self, X: Arrays, U: Arrays | None = None, lengths: Sequence[int] | None = None) -> np.ndarray:
         """The posterior probability of each option at each step, u of §4.1, [ΣT, k]."""
         demos = self._demonstrations(X, U, lengths)
-        return _joined(demos, self.fit_.posterior(demos).u[0].numpy())[:, 1:]
+        padded = self.fit_.posterior(demos).u[0].numpy()
+        return np.concatenate([row[:steps, 1:] for row, steps in zip(padded, demos.lengths, strict=True)])
 
     def score(self, X: Arrays, U: Arrays | None = None, lengths: Sequence[int] | None = None) -> float:
         """log p(ξ) of all sequences together, nats."""
@@ -267,8 +267,3 @@ def _drawn(random_state: Any) -> int:
         raise BadInput(
             f"random_state={random_state!r}: has to be a whole number, a numpy.random.RandomState, or None"
         ) from None
-
-
-def _joined(demos: Demonstrations, padded: np.ndarray | torch.Tensor) -> np.ndarray:
-    """Results [N, T, ...] of all steps of the sequences, [ΣT, ...]."""
-    return np.concatenate([np.asarray(row[:steps]) for row, steps in zip(padded, demos.lengths, strict=True)])

@@ -16,7 +16,6 @@ import numpy as np
 
 from ddco_pyro.data.controls import measure
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.data.files import leftovers
 from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.labels import label_names
 from ddco_pyro.errors import path_of
@@ -25,24 +24,16 @@ from ddco_pyro.fitting.digest import record, recorded
 from ddco_pyro.fitting.evaluation import evaluate, marginal
 from ddco_pyro.fitting.fitted import Fit, left_out, load
 from ddco_pyro.fitting.names import accepted, matched, read_names, write_names
-from ddco_pyro.fitting.run import (
-    Clock,
-    claim,
-    claimed,
-    has_model,
-    is_finished,
-    read_model,
-    write_history,
-    write_model,
-)
+from ddco_pyro.fitting.run import Clock, claim, claimed, is_finished, write_model
 from ddco_pyro.inference import compile_all
 from ddco_pyro.jobs import BackendError, Workers, run_all
+from ddco_pyro.metrics import write_table
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec, load_spec, with_overrides
 from ddco_pyro.training.data import demonstrations as read_demonstrations
 from ddco_pyro.training.data import dimensions, known_demonstrations, refuse_unfit, seen, train_and_valid
 from ddco_pyro.training.labels import used
-from ddco_pyro.training.networks import Dimensions, check_models, model_name, parameters
+from ddco_pyro.training.networks import Dimensions, check_models, check_networks, model_name, parameters
 from ddco_pyro.training.optimizers import optimizer_of
 from ddco_pyro.training.processes import Ranks, device_of, repeatable
 from ddco_pyro.training.restarts import train_model, training_began
@@ -96,9 +87,7 @@ def fit(
     :raises TrainingError: training stopped; the checkpoints stay.
     """
     spec, folder = spec if isinstance(spec, Spec) else load_spec(spec), None if out is None else path_of(out, "out")
-    workers = Workers(jobs)
-    if _check_shards(spec.training.shards) > 1:
-        workers = ALONE  # which trains with the others of torchrun
+    workers = Workers(jobs) if _check_shards(spec.training.shards) == 1 else ALONE  # torchrun's others train along
     clock, given = Clock(), None
     with clock("demonstrations"):
         if isinstance(demonstrations, Iterable) and not isinstance(demonstrations, str | Demonstrations):
@@ -113,7 +102,7 @@ def fit(
             if demonstrations is not None:
                 spec = with_overrides(spec, {"demonstrations.path": str(path_of(demonstrations, "demonstrations"))})
             demos = known_demonstrations(spec)
-        models, known = check_models(spec, dimensions(spec, demos)), demos is not None
+        models = check_models(spec, dimensions(spec, demos))
         if demos is not None:
             refuse_unfit(spec, demos)
             used(spec, demos)
@@ -123,25 +112,19 @@ def fit(
             stack.enter_context(claimed(folder, spec, resume))
             read_names(folder, spec)  # or they are refused
         finished = folder is not None and is_finished(folder)
-        with clock("demonstrations"):
-            if demos is None and not finished:
+        if demos is None and not finished:
+            with clock("demonstrations"):
                 demos = read_demonstrations(spec, on_event)
-            if folder is not None and demos is not None:
-                record(folder, demos)
+            models = check_models(spec, Dimensions.of(demos))  # the control decides the baselines too
         if folder is not None:
+            if demos is not None:
+                record(folder, demos)
             if keep and given is not None and not (kept := folder / "demonstrations.hdf5").exists():
                 given.write(kept)
             if finished:
                 return replace(load(folder, allow_code=True), given=demos)  # the caller has this very spec
-            for part in (folder, *(path for path in folder.rglob("*") if path.is_dir())):
-                for old in leftovers(part):
-                    old.unlink()
         assert demos is not None
-        if not known:  # the dimensions of the control decide the baselines too
-            models = check_models(spec, Dimensions.of(demos))
-        short = len(spec.training.starts) == 1 or all(_over_all(*model) for model in models.values())
-        baselines = dict(list(models.items())[1:])
-        return _fit_model(spec, demos, folder, on_event, workers, clock, baselines, short)
+        return _fit_models(models, demos, folder, on_event, workers, clock)
 
 
 def _check_shards(shards: int) -> int:
@@ -157,57 +140,58 @@ def _check_shards(shards: int) -> int:
     return processes
 
 
-def _fit_model(
-    spec: Spec,
+Models = Mapping[str, tuple[Spec, Hierarchy]]
+"""Specs and networks by name: of a model, then of its baselines."""
+
+
+def _fit_models(
+    models: Models,
     demos: Demonstrations,
     folder: Path | None,
-    on_event: OnEvent,
-    workers: Workers,
-    clock: Clock,
-    baselines: Mapping[str, tuple[Spec, Hierarchy]],
-    short: bool = True,
+    on_event: OnEvent = ignore,
+    workers: Workers = ALONE,
+    clock: Clock | None = None,
     name: str | None = None,
 ) -> Fit:
     """Train a model and its baselines, evaluate it, and write its folder.
 
-    :param baselines: the specs and networks of the baselines by name.
-    :param short: whether baselines may go to other processes; several long restarts share those among themselves.
-    :param name: of the model in events.
+    :param name: of a baseline, in events.
     """
+    clock = clock or Clock()
+    spec, *_ = next(iter(models.values()))
+    specs = {other: its for other, (its, _) in list(models.items())[1:]}
     split, size = train_and_valid(spec, demos), Dimensions.of(demos)
-    checkpoints = folder / "checkpoints" if folder else None
-    specs = {name: its for name, (its, _) in baselines.items()}
+    later = {other for other, its in specs.items() if _shares_recogniser(its)}
 
-    def fit_of(name: str) -> Callable[..., Fit]:
-        place = folder and folder / "baselines" / name
-        return partial(_fit_baseline, specs[name], demos, place, folder, name)
+    def baseline(other: str) -> Callable[..., Fit]:
+        place = folder and folder / "baselines" / other
+        return partial(fit_beside, other, specs[other], demos, place)
 
-    later = {name for name, its in specs.items() if _shares_recogniser(its)}
-    own = [name for name in specs if name not in later]
-    long = {name: fit_of(name) for name in own if short and _worth_a_process(*baselines[name], demos)}
-    waiting = {name: training_began(its, name) for name, its in specs.items()}
-    if long:
+    # several long restarts share the processes among themselves
+    short = len(spec.training.starts) == 1 or all(_over_all(*model) for model in models.values())
+    beside = [other for other in specs if short and other not in later and _worth_a_process(*models[other], demos)]
+    if beside:
         compile_all()
-    with run_all(
-        long, workers, "trained a baseline", on_event, ordered=True, beside=True, waiting=waiting
-    ) as fitted_beside:
+    calls, waiting = {other: baseline(other) for other in beside}, {o: training_began(specs[o], o) for o in beside}
+    with run_all(calls, workers, "trained a baseline", on_event, True, True, waiting) as fitted_beside:
         with clock("training"):
-            free = max(1, workers.number() - len(long))
+            free, checkpoints = max(1, workers.number() - len(beside)), folder and folder / "checkpoints"
             trained = train_model(spec, size, split["train"], on_event, checkpoints, split.get("valid"), name, free)
-        specs |= {name: _with_recogniser(specs[name], trained.summary["recogniser"]) for name in later}
+        specs |= {other: _with_recogniser(specs[other], trained.summary["recogniser"]) for other in later}
         with clock("baselines"):
-            others = {name: fit_of(name)(on_event, workers) for name in specs if name not in long} | dict(fitted_beside)
-            by_name = {name: replace(others[name], given=demos) for name in specs}
+            here = {other: baseline(other)(on_event, workers) for other in specs if other not in beside}
+            fits = here | dict(fitted_beside)
+    by_name = {other: replace(fits[other], given=demos) for other in specs}
     contained = [other for other in by_name if _contains(spec, specs[other])]
     with clock("training"):
         for other in contained:
             trained.contain(by_name[other].hierarchy, by_name[other].metrics.training.objective)
         hierarchy = trained.hierarchy
         if folder:
-            write_history(folder, trained.history)
+            write_table(folder / "history.csv", ("restart", "stage", "epoch", "train", "tune"), trained.history)
             write_model(folder, hierarchy)
         alone = workers if _worth_a_process(spec, hierarchy, demos) else ALONE
-        apart = _leave_one_out(spec, size, demos, folder, on_event, alone)
+        apart = _leave_one_out(spec, demos, folder, on_event, alone)
     fitted = Fit(spec, hierarchy, folder=folder, given=demos, beside=by_name, apart=apart)
     train, valid = len(trained.data.train), len(split.get("valid", ()))
     counts = {"train": train, "tune": len(split["train"]) - train, "valid": valid, "left_out": bool(apart)}
@@ -272,56 +256,44 @@ def _versions() -> dict[str, str]:
 
 
 def _leave_one_out(
-    spec: Spec,
-    size: Dimensions,
-    demos: Demonstrations,
-    folder: Path | None,
-    on_event: OnEvent,
-    workers: Workers,
+    spec: Spec, demos: Demonstrations, folder: Path | None, on_event: OnEvent, workers: Workers
 ) -> dict[str, Hierarchy]:
-    """The model trained without each demonstration, by its name, each kept in the run folder as soon as it is done."""
+    """The model trained without each demonstration, by its name; each is a fit that holds one demonstration out."""
     if not spec.demonstrations.leave_one_out:
         return {}
+    alone = with_overrides(spec, {"demonstrations.leave_one_out": False, "compare_with": []})
     places = left_out(folder, demos) if folder else {}
-    calls = {name: partial(_train_without, spec, size, demos, name, places.get(name)) for name in demos.names}
+    calls = {}
+    for name in demos.names:
+        others = replace(demos, masks={"valid": (name,)})
+        calls[name] = partial(fit_beside, f"{model_name(spec)} without {name}", alone, others, places.get(name))
     with run_all(calls, workers, "trained without a demonstration", on_event) as trained:
-        models = dict(trained)
-    return {name: models[name] for name in demos.names}
+        fits = dict(trained)
+    return {name: fits[name].hierarchy for name in demos.names}
 
 
-def _train_without(
-    spec: Spec, size: Dimensions, demos: Demonstrations, name: str, folder: Path | None, on_event: OnEvent
-) -> Hierarchy:
-    """Train without a demonstration, or read the model where that is done."""
-    if folder and has_model(folder):
-        return read_model(folder, spec)
-    others = demos.select(other for other in demos.names if other != name)
-    checkpoints, event = folder and folder / "checkpoints", f"{model_name(spec)} without {name}"
-    model = train_model(spec, size, others, on_event, checkpoints, None, event).hierarchy
-    if folder:
-        write_model(folder, model)
-    return model
-
-
-def _fit_baseline(
+def fit_beside(
+    name: str,
     spec: Spec,
     demos: Demonstrations,
     folder: Path | None,
-    above: Path | None,
-    name: str,
-    on_event: OnEvent,
+    on_event: OnEvent = ignore,
     workers: Workers = ALONE,
 ) -> Fit:
-    """Fit a baseline, or load it where that is done; without demonstrations, which another process need not send back.
+    """The fit of a baseline, of a fold, or without a demonstration: loaded where it is done.
 
-    :param above: the run folder of the model that it is compared with.
+    It is without demonstrations, which another process need not send back.
+
+    :param name: of the model in events.
+    :param folder: two below the folder of the run or selection, which has a digest of the same demonstrations.
     """
-    if folder and above:
+    if folder:
         claim(folder, spec)
-        record(folder, demos, recorded(above))
+        record(folder, demos, recorded(folder.parent.parent))
         if is_finished(folder):
             return load(folder, allow_code=True)
-    return replace(_fit_model(spec, demos, folder, on_event, workers, Clock(), {}, name=name), given=None)
+    models = {name: (spec, check_networks(spec, Dimensions.of(demos)))}
+    return replace(_fit_models(models, demos, folder, on_event, workers, name=name), given=None)
 
 
 # --- in other processes -----------------------------------------------------------------------------------------------

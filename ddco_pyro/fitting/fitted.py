@@ -212,9 +212,7 @@ class Fit:
         (torch.Size([6, 10, 3]), 1.0)
         """
         parts = [piece.posterior for piece in self.infer(demos)]
-        return Posterior(
-            *(tuple(_stacked(level, 0.0) for level in zip(*kind, strict=True)) for kind in zip(*parts, strict=True))
-        )
+        return Posterior(*(tuple(map(_stacked, zip(*kind, strict=True))) for kind in zip(*parts, strict=True)))
 
     def refuse_flat(self) -> None:
         """Refuse a policy without options.
@@ -262,8 +260,7 @@ class Fit:
         :param draws: from each model.
         :raises BadInput: the model has no options.
         """
-        if not self.names:
-            raise BadInput(f"{self.place}: is a {self.name} policy without options; name a run that has options")
+        self.refuse_flat()
         fits = (self, *self.repetitions)
         seeds = [fit.spec.seed if (own := fit.spec.training.seed) is None else own for fit in fits]
         return draw([fit.infer(demos) for fit in fits], self.names, seeds, draws, seed)
@@ -282,10 +279,9 @@ class Fit:
         return Monitor(self.hierarchy, self.names, lengths)
 
 
-def _stacked(parts: Sequence[Tensor], padding: float) -> Tensor:
-    """Parts [N_i, T_i, ...] stacked along N, padded to the longest."""
-    rows = [row for part in parts for row in part]
-    return torch.nn.utils.rnn.pad_sequence(rows, batch_first=True, padding_value=padding)
+def _stacked(parts: Sequence[Tensor]) -> Tensor:
+    """Parts [N_i, T_i, ...] stacked along N, padded with zeros to the longest."""
+    return torch.nn.utils.rnn.pad_sequence([row for part in parts for row in part], batch_first=True)
 
 
 def left_out(folder: Path, demos: Demonstrations) -> dict[str, Path]:

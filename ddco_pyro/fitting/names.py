@@ -13,7 +13,7 @@ from ddco_pyro.data.files import write_text
 from ddco_pyro.data.labels import label_names
 from ddco_pyro.errors import BadInput, nearest
 from ddco_pyro.evaluation.agreement import confusion
-from ddco_pyro.metrics import Confusion, NamedByLabel, TrainedLabels
+from ddco_pyro.metrics import NamedByLabel, TrainedLabels
 from ddco_pyro.names import choice_names, label_name, option_name
 from ddco_pyro.spec import Spec
 from ddco_pyro.spec.yaml import dump_yaml, read_yaml
@@ -99,26 +99,20 @@ def matched(
         if not labelled or not (own or len(labelled) == len(train)):
             continue
         table = confusion([choices[row] for row in labelled], [train[row].labels[label] for row in labelled])
+        steps = np.array(table.steps)  # [labels, options]
         pairs = zip(table.options, table.matched, strict=True)
         for option, value in enumerate(own.values, start=1) if own else pairs:
             if not option or value is None:
                 continue
+            here = np.equal(table.labels, value)[:, None] & np.equal(table.options, option)
+            both = int(steps[here].sum())
+            each = int(steps[:, here.any(0)].sum()), int(steps[here.any(1)].sum())  # of the option, of the label
             name = label_name(label, value, known.get(label, ()), level.name)
-            both, apart = _shared(table, option, value)
-            alone = name in (option_name(0), *(one.name for one in found if one.level == level.name))
-            if not alone and (own or both > max(apart)):
-                share = both / (both + sum(apart)) if both else 0.0
+            taken = name in (option_name(0), *(one.name for one in found if one.level == level.name))
+            if not taken and (own or 2 * both > max(each)):
+                share = both / (sum(each) - both) if both else 0.0
                 found.append(NamedByLabel(level=level.name, option=option, labels=label, name=name, agreement=share))
     return found
-
-
-def _shared(table: Confusion, option: int, value: int) -> tuple[int, tuple[int, int]]:
-    """The steps with both an option and a label, and the further ones of the option and of the label."""
-    steps = np.array(table.steps)
-    of_option = steps[:, [one == option for one in table.options]]
-    of_label = steps[[one == value for one in table.labels]]
-    both = int(of_label[:, [one == option for one in table.options]].sum())
-    return both, (int(of_option.sum()) - both, int(of_label.sum()) - both)
 
 
 def accepted(spec: Spec, found: Sequence[NamedByLabel]) -> Named:

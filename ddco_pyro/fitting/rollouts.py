@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.events import EpisodeEnded, OnEvent, ignore
@@ -13,7 +11,7 @@ from ddco_pyro.fitting.run import RunError
 from ddco_pyro.metrics import Method, Rollouts, write_table
 from ddco_pyro.simulation.episodes import run_episodes, summarize
 from ddco_pyro.simulation.film import write_film
-from ddco_pyro.simulation.task import SUCCESS, Policy, Task, find_task
+from ddco_pyro.simulation.task import SUCCESS, Policy, find_task
 from ddco_pyro.statistics import paired_difference, success_worth
 
 FIRST_SEED = 1000
@@ -91,7 +89,17 @@ def roll_out(
     fit.metrics.rollouts = Rollouts(
         seed=seeds.start,
         episodes=episodes,
-        methods={name: _method(task, name, outcomes, succeeded, fit.name) for name, outcomes in by_method.items()},
+        methods={
+            name: Method.model_validate(
+                {
+                    "measures": summarize(task, outcomes),
+                    "against": paired_difference(succeeded[fit.name], succeeded[name])
+                    if name != fit.name and {name, fit.name} <= {*succeeded}
+                    else None,
+                }
+            )
+            for name, outcomes in by_method.items()
+        },
         worth=success_worth(fit.name, succeeded),
     )
     fit.metrics.write(folder)
@@ -100,13 +108,3 @@ def roll_out(
 
 def _film(fit: Fit, name: str, seed: int) -> Path:
     return fit.run_folder / "videos" / f"{name}-{seed}.mp4"
-
-
-def _method(
-    task: Task, name: str, outcomes: list[dict[str, float]], succeeded: Mapping[str, list[float]], ours: str
-) -> Method:
-    """The measures of a method, and its successes against ours."""
-    found: dict[str, Any] = {"measures": summarize(task, outcomes)}
-    if name != ours and {name, ours} <= {*succeeded}:
-        found["against"] = paired_difference(succeeded[ours], succeeded[name])
-    return Method.model_validate(found)

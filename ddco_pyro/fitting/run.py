@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -15,7 +14,7 @@ from ddco_pyro.data.controls import ControlPart
 from ddco_pyro.data.files import Damaged, leftovers, only_one, write_text
 from ddco_pyro.data.tensors import read_tensors, write_tensors
 from ddco_pyro.errors import BadInput
-from ddco_pyro.metrics import refit, write_table
+from ddco_pyro.metrics import refit
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec, SpecError, dump_spec, load_spec
 from ddco_pyro.training.checkpoint import copy_of
@@ -30,6 +29,8 @@ class RunError(BadInput):
 def claimed(folder: Path, spec: Spec, resume: bool = True) -> Iterator[None]:
     """Inside, the folder is the run of this spec (:func:`claim`), and no other process works on it.
 
+    What a killed process has left half written is removed.
+
     :raises RunError: the folder is a file, or as :func:`claim`.
     :raises Busy: another process works on the folder.
     """
@@ -37,6 +38,9 @@ def claimed(folder: Path, spec: Spec, resume: bool = True) -> Iterator[None]:
         raise RunError(f"{folder}: is a file; choose another --out")
     with only_one(folder):
         claim(folder, spec, resume)
+        for part in (folder, *(path for path in folder.rglob("*") if path.is_dir())):
+            for old in leftovers(part):
+                old.unlink()
         yield
 
 
@@ -50,8 +54,10 @@ def claim(folder: Path, spec: Spec, resume: bool = True) -> None:
     """
     text, path = dump_spec(spec), folder / "spec.yaml"
     if path.exists():
-        same = path.read_bytes() == text.encode()
-        if not same and not _is_of(spec, path):
+        same = same_model = path.read_bytes() == text.encode()
+        with suppress(SpecError):  # user code is not imported by reading its name
+            same_model = same or load_spec(path, allow_code=True).model_copy(update={"report": spec.report}) == spec
+        if not same_model:
             raise RunError(f"{folder}: holds a run of another spec; choose another --out or remove it")
         if not resume and is_finished(folder) and (folder / "report.html").exists():  # what `fit` writes last
             raise RunError(
@@ -64,23 +70,9 @@ def claim(folder: Path, spec: Spec, resume: bool = True) -> None:
     write_text(path, text)
 
 
-def _is_of(spec: Spec, path: Path) -> bool:
-    """Whether a spec differs from that in a file in its ``report`` at most."""
-    try:
-        other = load_spec(path, allow_code=True)  # which imports nothing
-    except SpecError:
-        return False
-    return other.model_copy(update={"report": spec.report}) == spec
-
-
 def is_finished(folder: Path) -> bool:
     """Whether a run is complete: ``metrics.json`` is written last. A damaged file that was removed is made again."""
     return all((folder / name).exists() for name in ("model.safetensors", "metrics.json"))
-
-
-def has_model(folder: Path) -> bool:
-    """Whether a trained model is in the folder."""
-    return (folder / "model.safetensors").exists()
 
 
 def write_model(folder: Path, hierarchy: Hierarchy) -> None:
@@ -118,11 +110,6 @@ def read_model(folder: Path, spec: Spec) -> Hierarchy:
     except (KeyError, ValueError, RuntimeError) as error:
         raise RunError(f"{path}: is of another spec than spec.yaml; {remedy}") from error
     return hierarchy.eval()
-
-
-def write_history(folder: Path, rows: Sequence[dict[str, Any]]) -> None:
-    """Write ``history.csv``: a row for each epoch of each restart."""
-    write_table(folder / "history.csv", ("restart", "stage", "epoch", "train", "tune"), rows)
 
 
 class Clock:

@@ -10,12 +10,12 @@ from pathlib import Path
 from ddco_pyro.data.files import only_one
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import OnEvent, SeedFitted, ignore
-from ddco_pyro.fitting.fit import fit as fit_again
-from ddco_pyro.fitting.fitted import Fit, load
+from ddco_pyro.fitting.fit import fit
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.jobs import Workers, run_all
 from ddco_pyro.metrics import Metrics, Seeds, SuccessOfSeeds
-from ddco_pyro.spec import Spec, user_code, with_overrides
+from ddco_pyro.spec import Spec, with_overrides
 
 
 def check_seeds(spec: Spec, seeds: int) -> None:
@@ -43,24 +43,21 @@ def repeat(first: Fit, seeds: int, on_event: OnEvent = ignore, jobs: int = 1) ->
     :returns: the fit, with the results of all repetitions in ``metrics.seeds`` and ``metrics.json``.
     :raises Failed: a process died.
     """
-    folder = first.run_folder
-    numbers = training_seeds(first.spec, seeds)
-    allow_code = bool(user_code(first.spec))
+    folder, numbers = first.run_folder, training_seeds(first.spec, seeds)
+    each = {numbers[0]: first.metrics}
     with only_one(folder):
-        places = {seed: folder / "seeds" / str(seed) for seed in numbers[1:]}
-        calls = {seed: partial(_again, first.spec, seed, place) for seed, place in places.items()}
-        with run_all(calls, Workers(jobs), "repeated the fit") as fitted:
-            for _ in fitted:
-                on_event(SeedFitted(len(places)))
-        every = [first, *(load(place, allow_code) for place in places.values())]
-        first.metrics.seeds = over_seeds(numbers, [fit.metrics for fit in every])
+        calls = {seed: partial(_again, first.spec, seed, folder / "seeds" / str(seed)) for seed in numbers[1:]}
+        with run_all(calls, Workers(jobs), "repeated the fit") as repeated:
+            for seed, metrics in repeated:
+                each[seed] = metrics
+                on_event(SeedFitted(len(calls)))
+        first.metrics.seeds = over_seeds(numbers, [each[seed] for seed in numbers])
         first.metrics.write(folder)
     return first
 
 
-def _again(spec: Spec, seed: int, folder: Path) -> None:
-    """Fit with another training seed, in another folder."""
-    fit_again(with_overrides(spec, {"training.seed": seed}), None, folder)
+def _again(spec: Spec, seed: int, folder: Path) -> Metrics:
+    return fit(with_overrides(spec, {"training.seed": seed}), None, folder).metrics
 
 
 def roll_out_repetitions(first: Fit, on_event: OnEvent = ignore, jobs: int = -1) -> None:

@@ -1,7 +1,7 @@
 """Selection by k-fold cross-validation (paper §4.3) over a grid of spec keys, with the same folds for every candidate.
 
-The folder holds ``selection.json`` (the result), ``folds/`` (a file for each finished candidate and fold), ``fit/``
-(the final fit) and ``demonstrations.json`` (the digest of the demonstrations).
+The folder holds ``selection.json`` (the result), ``folds/`` (the run folder of each candidate's fit without a fold),
+``fit/`` (the final fit) and ``demonstrations.json`` (the digest of the demonstrations).
 """
 
 from __future__ import annotations
@@ -12,21 +12,25 @@ from functools import partial
 from pathlib import Path
 
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.data.files import json_text, write_text
-from ddco_pyro.errors import Failed
+from ddco_pyro.data.files import Damaged, json_text, write_text
+from ddco_pyro.errors import Failed, reason
 from ddco_pyro.events import CellDone, CellsBegan, OnEvent, ignore
 from ddco_pyro.fitting.digest import record
-from ddco_pyro.fitting.run import claimed
+from ddco_pyro.fitting.fit import fit_beside
+from ddco_pyro.fitting.fitted import load
+from ddco_pyro.fitting.run import claimed, is_finished
 from ddco_pyro.inference import compile_all
 from ddco_pyro.jobs import Workers, run_all
+from ddco_pyro.metrics import Metrics
 from ddco_pyro.selection import choice as choosing
-from ddco_pyro.selection import folds as dividing
 from ddco_pyro.selection import grid
 from ddco_pyro.selection.choice import Choice
-from ddco_pyro.selection.folds import Folds, Score
+from ddco_pyro.selection.folds import assign, divide
 from ddco_pyro.selection.grid import Candidate
 from ddco_pyro.spec import Spec, with_overrides
 from ddco_pyro.training import data
+from ddco_pyro.training.networks import Dimensions, model_name
+from ddco_pyro.training.processes import one_thread
 
 __all__ = ["Choice", "Selection", "SelectionFailed", "Workers", "check", "final_spec", "known_demonstrations", "select"]
 
@@ -40,12 +44,15 @@ class SelectionFailed(Failed):
 
 @dataclass(frozen=True)
 class Selection:
-    """A finished cross-validation, its folder, and the demonstrations with the observations of every candidate."""
+    """A finished cross-validation, its folder, and the demonstrations with the observations of every candidate.
+
+    :param held_out: the names of the demonstrations that each fold holds out.
+    """
 
     folder: Path
     demos: Demonstrations
     choice: Choice
-    folds: Folds
+    held_out: Sequence[Sequence[str]]
 
 
 def known_demonstrations(spec: Spec) -> Demonstrations | None:
@@ -65,9 +72,9 @@ def check(spec: Spec, demos: Demonstrations | None = None) -> list[Candidate]:
     demos = data.outline(wide) if demos is None and data.in_file(wide) else demos
     candidates = grid.candidates(spec, data.dimensions(wide, demos))
     if demos is None:  # they will be collected
-        dividing.assign(own.count - len(set(own.exclude)), spec.selection.folds, spec.seed)
+        assign(own.count - len(set(own.exclude)), spec.selection.folds, spec.seed)
     else:
-        dividing.divide(demos, spec.selection.folds, spec.seed)
+        divide(demos, spec.selection.folds, spec.seed)
     return candidates
 
 
@@ -81,7 +88,7 @@ def select(
 ) -> Selection:
     """Score every candidate of the spec's grid in every fold, choose one, and write table and figure into the folder.
 
-    Scores that the folder holds are not computed again. The result depends on the spec and the demonstrations
+    Fits that the folder holds are not done again. The result depends on the spec and the demonstrations
     alone, not on workers or interruptions.
 
     >>> grid = "selection.grid.hierarchy.levels.0.count=[1, 2]"
@@ -101,34 +108,63 @@ def select(
     with claimed(folder, spec, resume):
         demos = demos or data.demonstrations(grid.wide(spec), on_event)
         record(folder, demos)
-        folds = dividing.divide(demos, spec.selection.folds, spec.seed)
-        write_text(folder / "folds.json", json_text({"folds": folds.held_out}))
-        candidates = grid.candidates(spec, folds.dimensions)
-        scores = _score_all(folder, folds, candidates, on_event, workers)
-        choice = choosing.choose(candidates, scores, len(folds.held_out))
+        folds = divide(demos, spec.selection.folds, spec.seed)
+        held_out = [fold.masks["valid"] for fold in folds]
+        write_text(folder / "folds.json", json_text({"folds": held_out}))
+        candidates = grid.candidates(spec, Dimensions.of(demos))
+        choice = choosing.choose(candidates, _fit_all(folder, folds, candidates, on_event, workers))
         _write(folder, spec, choice, folds)
     if choice.chosen is None:
         reasons = [reason for row in choice.rows for reason in row.failed.values()]
         raise SelectionFailed(f"every candidate has failed in some fold; the first reason: {reasons[0]}")
-    return Selection(folder, demos, choice, folds)
+    return Selection(folder, demos, choice, held_out)
 
 
-def _score_all(
-    folder: Path, folds: Folds, candidates: Sequence[Candidate], on_event: OnEvent, workers: Workers
-) -> list[Score]:
-    """The scores of all candidates in all folds, in their order."""
-    pairs = [(candidate.number, fold) for fold in range(len(folds.held_out)) for candidate in candidates]
-    kept = {pair: dividing.kept_score(folder, folds, *pair) for pair in pairs}
-    done = {pair: score for pair, score in kept.items() if score is not None}
-    on_event(CellsBegan("cross-validation", len(pairs), len(done)))
-    calls = {pair: partial(dividing.score, folds, candidates[pair[0]], pair[1]) for pair in pairs if pair not in done}
+def _fit_all(
+    folder: Path,
+    folds: Sequence[Demonstrations],
+    candidates: Sequence[Candidate],
+    on_event: OnEvent,
+    workers: Workers,
+) -> dict[tuple[int, int], Metrics | str]:
+    """The metrics of each candidate, by its number, in each fold; or why it failed there."""
+    pairs = [(candidate.number, fold) for fold in range(len(folds)) for candidate in candidates]
+    places = {pair: folder / "folds" / "{:03d}-{:02d}".format(*pair) for pair in pairs}
+    found: dict[tuple[int, int], Metrics | str] = {
+        pair: load(place, allow_code=True).metrics for pair, place in places.items() if is_finished(place)
+    }
+    on_event(CellsBegan("cross-validation", len(places), len(found)))
+    calls = {
+        pair: partial(_fitted, candidates[pair[0]].spec, folds[pair[1]], place)
+        for pair, place in places.items()
+        if pair not in found
+    }
     compile_all()
-    with run_all(calls, workers, "trained a fold") as scores:
-        for pair, score in scores:
-            dividing.keep_score(folder, score)
-            done[pair] = score
-            on_event(CellDone(f"{candidates[score.candidate].name}, fold {score.fold}", score.failed))
-    return [done[pair] for pair in sorted(pairs)]
+    with run_all(calls, workers, "trained a fold") as fitted:
+        for pair, metrics in fitted:
+            found[pair] = metrics
+            failed = metrics if isinstance(metrics, str) else ""
+            on_event(CellDone(f"{candidates[pair[0]].name}, fold {pair[1]}", failed))
+    return dict(sorted(found.items()))
+
+
+def _fitted(spec: Spec, demos: Demonstrations, folder: Path) -> Metrics | str:
+    """The metrics of a fit to a fold's demonstrations, on one thread for the same bits anywhere; or why it failed.
+
+    A failure does not stop other folds.
+    """
+    try:
+        spec = with_overrides(spec, WHOLE)
+        with one_thread():
+            return fit_beside(model_name(spec), spec, data.seen(spec, demos), folder).metrics
+    except Damaged:
+        raise
+    except Exception as error:
+        return reason(error)
+
+
+WHOLE = {"demonstrations.hold_out_by": None, "demonstrations.leave_one_out": False}
+"""Masks alone say what is held out."""
 
 
 def final_spec(chosen: Candidate) -> Spec:
@@ -137,10 +173,10 @@ def final_spec(chosen: Candidate) -> Spec:
     return with_overrides(chosen.spec, {**apart, "demonstrations.leave_one_out": False})
 
 
-def _write(folder: Path, spec: Spec, choice: Choice, folds: Folds) -> None:
+def _write(folder: Path, spec: Spec, choice: Choice, folds: Sequence[Demonstrations]) -> None:
     found = {
-        "folds": len(folds.held_out),
-        "demonstrations": len(folds.demos),
+        "folds": len(folds),
+        "demonstrations": sum(len(fold.masks["valid"]) for fold in folds),
         "seed": spec.seed,
         **choosing.as_data(choice),
     }

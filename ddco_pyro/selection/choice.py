@@ -6,9 +6,10 @@ error here therefore counts a fold, not a demonstration, as one observation.
 
 from __future__ import annotations
 
+import math
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,14 +17,11 @@ import numpy as np
 
 from ddco_pyro.drawing.page import Page, Table, Text
 from ddco_pyro.drawing.words import NAT, number, with_error
-from ddco_pyro.metrics import Difference
-from ddco_pyro.selection.folds import Score
+from ddco_pyro.metrics import Difference, Metrics
 from ddco_pyro.selection.grid import Candidate, point_name
 from ddco_pyro.statistics import paired
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from ddco_pyro.drawing.figures import Interval
 
 RULE = (
@@ -41,29 +39,65 @@ STD_NOTE = (
 
 @dataclass(frozen=True)
 class Row:
-    """The result of one candidate; log-likelihoods in nats per step.
+    """The fits of one candidate; log-likelihoods in nats per step.
 
-    :param mean: held-out log-likelihood per step over the scored folds, and its standard ``error``.
+    :param fits: the metrics of each fold's fit, by number of the fold.
+    :param failed: why there is no fit, by number of the fold.
     :param difference: this minus the best over the folds of both.
-    :param folds: log-likelihood per step of each scored fold, by number.
-    :param failed: the reason, by number of the fold.
-    :param gradient_steps: of a fold's training, on average; None where no fold was scored.
-    :param unconverged: the folds whose training had not converged.
     """
 
     candidate: Candidate
-    mean: float | None
-    error: float | None
-    difference: Difference | None
-    folds: Mapping[int, float]
+    fits: Mapping[int, Metrics]
     failed: Mapping[int, str]
-    gradient_steps: float | None = None
-    unconverged: tuple[int, ...] = ()
+    difference: Difference | None = None
+
+    def arrays(self, folds: Iterable[int]) -> tuple[np.ndarray, np.ndarray]:
+        """Held-out log-likelihood in nats, and steps, of some folds."""
+        held_out = [self.fits[fold].valid for fold in folds]
+        totals = [math.fsum(demo.log_likelihood for demo in demos) for demos in held_out]
+        return np.array(totals), np.array([float(sum(demo.steps for demo in demos)) for demos in held_out])
+
+    @property
+    def folds(self) -> dict[int, float]:
+        """Held-out log-likelihood per step of each fold, by its number."""
+        values, steps = self.arrays(self.fits)
+        return dict(zip(self.fits, (values / steps).tolist(), strict=True))
+
+    @property
+    def mean(self) -> float | None:
+        """Held-out log-likelihood per step over the folds; None where none has a fit."""
+        values, steps = self.arrays(self.fits)
+        return float(values.sum() / steps.sum()) if self.fits else None
+
+    @property
+    def error(self) -> float | None:
+        """The standard error of the mean; None with fewer than two fits."""
+        values, steps = self.arrays(self.fits)
+        return paired(values, np.zeros(len(values)), steps).standard_error if self.fits else None
+
+    @property
+    def gradient_steps(self) -> float | None:
+        """Of a fold's training, on average."""
+        steps = [fit.training.spent.gradient_steps or 0 for fit in self.fits.values()]
+        return float(np.mean(steps)) if steps else None
+
+    @property
+    def unconverged(self) -> list[int]:
+        """The folds whose training had not converged."""
+        return [fold for fold, fit in self.fits.items() if not fit.training.converged]
 
     @property
     def status(self) -> str:
         """``scored``, or ``failed`` where a fold failed."""
         return "failed" if self.failed else "scored"
+
+    def minus(self, best: Row | None) -> Row:
+        """This row with its difference to the best."""
+        both = [fold for fold in self.fits if best and fold in best.fits]
+        if best is None or len(both) < 2:
+            return self
+        (ours, steps), (theirs, _) = self.arrays(both), best.arrays(both)
+        return replace(self, difference=paired(ours, theirs, steps))
 
 
 @dataclass(frozen=True)
@@ -87,7 +121,7 @@ class Choice:
         """
         best = self.best
         for path, own in best.candidate.values.items() if best else ():
-            values = {row.candidate.values[path] for row in self.rows if _is_number(row.candidate.values[path])}
+            values = {value for row in self.rows if type(value := row.candidate.values[path]) in (int, float)}
             count = path.endswith(".count")
             if len(values) < 2 or own not in (min(values), max(values)) or (count and own == 1):
                 continue
@@ -99,24 +133,24 @@ class Choice:
             )
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def choose(candidates: Sequence[Candidate], scores: Sequence[Score], folds: int) -> Choice:
+def choose(candidates: Sequence[Candidate], fits: Mapping[tuple[int, int], Metrics | str]) -> Choice:
     """The best candidate, and the candidate that the one-standard-error rule chooses.
 
-    :param folds: how many folds a complete candidate has.
+    :param fits: by the number of the candidate and of the fold, which is complete: metrics, or why there are none.
     """
-    results = [_Scored(candidate, [s for s in scores if s.candidate == candidate.number]) for candidate in candidates]
-    complete = [result for result in results if len(result.good) == folds]
-    best = max(complete, key=lambda result: result.mean, default=None)
-    reference = best or max((result for result in results if result.good), key=lambda result: result.mean, default=None)
-    rows = [result.row(reference) for result in results]
-    best_row = rows[best.candidate.number] if best else None
-    within = [row for row in rows if within_one_error(row, best_row)]
+    rows = []
+    for candidate in candidates:
+        own = {fold: fit for (number, fold), fit in fits.items() if number == candidate.number}
+        done = {fold: fit for fold, fit in own.items() if not isinstance(fit, str)}
+        rows.append(Row(candidate, done, {fold: why for fold, why in own.items() if isinstance(why, str)}))
+    scored = [row for row in rows if row.fits]
+    complete = [row for row in scored if not row.failed]
+    reference = max(complete or scored, key=lambda row: row.mean or 0.0, default=None)
+    rows = [row.minus(reference) for row in rows]
+    best = next((row for row in rows if complete and reference and row.candidate is reference.candidate), None)
+    within = [row for row in rows if within_one_error(row, best)]
     chosen = min(within, key=lambda row: (row.candidate.parameters, -(row.mean or 0.0)), default=None)
-    return Choice(rows, best_row, chosen)
+    return Choice(rows, best, chosen)
 
 
 def within_one_error(row: Row, best: Row | None) -> bool:
@@ -126,77 +160,36 @@ def within_one_error(row: Row, best: Row | None) -> bool:
     return best.mean - row.mean <= best.error
 
 
-class _Scored:
-    """The scores of one candidate by fold."""
-
-    def __init__(self, candidate: Candidate, scores: Sequence[Score]) -> None:
-        self.candidate = candidate
-        by_fold = sorted(scores, key=lambda score: score.fold)
-        self.good = {score.fold: score for score in by_fold if not score.failed}
-        self.failed = {score.fold: score.failed for score in by_fold if score.failed}
-
-    def arrays(self, folds: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-        """Log-likelihood and steps of some folds."""
-        chosen = [self.good[fold] for fold in folds]
-        return np.array([score.total for score in chosen]), np.array([float(sum(score.steps)) for score in chosen])
-
-    @property
-    def mean(self) -> float:
-        """Held-out log-likelihood per step."""
-        values, steps = self.arrays(list(self.good))
-        return float(values.sum() / steps.sum())
-
-    def row(self, best: _Scored | None) -> Row:
-        """The candidate's row, compared with the best."""
-        if not self.good:
-            return Row(self.candidate, None, None, None, {}, self.failed)
-        values, steps = self.arrays(list(self.good))
-        error = paired(values, np.zeros(len(values)), steps).standard_error
-        per_fold = dict(zip(self.good, (values / steps).tolist(), strict=True))
-        took = float(np.mean([score.gradient_steps for score in self.good.values()]))
-        rising = tuple(fold for fold, score in self.good.items() if not score.converged)
-        return Row(self.candidate, self.mean, error, self.against(best), per_fold, self.failed, took, rising)
-
-    def against(self, best: _Scored | None) -> Difference | None:
-        """Difference to another candidate per step, over the folds of both."""
-        both = [fold for fold in self.good if best and fold in best.good]
-        if best is None or len(both) < 2:
-            return None
-        (ours, steps), (theirs, _) = self.arrays(both), best.arrays(both)
-        return paired(ours, theirs, steps)
-
-
 def as_data(choice: Choice) -> dict[str, Any]:
     """The choice as plain data for ``selection.json``."""
+    none = {"nats_per_step": None, "standard_error": None}
     return {
         "rule": RULE,
         "notes": choice.notes,
         "best": choice.best.candidate.number if choice.best else None,
         "chosen": choice.chosen.candidate.number if choice.chosen else None,
-        "candidates": [_row(row, choice.best) for row in choice.rows],
+        "candidates": [
+            {
+                "number": row.candidate.number,
+                "name": row.candidate.name,
+                "values": dict(row.candidate.values),
+                "parameters": row.candidate.parameters,
+                "status": row.status,
+                "log_likelihood_per_step": row.mean,
+                "standard_error": row.error,
+                "difference": row.difference.model_dump() if row.difference else none,
+                "within_one_standard_error": within_one_error(row, choice.best),
+                "gradient_steps": row.gradient_steps,
+                "not_converged": len(row.unconverged),
+                "folds": [{"fold": fold, "log_likelihood_per_step": value} for fold, value in row.folds.items()],
+            }
+            for row in choice.rows
+        ],
         "failed": [
             {"candidate": row.candidate.number, "name": row.candidate.name, "fold": fold, "reason": reason}
             for row in choice.rows
             for fold, reason in row.failed.items()
         ],
-    }
-
-
-def _row(row: Row, best: Row | None) -> dict[str, Any]:
-    unknown = {"nats_per_step": None, "standard_error": None}
-    return {
-        "number": row.candidate.number,
-        "name": row.candidate.name,
-        "values": dict(row.candidate.values),
-        "parameters": row.candidate.parameters,
-        "status": row.status,
-        "log_likelihood_per_step": row.mean,
-        "standard_error": row.error,
-        "difference": row.difference.model_dump() if row.difference else unknown,
-        "within_one_standard_error": within_one_error(row, best),
-        "gradient_steps": row.gradient_steps,
-        "not_converged": len(row.unconverged),
-        "folds": [{"fold": fold, "log_likelihood_per_step": value} for fold, value in row.folds.items()],
     }
 
 
@@ -233,17 +226,13 @@ def markdown(choice: Choice, data: Mapping[str, Any]) -> str:
 
 
 def write_figure(choice: Choice, path: Path) -> None:
-    """Draw the choice as PNG; nothing where no candidate was scored."""
-    if any(row.mean is not None for row in choice.rows):
-        from ddco_pyro.drawing.figures import save, style
+    """Draw log-likelihoods and paired differences of candidates as PNG; nothing where no candidate was scored.
 
-        with style():
-            save(draw(choice), path, "Held-out log-likelihood of each candidate, and paired differences to the best")
-
-
-def draw(choice: Choice) -> Figure:
-    """Log-likelihood of each candidate with the band of one standard error below the best, and paired differences."""
-    from ddco_pyro.drawing.figures import ACCENT, FAINT, INK, Interval, Panel, interval_plot
+    A band ends one standard error below the best.
+    """
+    if all(row.mean is None for row in choice.rows):
+        return
+    from ddco_pyro.drawing.figures import ACCENT, FAINT, INK, Interval, Panel, interval_plot, save, style
 
     best, band = choice.best, None
     if best and best.mean is not None and best.error is not None:
@@ -272,4 +261,6 @@ def draw(choice: Choice) -> Figure:
         f"{row.candidate.name} ({row.candidate.parameters} parameters){' (failed)' if row.failed else ''}"
         for row in choice.rows
     ]
-    return interval_plot(names, panels, [marks, *notes])
+    with style():
+        figure = interval_plot(names, panels, [marks, *notes])
+        save(figure, path, "Held-out log-likelihood of each candidate, and paired differences to the best")

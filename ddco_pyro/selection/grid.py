@@ -107,10 +107,11 @@ def _refuse_other_measures(candidates: Sequence[Candidate], dimensions: Dimensio
 
     :raises SpecError: candidates model a control dimension as different kinds.
     """
-    parts = [control_parts(candidate.spec.control, dimensions.control) for candidate in candidates]
-    for candidate, own in zip(candidates[1:], parts[1:], strict=True):
-        if different := difference(parts[0], own):
+    first, *others = candidates
+    for candidate in others:
+        own, their = (control_parts(one.spec.control, dimensions.control) for one in (first, candidate))
+        if different := difference(own, their):
             raise SpecError(
-                f"selection.grid: {candidates[0].name} and {candidate.name} measure different things: {different}; "
+                f"selection.grid: {first.name} and {candidate.name} measure different things: {different}; "
                 "densities and probabilities cannot be ranked, so give all candidates the same control.kind"
             )

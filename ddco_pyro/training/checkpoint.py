@@ -62,9 +62,8 @@ class TrainingData:
         """The seed of a restart, of one of its stages, of an epoch of a stage, or of a shard of a minibatch.
 
         The first restarts of two ways to begin have the same seeds, and so have the second ones: the way alone differs.
-        numpy pads with zeros: a stage has the seed of its first epoch, and the first stage that of its restart. Those
-        seeds draw different things: weights, clusters, the order of minibatches. No two restarts of one way, stages of
-        a restart, epochs or shards have the same seed.
+        numpy pads with zeros: a stage has the seed of its first epoch, and the first stage that of its restart. They
+        draw different things.
         """
         own, training = self.spec.seed, self.spec.training.seed
         entropy = [own if training is None else training, self.repetition(restart), *place]
@@ -91,7 +90,7 @@ class Progress:
     :param objective: of the training demonstrations under the model that is kept, with the log-prior of its weights,
         nats per step.
     :param sounded: the same at the pause in which restarts are compared; of one that ended before it, at the end.
-    :param ended: a :class:`ddco_pyro.training.stages.StageEnd` for each stage that has ended.
+    :param ended: a :class:`ddco_pyro.metrics.Stage` for each stage that has ended.
     :param history: a row for each epoch.
     :param device: the kind of device that its networks are trained on.
     :param diverged: where a log-likelihood became NaN or infinite, which ended the restart.

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from ddco_pyro.data.arrays import is_picture, network_input
-from ddco_pyro.data.demonstration import Demonstration, check
-from ddco_pyro.data.demonstrations import Demonstrations, bytes_of_a_fit, stored
+from ddco_pyro.data.demonstration import Demonstration, check, needed
+from ddco_pyro.data.demonstrations import Demonstrations, stored
 from ddco_pyro.data.division import check_trained, with_values
 from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.memory import refuse_too_much
@@ -117,8 +118,7 @@ def demonstrations(spec: Spec, on_event: OnEvent = ignore) -> Demonstrations:
     path = sought.file
     if path is None or not in_file(spec):
         path = collect(str(spec.demonstrated_task), sought, path, on_event, spec.observed)
-    _refuse_what_cannot_be_read(spec, path)
-    return _set_apart(spec, Demonstrations.read(path, spec.observed, _labels(spec), sought.exclude))
+    return _read(spec, path, lambda demo: Demonstration(**vars(demo)))
 
 
 def outline(spec: Spec) -> Demonstrations:
@@ -128,22 +128,36 @@ def outline(spec: Spec) -> Demonstrations:
     """
     path = spec.demonstrations.file
     assert path is not None  # the demonstrations are in a file
-    _refuse_what_cannot_be_read(spec, path)
-    exclude = spec.demonstrations.exclude
-    controls = Demonstrations.read(path, (), _labels(spec), exclude)
-    with stored(path, spec.observed, (), exclude) as (found, *_):
-        outlined = [_outlined(demo, of) for demo, of in zip(controls, found, strict=True)]
-    return _set_apart(spec, replace(controls, demonstrations=tuple(outlined)))
+    return _read(spec, path, _outlined)
 
 
-def _outlined(demo: Demonstration, found: Demonstration) -> Demonstration:
-    """A demonstration with zeros, which need no memory, in place of observations as they are found."""
-    check(found)
+def _read(spec: Spec, path: Path, ready: Callable[[Demonstration], Demonstration]) -> Demonstrations:
+    """The demonstrations of a file, each as ``ready`` makes it of what the file stores.
+
+    :raises DemonstrationsError: the file is missing or damaged, or a fit to it does not fit into memory.
+    """
+    if not path.exists():
+        read = ["actions", *(f"obs/{key}" for key in spec.observed), *(f"labels/{name}" for name in _labels(spec))]
+        raise DemonstrationsError(
+            f"demonstrations.path: {path}: there is no such file; put it there, or fit to another with --set "
+            f"demonstrations.path=FILE; it has to be HDF5 in robomimic's layout, with {', '.join(read)} in each "
+            "data/<demonstration>"
+        )
+    with stored(path, spec.observed, _labels(spec), spec.demonstrations.exclude) as (found, masks, attributes):
+        remedy = "leave observations out, or make its demonstrations fewer, shorter or equally long"
+        refuse_too_much(needed(found), f"{path}: a fit to {', '.join(spec.observed)}", remedy)
+        return _set_apart(spec, Demonstrations(tuple(ready(demo) for demo in found), masks, attributes))
+
+
+def _outlined(demo: Demonstration) -> Demonstration:
+    """A demonstration with zeros, which need no memory, in place of observations."""
+    check(demo)
     zeros = {
         key: np.broadcast_to(np.zeros((), np.uint8 if is_picture(array) else np.float64), array.shape)
-        for key, array in found.observations.items()
+        for key, array in demo.observations.items()
     }
-    return Demonstration.stored(**{**vars(demo), "observations": zeros})
+    known = Demonstration(**{**vars(demo), "observations": {}})
+    return Demonstration.stored(**{**vars(known), "observations": zeros})
 
 
 def seen(spec: Spec, demos: Demonstrations) -> Demonstrations:
@@ -193,21 +207,3 @@ def _labels(spec: Spec) -> tuple[str, ...]:
     """Names of the labels to compare segments with, and to train from."""
     trained = spec.training.labels
     return tuple(dict.fromkeys((*spec.demonstrations.label_names, *([trained.source] if trained else []))))
-
-
-def _needed(spec: Spec) -> str:
-    """The remedy for a missing file."""
-    read = ["actions", *(f"obs/{key}" for key in spec.observed), *(f"labels/{name}" for name in _labels(spec))]
-    return (
-        "put it there, or fit to another with --set demonstrations.path=FILE; it has to be HDF5 in robomimic's layout, "
-        f"with {', '.join(read)} in each data/<demonstration>"
-    )
-
-
-def _refuse_what_cannot_be_read(spec: Spec, path: Path) -> None:
-    """Refuse a missing file, and by its headers a file whose demonstrations do not fit into memory."""
-    if not path.exists():
-        raise DemonstrationsError(f"demonstrations.path: {path}: there is no such file; {_needed(spec)}")
-    remedy = "leave observations out, or make its demonstrations fewer, shorter or equally long"
-    what = f"{path}: a fit to {', '.join(spec.observed)}"
-    refuse_too_much(bytes_of_a_fit(path, spec.observed, spec.demonstrations.exclude), what, remedy)

@@ -12,7 +12,7 @@ Where some options have labelled steps, their clusters start from the means of t
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -60,10 +60,14 @@ class Clusters:
         window: int = 0,
     ) -> None:
         self._controls, self._read, self._window = controls, read, window
-        self._most = most_rows(next(self._blocks(batch)).shape[1])
+        most = most_rows(next(self._blocks(batch)).shape[1])
         chosen = np.ones(batch.steps, dtype=bool)
-        chosen[np.random.default_rng(seed).permutation(batch.steps)[self._most :]] = False
-        rows = np.concatenate(list(_only(chosen, self._blocks(batch))))
+        chosen[np.random.default_rng(seed).permutation(batch.steps)[most:]] = False
+        left, found = chosen, []
+        for block in self._blocks(batch):
+            here, left = np.split(left, [len(block)])
+            found.append(block[here])
+        rows = np.concatenate(found)
         known = None if labels is None else labels[_alive(batch)].numpy()[chosen]
         self._namer: LogisticRegression | KMeans
         if known is not None and options > 1 and len(_labelled(known, options)) == options:
@@ -82,7 +86,7 @@ class Clusters:
     def choices(self, batch: Batch) -> Tensor:
         """The cluster of each step, [N, T], 1 to k; 0 where there is padding."""
         choices = torch.zeros(batch.inputs.batch, dtype=torch.long)
-        clusters = [self._namer.predict(rows) for rows in _together(self._blocks(batch), self._most)]
+        clusters = [self._namer.predict(rows) for rows in self._blocks(batch)]
         choices[_alive(batch)] = torch.as_tensor(np.concatenate(clusters), dtype=torch.long) + 1
         return choices
 
@@ -108,26 +112,6 @@ class Clusters:
             first = last
 
 
-def _only(chosen: np.ndarray, blocks: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
-    """The chosen rows of each block; ``chosen`` has an entry for each row of all blocks."""
-    first = 0
-    for block in blocks:
-        yield block[chosen[first : first + len(block)]]
-        first += len(block)
-
-
-def _together(blocks: Iterable[np.ndarray], rows: int) -> Iterator[np.ndarray]:
-    """Blocks joined to blocks of about so many rows."""
-    waiting: list[np.ndarray] = []
-    for block in blocks:
-        waiting.append(block)
-        if sum(map(len, waiting)) >= rows:
-            yield np.concatenate(waiting)
-            waiting = []
-    if waiting:
-        yield np.concatenate(waiting)
-
-
 def most_rows(numbers: int) -> int:
     """The most steps, with so many numbers each, that are clustered together: memory bounds them."""
     return max(1, BYTES_AT_ONCE // (8 * max(1, numbers)))
@@ -138,104 +122,43 @@ def joined(seen: np.ndarray, actions: np.ndarray) -> np.ndarray:
     return np.concatenate([seen, np.sqrt(seen.shape[1] / actions.shape[1]) * actions], axis=1)
 
 
-class EqualParts:
-    """Every trajectory cut into ``options`` parts of equal length, named as the options 1 to k in order.
+def equal_parts(batch: Batch, options: int) -> Tensor:
+    """The part of each step in trajectories cut into ``options`` equal parts, [N, T], 1 to k; 0 where there is padding.
 
     Training of left-to-right hidden Markov models starts from this uniform segmentation.
     """
-
-    def __init__(self, options: int) -> None:
-        self.options = options
-
-    def choices(self, batch: Batch) -> Tensor:
-        """The part of each step, [N, T], 1 to k; 0 where there is padding."""
-        part = batch.inputs.time * self.options // batch.lengths[:, None] + 1
-        return torch.where(_alive(batch), part, 0)
+    part = batch.inputs.time * options // batch.lengths[:, None] + 1
+    return torch.where(_alive(batch), part, 0)
 
 
 # --- ways to begin ----------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class Given:
-    """What the initial segments of a level come from; the parameters are those of :class:`Clusters`."""
+class Way:
+    """A way to begin: initial segments, and what is trained first.
 
-    batch: Batch
-    options: int
-    seed: int
-    labels: Tensor | None
-    read: Sequence[str]
-    best: bool
-    window: int
-
-    def clusters(self, controls: bool, window: int = 0) -> Clusters:
-        """Clusters of the observations, and of the controls if asked for."""
-        return Clusters(self.batch, self.options, self.seed, controls, self.labels, self.read, self.best, window)
-
-
-class Observations:
-    """Clusters of the observations that the policies read.
-
-    :cvar stage: names the stages that train on the segments; empty where there are no segments.
-    :cvar memoryless: whether the memoryless mixture is trained before options that last.
-    :cvar ordered: whether segments are numbered in the order of time.
+    :param stage: names the stages that train on clusters, or on equal parts; empty for random weights.
+    :param controls: whether clusters are of observations and controls, or of observations alone.
+    :param windowed: whether clusters are of means over ``training.window`` steps before and after each.
+    :param memoryless: whether the memoryless mixture is trained before options that last.
+    :param ordered: whether segments are equal parts of each demonstration, numbered in the order of time.
     """
 
-    stage = "vq"
-    memoryless = False
-    ordered = False
-
-    def segments(self, given: Given) -> Clusters | EqualParts:
-        """What gives each step its option, :meth:`Clusters.choices`."""
-        return given.clusters(controls=False)
+    stage: str = "vq"
+    controls: bool = False
+    windowed: bool = False
+    memoryless: bool = False
+    ordered: bool = False
 
 
-class ObservationsAndControls(Observations):
-    """Clusters of observations and controls."""
-
-    def segments(self, given: Given) -> Clusters | EqualParts:
-        """Clusters of both."""
-        return given.clusters(controls=True)
-
-
-class Windows(Observations):
-    """Clusters of means of observations and controls over the steps around each."""
-
-    def segments(self, given: Given) -> Clusters | EqualParts:
-        """Clusters of both, over ``training.window`` steps before and after."""
-        return given.clusters(controls=True, window=given.window)
-
-
-class Mixture(ObservationsAndControls):
-    """The memoryless mixture, which is trained first from clusters of observations and controls."""
-
-    memoryless = True
-
-
-class Parts(Observations):
-    """Parts of equal length of each demonstration."""
-
-    stage = "parts"
-    ordered = True
-
-    def segments(self, given: Given) -> Clusters | EqualParts:
-        """As many parts as options."""
-        return EqualParts(given.options)
-
-
-class Random(Observations):
-    """Random weights."""
-
-    stage = ""
-
-
-WAYS: Mapping[Start, Observations] = {
-    "vq": Observations(),
-    "vq_controls": ObservationsAndControls(),
-    "windows": Windows(),
-    "equal_parts": Parts(),
-    "mixture": Mixture(),
-    "random": Random(),
+WAYS: Mapping[Start, Way] = {
+    "vq": Way(),
+    "vq_controls": Way(controls=True),
+    "windows": Way(controls=True, windowed=True),
+    "equal_parts": Way("parts", ordered=True),
+    "mixture": Way(controls=True, memoryless=True),
+    "random": Way(""),
 }
 """Every way to begin, by its name in a spec."""
 

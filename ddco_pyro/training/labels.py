@@ -14,7 +14,6 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.spec import Spec, SpecError
 from ddco_pyro.training.data import train_and_valid, tuning_split
 from ddco_pyro.training.networks import Dimensions
-from ddco_pyro.training.stages import Stage
 
 
 @dataclass(frozen=True)
@@ -64,10 +63,6 @@ class Labels:
         names = tuple(demo.name for demo in used)
         ours, theirs = (choices(part, labels.source, values, names) for part in (train, tune))
         return cls(number, values, names, ours, theirs)
-
-    def matter_in(self, stage: Stage) -> bool:
-        """Whether a stage of training uses the labels."""
-        return stage.discovering is None or self.level <= stage.discovering
 
 
 def used(spec: Spec, demos: Demonstrations) -> Labels | None:

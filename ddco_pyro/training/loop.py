@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
@@ -40,7 +40,7 @@ from ddco_pyro.training.optimizers import (
     restore_optimizer,
 )
 from ddco_pyro.training.processes import Ranks, device_of, one_thread, repeatable
-from ddco_pyro.training.stages import EVERYTHING, Stage, StageEnd, plan, share
+from ddco_pyro.training.stages import EVERYTHING, Stage, plan, share, stage_end
 
 SAVE_EVERY = 5.0
 """Seconds between checkpoints, at least: an epoch of a small model takes less time than its checkpoint."""
@@ -125,7 +125,8 @@ class StageTraining:
             ridge, discovering = self.spec.optimizer.ridge, stage.discovering
             self.whole = Expectation(model, stage.trained, self._score, ridge, discovering, roughly=not last)
         elif optimizer == "lbfgs":
-            self.whole = QuasiNewton(model, self._backward_whole, self.spec.optimizer.weight_decay)
+            gradient = partial(backward, self.objective)
+            self.whole = QuasiNewton(model, gradient, self.spec.optimizer.weight_decay)
         else:
             self.optimizer = gradient_optimizer(optimizer, self.spec.optimizer, self.parameters)
         decay = self.spec.average
@@ -145,8 +146,7 @@ class StageTraining:
     def converged(self) -> bool:
         """Whether patience has run out, or a step over all demonstrations gains nothing more."""
         patience = self.spec.patience if self._tuned else None
-        out = patience is not None and self.restart.progress.stale >= patience
-        return out or self._at_optimum
+        return self._at_optimum or (patience is not None and self.restart.progress.stale >= patience)
 
     @property
     def _at_optimum(self) -> bool:
@@ -193,9 +193,6 @@ class StageTraining:
     def _score(self, tables: Tables, piece: Batch, rows: Tensor) -> Tensor:
         return self.objective.values(self.objective.clamped(tables, rows), piece.lengths).sum()
 
-    def _backward_whole(self, model: Hierarchy, batch: Batch) -> float:
-        return backward(self.objective, model, batch, batch.by_length)
-
     def _gradient_steps(self, place: tuple[int, int, int]) -> float:
         """A gradient step on each minibatch; the log-likelihood on the way, nats.
 
@@ -232,17 +229,13 @@ class StageTraining:
         steps, now, total = int(batch.lengths[rows].sum()), self.restart.progress, 0.0
         sums: Gradients = [None] * len(self.parameters)
         seeds = (self.data.seed(now.restart, now.stage, now.epoch, number, shard) for shard in range(self.spec.shards))
-        shards = zip(self._shards(rows), seeds, strict=False)
+        shards = zip(rows.tensor_split(min(self.spec.shards, len(rows))), seeds, strict=False)  # none is empty
         for value, gradients in self.ranks.each(partial(self._shard, batch, *shard, steps) for shard in shards):
             total += value
             sums = [_sum(*pair) for pair in zip(sums, gradients, strict=True)]
         for parameter, gradient in zip(self.parameters, sums, strict=True):
             parameter.grad = None if gradient is None else torch.from_numpy(gradient).to(parameter.device)
         return total
-
-    def _shards(self, rows: Tensor) -> tuple[Tensor, ...]:
-        """A minibatch in parts as equal as they can be, none of them empty."""
-        return rows.tensor_split(min(self.spec.shards, len(rows)))
 
     def _shard(self, batch: Batch, rows: Tensor, seed: int, steps: int) -> tuple[float, Gradients]:
         """The part of a shard in the objective, and in the gradient of each parameter.
@@ -277,10 +270,7 @@ class StageTraining:
         """The best epoch is the model that the stage gives."""
         now = self.restart.progress
         self.model.load_state_dict(self.restart.states["best"])
-        end = StageEnd.of(self.stage.name, cap, now.tune, self.spec.patience)
-        if self._at_optimum:
-            end = replace(end, rising=0.0)
-        now.ended.append(asdict(end))
+        now.ended.append(stage_end(self.stage.name, cap, now.tune, self.spec.patience, self._at_optimum))
 
 
 def backward(objective: Objective, model: Hierarchy, batch: Batch, rows: Tensor, steps: int | None = None) -> float:

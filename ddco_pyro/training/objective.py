@@ -17,7 +17,7 @@ from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.outputs import Outputs
 from ddco_pyro.model.tables import Tables
 from ddco_pyro.training.checkpoint import Progress, State, TrainingData
-from ddco_pyro.training.initialization import WAYS, Given
+from ddco_pyro.training.initialization import WAYS, Clusters, equal_parts
 from ddco_pyro.training.processes import Ranks
 from ddco_pyro.training.stages import Stage, starts_of
 from ddco_pyro.training.upper import Constants, expected, fitted
@@ -61,7 +61,7 @@ class Objective:
         self.known: tuple[Known, Known] = {}, {}
         self.evidence: tuple[Known, Known] = {}, {}
         labels = data.labels
-        if labels is not None and labels.matter_in(stage):
+        if labels is not None and (stage.discovering is None or labels.level <= stage.discovering):
             self.known = {labels.level: labels.train}, {labels.level: labels.tune}
             if labels.evidence is not None:
                 self.evidence = {labels.level: labels.evidence[0]}, {labels.level: labels.evidence[1]}
@@ -89,12 +89,14 @@ class Objective:
             for known, found in zip(self.known, labels.starts, strict=True):
                 known[level] = torch.where(known[level] < 0, found, known[level])
             return
-        count, read = hierarchy.levels[level - 1].count, hierarchy.read_by(level)
-        best = not data.repetition(restart)  # further restarts are to differ
-        given = Given(data.train, count, seed, self.known[0].get(level), read, best, data.spec.training.window)
-        start = WAYS[starts_of(data.spec)[restart]].segments(given)
+        count, way = hierarchy.levels[level - 1].count, WAYS[starts_of(data.spec)[restart]]
+        if not way.ordered:
+            best = not data.repetition(restart)  # further restarts are to differ
+            window = data.spec.training.window if way.windowed else 0
+            own = self.known[0].get(level), hierarchy.read_by(level)
+            clusters = Clusters(data.train, count, seed, way.controls, *own, best, window)
         for known, batch in zip(self.known, (data.train, data.tune), strict=True):
-            choices = start.choices(batch)
+            choices = equal_parts(batch, count) if way.ordered else clusters.choices(batch)
             labelled = known.get(level, choices)
             known[level] = torch.where(labelled < 0, choices, labelled)
 

@@ -99,7 +99,7 @@ class QuasiNewton:
     :ivar steps: steps of the demonstrations, once the first step has begun.
     """
 
-    def __init__(self, model: Hierarchy, backward: Callable[[Hierarchy, Batch], float], decay: float) -> None:
+    def __init__(self, model: Hierarchy, backward: Callable[[Hierarchy, Batch, Tensor], float], decay: float) -> None:
         self.model, self._backward, self._decay, self.steps = model, backward, decay, 0
         self._gains = [math.inf]
         self._parameters = list(model.parameters())
@@ -130,7 +130,7 @@ class QuasiNewton:
         if evaluation is None:
             self._optimizer.zero_grad()
             with torch.enable_grad():
-                value = self._backward(self.model, batch)
+                value = self._backward(self.model, batch, batch.by_length)
             gradients = [p.grad + self._decay * p.detach() for p in self._parameters if p.grad is not None]
             loss = 0.5 * self._decay * float(weights @ weights) - value / batch.steps
             evaluation = weights, loss, value, gradients

@@ -59,10 +59,7 @@ def recognise(model: Hierarchy, data: TrainingData, demos: Demonstrations) -> tu
         much the recogniser counts.
     """
     labels, own, recogniser = data.labels, data.spec.training.labels, model.recogniser
-    assert labels is not None
-    assert own is not None
-    assert own.recogniser is not None
-    assert recogniser is not None
+    assert labels and own and own.recogniser and recogniser  # noqa: PT018
     asked = own.recogniser
     batch = encode(demos, model.encoder, model.scaling)
     options = choices(demos, own.source, labels.values, labels.demonstrations)

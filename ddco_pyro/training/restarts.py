@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,14 +25,7 @@ import torch
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.errors import BadInput
-from ddco_pyro.events import (
-    OnEvent,
-    RestartDiverged,
-    RestartStopped,
-    TrainingBegan,
-    TrainingEnded,
-    ignore,
-)
+from ddco_pyro.events import OnEvent, RestartDiverged, RestartStopped, TrainingBegan, TrainingEnded, ignore
 from ddco_pyro.inference.engines import STEPS, TRAJECTORIES, EngineCheck, compare_engines
 from ddco_pyro.inference.paths import segment
 from ddco_pyro.jobs import Workers, run_all
@@ -51,7 +44,7 @@ from ddco_pyro.training.optimizers import optimizer_of
 from ddco_pyro.training.processes import Ranks, described, device_of, one_thread
 from ddco_pyro.training.recognition import recognise
 from ddco_pyro.training.ridge import cross_validated
-from ddco_pyro.training.stages import StageEnd, plan, starts_of
+from ddco_pyro.training.stages import plan, starts_of
 
 SOUNDING, BY_GRADIENT = 5, 50
 """Epochs of the last stage before restarts are compared: of EM, and of gradient steps."""
@@ -149,8 +142,7 @@ class Trainer:
         fitted = encoder.state_dict(), scaling.state_dict()
         self.data = TrainingData(spec, dimensions, *encoded, train.names, *fitted, Labels.of(spec, train, tune))
         self.ridge = ridge = spec.training.optimizer.ridge.policy
-        by_em = optimizer_of(spec.training.optimizer, self.hierarchy) == "em"
-        if by_em and spec.training.optimizer.ridge.cross_validated:
+        if self._optimizer == "em" and spec.training.optimizer.ridge.cross_validated:
             self.ridge = cross_validated(self.hierarchy, encoded[0], ridge, self.data.seed(0))
             raised = with_overrides(spec, {"training.optimizer.ridge.policy": self.ridge})
             self.data = replace(self.data, spec=raised)
@@ -190,7 +182,7 @@ class Trainer:
 
         Where all restarts that were left have diverged, the stopped ones are trained to the end instead.
 
-        :raises OtherDevice: a restart was begun on another kind of device than it is to be continued on.
+        :raises OtherDevice: a restart was begun on another kind of device.
         :raises TrainingError: every restart has diverged.
         """
         self.restarts = [self._begun(number) for number in range(len(starts_of(self.spec)))]
@@ -198,11 +190,11 @@ class Trainer:
         with self._together():
             if len(every) > 1:
                 self._train(every, BY_GRADIENT if self._by_gradient else SOUNDING)
-                self._stop(self._behind())
-            self._train([number for number in every if number not in self.stopped], None)
+                self._stop_behind()
+            self._train([number for number in every if number not in self.stopped])
             if self.restarts[self.best].progress.diverged is not None and self.stopped:
                 again, self.stopped = [*self.stopped], {}
-                self._train(again, None)
+                self._train(again)
         if (why := self.restarts[self.best].progress.diverged) is not None:
             raise TrainingError(why)
         return self._keep_best()
@@ -235,7 +227,7 @@ class Trainer:
         begun = Progress(number, stage=self._last(number), device=described(device_of(self.spec.training)))
         self.restarts.append(self._begun(number, Restart(begun, {"model": copy_of(model) | copy_of(mixture)})))
         with self._together():
-            self._train([number], None)
+            self._train([number])
 
     def _keep_best(self) -> Hierarchy:
         if len(self.restarts) > 1 and self.hierarchy.depth:
@@ -255,14 +247,21 @@ class Trainer:
         self.ranks.share(None)
 
     @property
-    def _by_gradient(self) -> bool:
-        return optimizer_of(self.spec.training.optimizer, self.hierarchy) not in ("em", "lbfgs")
+    def _optimizer(self) -> str:
+        return optimizer_of(self.spec.training.optimizer, self.hierarchy)
 
-    def _behind(self) -> list[int]:
-        """The restarts that are far behind the likeliest."""
-        reached = {restart.progress.restart: restart.progress.sounded for restart in self.restarts}
-        least = max(reached.values()) - BEHIND * self.hierarchy.scaling.size
-        return [number for number, value in reached.items() if value < least]
+    @property
+    def _by_gradient(self) -> bool:
+        return self._optimizer not in ("em", "lbfgs")
+
+    def _stop_behind(self) -> None:
+        """Stop the restarts that are far behind the likeliest, unless they have finished."""
+        each = [restart.progress for restart in self.restarts]
+        least = max(now.sounded for now in each) - BEHIND * self.hierarchy.scaling.size
+        for now in each:
+            if now.sounded < least and not now.done:
+                self.stopped[now.restart] = now.epoch
+                self.on_event(RestartStopped(now.restart, now.epoch))
 
     @property
     def objective(self) -> float:
@@ -275,7 +274,7 @@ class Trainer:
 
         One that is less likely than the mixture is not kept by the margin.
         """
-        values = {one.progress.restart: one.progress.objective for one in self._whole}
+        values = {n: one.progress.objective for n, one in enumerate(self.restarts) if n not in self.stopped}
         best = max(values, key=lambda number: (values[number], -number))
         first = values.get(0, -math.inf)
         return 0 if first >= max(self._least, values[best] - self.spec.training.margin) else best
@@ -288,20 +287,19 @@ class Trainer:
     @property
     def summary(self) -> dict[str, Any]:
         """``training`` of ``metrics.json``: the budget, the best restart's stages, and the epochs of all restarts."""
-        optimizer = optimizer_of(self.spec.training.optimizer, self.hierarchy)
-        whole = optimizer in ("em", "lbfgs")
-        best, updates = self.best, 1 if whole else math.ceil(len(self.data.train) / self.spec.training.batch_size)
-        ends, own = [StageEnd(**end) for end in self.restarts[best].progress.ended], len(starts_of(self.spec))
+        optimizer, best, kept = self._optimizer, self.best, self.restarts[self.best].progress
+        updates = math.ceil(len(self.data.train) / self.spec.training.batch_size) if self._by_gradient else 1
+        starts = [*starts_of(self.spec), BESIDE, BESIDE]
         each = [
             {
-                "epochs": len(restart.progress.history),
+                "epochs": len(now.history),
                 "stopped": self.stopped.get(number),
-                "diverged": restart.progress.diverged is not None,
-                "start": starts_of(self.data.spec)[number] if number < own else BESIDE,
-                "objective": None if math.isinf(restart.progress.objective) else restart.progress.objective,
+                "diverged": now.diverged is not None,
+                "start": starts[number],
+                "objective": None if math.isinf(now.objective) else now.objective,
                 "nmi": self.agreement.get(number),
             }
-            for number, restart in enumerate(self.restarts)
+            for number, now in enumerate(restart.progress for restart in self.restarts)
         ]
 
         def effort(epochs: int | None) -> dict[str, int | None]:
@@ -309,11 +307,11 @@ class Trainer:
 
         return {
             "budget": effort(self.spec.training.epochs),
-            "spent": effort(sum(end.epochs for end in ends)),
-            "stages": [asdict(end) | {"converged": end.converged} for end in ends],
-            "converged": ends[-1].converged,  # the last stage trains what acts in the end
+            "spent": effort(kept.spent),
+            "stages": kept.ended,
+            "converged": kept.ended[-1]["converged"],  # the last stage trains what acts in the end
             "restarts": {"best": best, "spent": effort(len(self.history)), "each": each},
-            "device": self.restarts[best].progress.device,
+            "device": kept.device,
             "objective": self.objective,
             "by_em": optimizer == "em",
             "by_lbfgs": optimizer == "lbfgs",
@@ -333,51 +331,29 @@ class Trainer:
         """The last stage of a restart."""
         return len(plan(self.data.spec, self.hierarchy.depth, number)) - 1
 
-    @property
-    def _whole(self) -> list[Restart]:
-        return [restart for restart in self.restarts if restart.progress.restart not in self.stopped]
-
     def _begun(self, number: int, beginning: Restart | None = None) -> Restart:
         """A restart from its checkpoint, or at its beginning: None for that of its way to begin.
 
         :raises Damaged: it does not hold what was written.
+        :raises OtherDevice: it was begun on another kind of device than it is to be continued on.
         """
-        path = self._path(number)
+        path, device = self._path(number), described(device_of(self.spec.training))
         if path is None or not path.exists():
-            return beginning or Restart(Progress(number, device=described(device_of(self.spec.training))))
-        return Restart.read(path)
-
-    def _refuse_other_device(self, progress: Progress, until: int | None) -> None:
-        """A restart may be trained further on the kind of device alone that it was begun on.
-
-        :raises OtherDevice: it was begun on another kind of device.
-        """
-        device = described(device_of(self.spec.training))
-        if progress.device != device and not progress.reached(self._last(progress.restart), until):
+            return beginning or Restart(Progress(number, device=device))
+        begun = Restart.read(path)
+        if begun.progress.device != device and not begun.progress.done:
             raise OtherDevice(
-                f"{self._path(progress.restart)}: was trained on {progress.device}, and networks are on {device} here, "
-                "where the last digits differ; continue it there, or remove it: this restart then begins anew"
+                f"{path}: was trained on {begun.progress.device}, and networks are on {device} here, where the last "
+                "digits differ; continue it there, or remove it: this restart then begins anew"
             )
+        return begun
 
     def _path(self, number: int) -> Path | None:
         return None if self.checkpoints is None else self.checkpoints / f"restart-{number}.safetensors"
 
-    def _stop(self, numbers: Sequence[int]) -> None:
-        """Those that are done need not be stopped."""
-        for number in numbers:
-            progress = self.restarts[number].progress
-            if not progress.done:
-                self.stopped[number] = progress.epoch
-                self.on_event(RestartStopped(number, progress.epoch))
-
-    def _train(self, numbers: Sequence[int], until: int | None) -> None:
-        """Train restarts until so many epochs of the last stage, None for to the end; jobs share gradient steps.
-
-        :raises OtherDevice: a restart was begun on another kind of device; nothing is trained then.
-        """
+    def _train(self, numbers: Sequence[int], until: int | None = None) -> None:
+        """Train restarts until so many epochs of the last stage, or to the end; jobs share gradient steps."""
         left = [n for n in numbers if not self.restarts[n].progress.reached(self._last(n), until)]
-        for number in left:
-            self._refuse_other_device(self.restarts[number].progress, until)
         if len(left) > 1 and self.jobs > 1 and self._by_gradient:
             calls = {n: partial(train, self.data, self.restarts[n], until, self._path(n)) for n in left}
             with run_all(calls, Workers(self.jobs), "trained a restart", self.on_event) as trained:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from ddco_pyro.spec import Spec, Start
 from ddco_pyro.training.initialization import WAYS
@@ -96,33 +97,23 @@ def _meta_policy_selects(spec: Spec) -> bool:
     return "control" not in spec.hierarchy.meta_policy.emits
 
 
-@dataclass(frozen=True)
-class StageEnd:
-    """How a stage of training ended.
+def stage_end(
+    stage: str, cap: int | None, tune: Sequence[float], patience: int | None, at_optimum: bool = False
+) -> dict[str, Any]:
+    """The end of a stage of training, as :class:`ddco_pyro.metrics.Stage`.
 
-    :param epochs: passes over the training demonstrations.
+    ``rising`` are the nats per step by which the best tuning value rose over the last ``over`` epochs
+    (``training.patience``, or all epochs where there are fewer): 0 where patience ended the stage, or at an optimum.
+    The stage ``converged`` where it had epochs, and rose by at most :data:`RISING`.
+
     :param cap: the epochs that the stage might take; None for no limit.
-    :param rising: nats per step by which the best tuning value rose over the last ``over`` epochs
-        (``training.patience``, or all epochs where there are fewer): 0 where patience ended the stage.
+    :param tune: tuning values before the stage, and of each epoch.
     """
-
-    stage: str
-    epochs: int
-    cap: int | None
-    rising: float
-    over: int
-
-    @property
-    def converged(self) -> bool:
-        """Whether the stage had epochs, and rose by at most :data:`RISING` over the last of them."""
-        return self.epochs > 0 and self.rising <= RISING
-
-    @classmethod
-    def of(cls, stage: str, cap: int | None, tune: Sequence[float], patience: int | None) -> StageEnd:
-        """The end of a stage with these tuning values: before the stage, and of each epoch."""
-        epochs = len(tune) - 1
-        over = min(patience or WINDOW, epochs)
-        return cls(stage, epochs, cap, max(tune) - max(tune[: epochs - over + 1]), over)
+    epochs = len(tune) - 1
+    over = min(patience or WINDOW, epochs)
+    rising = 0.0 if at_optimum else max(tune) - max(tune[: epochs - over + 1])
+    converged = epochs > 0 and rising <= RISING
+    return {"stage": stage, "epochs": epochs, "cap": cap, "rising": rising, "over": over, "converged": converged}
 
 
 def share(budget: int | None, spent: int, stages_left: int) -> int | None:

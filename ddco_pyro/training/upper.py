@@ -96,13 +96,8 @@ def fitted(pieces: Sequence[Piece], seed: int) -> Constants:
     while len(left) > 1:
         ends = sorted((_run(pieces, start, iterations, 0.0) for start in left), key=lambda end: -end[0])
         left, iterations = [constants for _, constants in ends[: len(ends) // 2]], 2 * iterations
-    return converged(pieces, left[0])
-
-
-def converged(pieces: Sequence[Piece], constants: Constants) -> Constants:
-    """The constants after EM, with at most :data:`MOST` iterations."""
     steps = sum(int(lengths.sum()) for _, lengths in pieces)
-    return _run(pieces, constants, MOST, CONVERGED * steps)[1]
+    return _run(pieces, left[0], MOST, CONVERGED * steps)[1]
 
 
 def _run(pieces: Sequence[Piece], constants: Constants, iterations: int, least: float) -> tuple[float, Constants]:

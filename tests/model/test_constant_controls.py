@@ -19,8 +19,9 @@ from ddco_pyro.comparison import CompareError, compare
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.fitted import Fit
-from ddco_pyro.selection import folds as dividing
+from ddco_pyro.selection.folds import divide
 from ddco_pyro.spec import Spec, with_overrides
+from ddco_pyro.training.networks import Dimensions
 
 STILL = {1: 0.1, 3: -7.0}
 """Dimension to value; 0.1 is no float32."""
@@ -159,11 +160,12 @@ def test_what_changes_in_held_out_demonstrations_alone_stays_in(folder: Path, tm
 def test_folds_decide_it_once_for_all(tmp_path: Path) -> None:
     """By all demonstrations, be they in one fold alone or set apart by the file."""
     demos = make_demonstrations()
-    assert dividing.divide(demos, 3, 0).dimensions.constant == STILL
+    assert [Dimensions.of(fold).constant for fold in divide(demos, 3, 0)] == [STILL] * 3
     for name in ("demo_0", "demo_7"):
         changed = demos.select([name])[0].actions.copy()
         changed[4, 3] = 0.0
-        assert dividing.divide(with_controls(demos, {name: changed}), 3, 0).dimensions.constant == {1: 0.1}
+        folds = divide(with_controls(demos, {name: changed}), 3, 0)
+        assert [Dimensions.of(fold).constant for fold in folds] == [{1: 0.1}] * 3
 
 
 def test_runs_that_score_other_dimensions_are_not_compared(whole: Fit, tmp_path: Path) -> None:

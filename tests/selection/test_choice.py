@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import math
 import re
+from collections import ChainMap
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from selecting import DATA, candidate, score, spec_at, two_skills
+from selecting import DATA, candidate, scored, spec_at, two_skills
 
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.data.files import Damaged
 from ddco_pyro.selection.choice import as_data, choose, markdown, table
-from ddco_pyro.selection.folds import FoldError, Score, assign, divide, keep_score, kept_score
+from ddco_pyro.selection.folds import FoldError, assign, divide
 from ddco_pyro.selection.grid import candidates, wide
 from ddco_pyro.spec import SpecError, parse_spec, with_overrides
 from ddco_pyro.training.networks import Dimensions
@@ -23,9 +23,12 @@ from ddco_pyro.training.networks import Dimensions
 
 def rows(values, lengths=(10,), parameters=None):
     """The choice among candidates with these log-likelihoods per step, one row each, one column per fold."""
-    scores = [score(c, f, value, lengths) for c, row in enumerate(values) for f, value in enumerate(row)]
+    fits = {}
+    for c, row in enumerate(values):
+        for f, value in enumerate(row):
+            fits |= {(c, f): value} if isinstance(value, str) else scored(c, f, value, lengths)
     sizes = parameters or [None] * len(values)
-    return choose([candidate(c, size) for c, size in enumerate(sizes)], scores, len(values[0]))
+    return choose([candidate(c, size) for c, size in enumerate(sizes)], fits)
 
 
 def pair(row):
@@ -46,8 +49,8 @@ def test_means_and_standard_errors_are_those_of_the_folds():
 
 
 def test_the_mean_is_over_steps_and_not_over_folds():
-    scores = [score(0, 0, 1.0, (2,)), score(0, 1, 4.0, (6,)), score(0, 2, 2.0, (4,))]
-    row = choose([candidate(0)], scores, 3).rows[0]
+    fits = scored(0, 0, 1.0, (2,)) | scored(0, 1, 4.0, (6,)) | scored(0, 2, 2.0, (4,))
+    row = choose([candidate(0)], fits).rows[0]
     assert row.mean == pytest.approx((2 * 1 + 6 * 4 + 4 * 2) / 12)
     residual = np.array([2 * 1, 6 * 4, 4 * 2]) - row.mean * np.array([2, 6, 4])
     assert row.error == pytest.approx(math.sqrt((residual**2).sum() / 2 * 3) / 12)  # that of a ratio of sums
@@ -77,8 +80,7 @@ def test_among_equal_sizes_the_better_one_is_chosen():
 
 
 def test_a_candidate_with_a_failed_fold_is_named_and_not_chosen():
-    scores = [score(0, 0, 9.0), score(0, 1, 0.0, failed="it diverged"), score(1, 0, 1.0), score(1, 1, 2.0)]
-    found = choose([candidate(0), candidate(1)], scores, 2)
+    found = rows([[9.0, "it diverged"], [1.0, 2.0]])
     assert [row.status for row in found.rows] == ["failed", "scored"]
     assert found.best is found.chosen is found.rows[1]
     data = as_data(found)
@@ -89,8 +91,7 @@ def test_a_candidate_with_a_failed_fold_is_named_and_not_chosen():
 
 
 def test_where_all_have_failed_there_is_no_choice():
-    scores = [score(0, 0, 1.0), score(0, 1, 0.0, failed="out of memory"), score(1, 0, 0.0, failed="x")]
-    found = choose([candidate(0), candidate(1)], scores, 2)
+    found = rows([[1.0, "out of memory"], ["x", "x"]])
     assert found.best is None
     assert found.chosen is None
     assert [row.mean for row in found.rows] == [1.0, None]
@@ -112,7 +113,8 @@ def test_where_all_have_failed_there_is_no_choice():
 )
 def test_a_best_candidate_at_the_edge_of_the_grid_is_noted(path, grid, means, said):
     each = [replace(candidate(c), values={path: value}) for c, value in enumerate(grid)]
-    made = choose(each, [score(c, f, mean) for c, mean in enumerate(means) for f in (0, 1)], 2)
+    fits = ChainMap(*(scored(c, f, mean) for c, mean in enumerate(means) for f in (0, 1)))
+    made = choose(each, fits)
     noted = " ".join(made.notes)
     assert noted.startswith(said)
     assert bool(noted) == bool(said)
@@ -125,9 +127,9 @@ def test_different_fixed_errors_are_noted():
         return parse_spec({**DATA, "demonstrations": {"path": "x"}, "control": {"std": std}})
 
     both = [candidate(0, spec=fixed(0.1)), candidate(1, spec=fixed(0.2))]
-    scores = [score(c, f, 1.0) for c in (0, 1) for f in (0, 1)]
-    assert "control.std differs" in choose(both, scores, 2).notes[0]
-    assert choose([both[0], both[0]], scores, 2).notes == []
+    fits = scored(0, 0, 1.0) | scored(0, 1, 1.0) | scored(1, 0, 1.0) | scored(1, 1, 1.0)
+    assert "control.std differs" in choose(both, fits).notes[0]
+    assert choose([both[0], both[0]], fits).notes == []
 
 
 # --- candidates: every point of the grid ------------------------------------------------------------------------------
@@ -217,14 +219,6 @@ def test_too_few_demonstrations_are_refused(count, folds, message):
 def test_what_its_author_set_apart_is_in_no_fold():
     demos = two_skills(10)
     marked = Demonstrations(demos.demonstrations, {"valid": ("demo_3", "demo_7")})
-    folds = divide(marked, 4, 0)
-    assert sorted(name for names in folds.held_out for name in names) == sorted({*demos.names} - {"demo_3", "demo_7"})
-
-
-def test_a_score_of_other_folds_is_refused(tmp_path):
-    folds, others = (divide(two_skills(6), 3, seed) for seed in (0, 1))
-    names = folds.held_out[0]
-    keep_score(tmp_path, Score(0, 0, names, (10,) * len(names), failed="for example"))
-    assert kept_score(tmp_path, folds, 0, 0).names == names
-    with pytest.raises(Damaged, match="is not the score of this candidate and fold; remove it"):
-        kept_score(tmp_path, others, 0, 0)
+    held_out, used = [fold.masks["valid"] for fold in divide(marked, 4, 0)], {*demos.names} - {"demo_3", "demo_7"}
+    assert sorted(name for names in held_out for name in names) == sorted(used)
+    assert all({*fold.masks["train"]} == used - {*fold.masks["valid"]} for fold in divide(marked, 4, 0))

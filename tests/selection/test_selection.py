@@ -7,10 +7,11 @@ import json
 import joblib
 import numpy as np
 import pytest
-from selecting import Told, kept, score, spec_at, two_skills
+from selecting import Told, kept, spec_at, two_skills
 
+from ddco_pyro import selection
 from ddco_pyro.fitting.fitted import Fit
-from ddco_pyro.selection import SelectionFailed, Workers, final_spec, folds, select
+from ddco_pyro.selection import SelectionFailed, Workers, final_spec, select
 from ddco_pyro.spec import with_overrides
 from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.restarts import train_model
@@ -32,11 +33,11 @@ def test_a_score_is_that_of_a_fit_without_the_fold(finished):
     demos = two_skills()
     scores = kept(folder)
     for row in made.choice.rows:
-        names = made.folds.held_out[2]
+        names = made.held_out[2]
         rest = demos.select([name for name in demos.names if name not in names])
         trained = train_model(row.candidate.spec, Dimensions.of(demos), rest)
         expected = Fit(row.candidate.spec, trained.hierarchy).log_likelihood(demos.select(names))
-        np.testing.assert_array_equal(scores[row.candidate.number, 2]["log_likelihood"], expected)
+        np.testing.assert_array_equal([demo.log_likelihood for demo in scores[row.candidate.number, 2].valid], expected)
 
 
 def test_every_candidate_has_the_same_folds(finished):
@@ -44,8 +45,8 @@ def test_every_candidate_has_the_same_folds(finished):
     scores = kept(folder)
     assert set(scores) == {(c, f) for c in range(2) for f in range(4)}
     for (_, fold), one in scores.items():
-        assert tuple(one["names"]) == made.folds.held_out[fold]
-        assert one["steps"] == [len(demo) for demo in two_skills().select(one["names"])]
+        assert tuple(demo.name for demo in one.valid) == tuple(made.held_out[fold])
+        assert [demo.steps for demo in one.valid] == [len(demo) for demo in two_skills().select(made.held_out[fold])]
     assert told.begun == [("cross-validation", 8, 0)]
     assert {pair[0] for pair in told.pairs} == {
         f"{row.candidate.name}, fold {f}" for row in made.choice.rows for f in range(4)
@@ -57,9 +58,8 @@ def test_the_file_is_what_the_scores_say(finished):
     data = json.loads((folder / "selection.json").read_text())
     scores, means = kept(folder), []
     for row in data["candidates"]:
-        own = [scores[row["number"], fold] for fold in range(4)]
-        total, steps = (sum(sum(one[key]) for one in own) for key in ("log_likelihood", "steps"))
-        means.append(total / steps)
+        own = [demo for fold in range(4) for demo in scores[row["number"], fold].valid]
+        means.append(sum(demo.log_likelihood for demo in own) / sum(demo.steps for demo in own))
         assert row["log_likelihood_per_step"] == pytest.approx(means[-1])
         assert row["status"] == "scored"
     assert data["best"] == int(np.argmax(means)) == made.choice.best.candidate.number
@@ -72,7 +72,7 @@ def test_the_file_is_what_the_scores_say(finished):
 def test_what_is_there_is_not_done_again(finished, monkeypatch):
     spec, folder, made, _ = finished
     before = (folder / "selection.json").read_bytes()
-    monkeypatch.setattr(folds, "score", None)
+    monkeypatch.setattr(selection, "fit_beside", None)
     told = Told()
     again = select(spec, folder, told, ONE)
     assert (told.begun, told.pairs) == ([("cross-validation", 8, 8)], [])
@@ -91,19 +91,6 @@ def test_the_final_fit_is_on_all_the_data(finished):
 # --- failures, and giving up ------------------------------------------------------------------------------------------
 
 
-def faked(values, calls=None):
-    """Instead of training: the value of a candidate in a fold, or why it fails."""
-
-    def scored(divided, candidate, fold):
-        if calls is not None:
-            calls.append((candidate.number, fold))
-        value = values(candidate.number, fold)
-        failed = value if isinstance(value, str) else ""
-        return score(candidate.number, fold, 0.0 if failed else value, failed=failed)
-
-    return scored
-
-
 def test_a_fold_that_fails_is_named_and_the_others_go_on(tmp_path, monkeypatch):
     grid = {"training.optimizer.lr": [0.05, 1e30], "training.patience": [None], "training.epochs": [16]}
     spec = spec_at(tmp_path, grid=grid, folds=2)
@@ -118,18 +105,13 @@ def test_a_fold_that_fails_is_named_and_the_others_go_on(tmp_path, monkeypatch):
     assert {pair[1] for pair in told.pairs if pair[0].startswith("lr = 0.05")} == {""}
 
 
-def test_where_nothing_is_left_the_first_reason_is_told(tmp_path, monkeypatch):
-    monkeypatch.setattr(folds, "score", faked(lambda c, f: "it diverged" if f == 1 else 1.0))
-    with pytest.raises(SelectionFailed, match="every candidate has failed in some fold; the first reason: it diverged"):
-        select(spec_at(tmp_path), tmp_path / "run", Told(), ONE)
-    assert json.loads((tmp_path / "run" / "selection.json").read_text())["chosen"] is None
-
-
-def test_an_unexpected_error_is_told_and_tried_again_next_time(tmp_path, monkeypatch):
+def test_where_nothing_is_left_an_unexpected_error_is_told_and_tried_again_next_time(tmp_path, monkeypatch):
     spec = spec_at(tmp_path, grid={"hierarchy.levels.0.count": [2]}, folds=2)
-    monkeypatch.setattr(folds, "train_model", lambda *_, **__: 1 / 0)
-    with pytest.raises(SelectionFailed, match="unexpected ZeroDivisionError: division by zero"):
+    monkeypatch.setattr(selection, "fit_beside", lambda *_, **__: 1 / 0)
+    said = "every candidate has failed in some fold; the first reason: unexpected ZeroDivisionError: division by zero"
+    with pytest.raises(SelectionFailed, match=said):
         select(spec, tmp_path / "run", Told(), ONE)
+    assert json.loads((tmp_path / "run" / "selection.json").read_text())["chosen"] is None
     monkeypatch.undo()
     assert select(spec, tmp_path / "run", Told(), ONE).choice.chosen is not None
 
@@ -149,4 +131,4 @@ def test_a_cluster_of_dask_gives_the_same(tmp_path):
         assert (tmp_path / "cluster" / name).read_bytes() == (tmp_path / "here" / name).read_bytes()
     there, here = kept(tmp_path / "cluster"), kept(tmp_path / "here")
     assert there.keys() == here.keys()
-    assert all(there[key]["log_likelihood"] == here[key]["log_likelihood"] for key in here)
+    assert all(there[key].valid == here[key].valid for key in here)

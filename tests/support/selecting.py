@@ -1,17 +1,17 @@
-"""A small selection for tests: demonstrations of a point, a grid, and scores without any training."""
+"""A small selection for tests: demonstrations of a point, a grid, and fits of folds without any training."""
 
 from __future__ import annotations
 
-import json
 from dataclasses import astuple
 
 import numpy as np
+from made_metrics import made_metrics
 from random_demonstrations import numbered
 
 from ddco_pyro.events import CellDone, CellsBegan
-from ddco_pyro.selection.folds import Score
+from ddco_pyro.metrics import Metrics
 from ddco_pyro.selection.grid import Candidate
-from ddco_pyro.spec import parse_spec
+from ddco_pyro.spec import load_spec, parse_spec
 
 
 class Told:
@@ -61,17 +61,21 @@ def spec_at(folder, demos=None, **selection):
     return parse_spec({**data, "selection": {**data["selection"], **selection}})
 
 
-def score(candidate, fold, per_step, lengths=(10,), failed="", steps=0, converged=True):
-    """A score that says ``per_step`` nats in each of these demonstrations."""
-    names = tuple(f"demo_{fold}_{number}" for number in range(len(lengths)))
-    values = () if failed else tuple(per_step * steps for steps in lengths)
-    return Score(candidate, fold, names, tuple(lengths), values, failed, steps, converged)
+def scored(candidate, fold, per_step, lengths=(10,)):
+    """By candidate and fold, the metrics of a fit that says ``per_step`` nats in each of these demonstrations."""
+    rows = [{"name": f"demo_{n}", "steps": own, "log_likelihood": per_step * own} for n, own in enumerate(lengths)]
+    return {(candidate, fold): made_metrics(valid=rows)}
 
 
 def kept(folder):
-    """The scores in a selection's folder, by candidate and fold."""
-    found = [json.loads(path.read_text()) for path in sorted((folder / "folds").iterdir())]
-    return {(one["candidate"], one["fold"]): one for one in found}
+    """The metrics in a selection's folder, by candidate and fold."""
+    paths = sorted((folder / "folds").iterdir())
+    return {tuple(map(int, path.name.split("-"))): Metrics.read(path, [counts(path)]) for path in paths}
+
+
+def counts(folder):
+    """The number of options of a run."""
+    return load_spec(folder / "spec.yaml").hierarchy.levels[0].count
 
 
 SPEC = parse_spec({**DATA, "demonstrations": {"path": "demos.hdf5"}})

@@ -15,7 +15,7 @@ from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.networks.conv import POOLED
 from ddco_pyro.training.checkpoint import Progress
-from ddco_pyro.training.initialization import Clusters, EqualParts
+from ddco_pyro.training.initialization import Clusters, equal_parts
 from ddco_pyro.training.objective import Objective
 from ddco_pyro.training.stages import plan
 
@@ -70,7 +70,7 @@ def test_planted_places_are_found_and_padding_belongs_to_none(controls):
 
 def test_equal_parts_cut_each_demonstration_for_itself():
     batch = make_batch(random_rows(0, 3), random_rows(1, 2))
-    assert EqualParts(3).choices(batch).tolist() == [
+    assert equal_parts(batch, 3).tolist() == [
         [1, 1, 1, 2, 2, 3, 3],
         [1, 1, 2, 3, 0, 0, 0],
         [1, 1, 2, 2, 3, 3, 0],

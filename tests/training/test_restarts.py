@@ -117,7 +117,7 @@ class Scripted:
         return restart
 
 
-ENDED = {"stage": "joint", "epochs": 20, "cap": None, "rising": 0.0, "over": 1}
+ENDED = {"stage": "joint", "epochs": 20, "cap": None, "rising": 0.0, "over": 1, "converged": True}
 
 
 @pytest.mark.parametrize("seed", range(8))

@@ -17,7 +17,7 @@ from ddco_pyro.spec import with_overrides
 from ddco_pyro.training.checkpoint import Progress, Restart
 from ddco_pyro.training.loop import StageTraining, train
 from ddco_pyro.training.objective import Objective
-from ddco_pyro.training.stages import RISING, StageEnd, plan
+from ddco_pyro.training.stages import RISING, plan, stage_end
 
 QUICK = {"control": {"std": 1.0}, "optimizer": {"lr": 0.1}}
 """Every stage soon stops."""
@@ -231,9 +231,9 @@ def test_both_engines_train_to_the_same_model(tmp_path):
     ],
 )
 def test_how_much_a_stage_still_rose(tune, patience, rising, over):
-    end = StageEnd.of("joint", 10, tune, patience)
-    assert (end.epochs, end.rising, end.over) == (len(tune) - 1, rising, over)
-    assert end.converged == (rising == 0.0 and len(tune) > 1)
+    end = stage_end("joint", 10, tune, patience)
+    assert (end["epochs"], end["rising"], end["over"]) == (len(tune) - 1, rising, over)
+    assert end["converged"] == (rising == 0.0 and len(tune) > 1)
 
 
 def test_what_is_called_converged_is_at_the_optimum(tmp_path):
