@@ -62,10 +62,7 @@ def label(
     listening = Listening.at(port)
     session = Session(load(run, allow_code), file, place, level, _exporters(run, file))
     session.journal.at(listening.address)
-    if session.document.done:
-        session.background.ready()
-    else:
-        session.ask()
+    session.background.ready()
 
     def ready() -> None:
         print(f"{listening.address}\nCtrl-C saves the labels and ends", flush=True)

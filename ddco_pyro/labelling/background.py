@@ -1,4 +1,4 @@
-"""Fits in another process, one piece of work at a time: how far it is, and ending it at once."""
+"""A call in another process: how far it is, and ending it at once."""
 
 from __future__ import annotations
 
@@ -9,10 +9,9 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from ddco_pyro.errors import Failed, reason
 from ddco_pyro.events import EpochEnded, Event, TrainingBegan
@@ -21,45 +20,22 @@ from ddco_pyro.jobs import end_with, without_lost_calls
 if TYPE_CHECKING:
     from joblib.externals.loky import ProcessPoolExecutor
 
-Result = TypeVar("Result")
-
-Call = Callable[..., Result]
+Call = Callable[..., Any]
 """What another process does; it is called with ``on_event``."""
-
-Away = Callable[[Call[Any]], Any]
-"""The result of a call in another process."""
-
-
-@dataclass(eq=False)
-class Work:
-    """What is under way.
-
-    :param message: what it is, as a person reads it.
-    :param do: makes its calls by an :data:`Away`.
-    :param calls: how many it makes.
-    :ivar done: how many of them are done.
-    """
-
-    message: str
-    do: Callable[[Away], None]
-    calls: int
-    done: int = field(init=False, default=0)
 
 
 class Background:
-    """One piece of work at a time, in a thread that waits for the calls of another process.
+    """One call at a time in another process, which stays for the next one.
 
     :param lock: held while anything here changes.
-    :param changed: called, with the lock, when work has ended.
+    :param ended: called, with the lock, when a call has ended that was not cancelled.
     :param modules: what the process imports before it is asked for anything.
-    :ivar work: None where nothing is under way.
-    :ivar error: what failed at last, and why; empty where nothing did.
+    :ivar error: why the last call failed; empty where it did not.
     """
 
-    def __init__(self, lock: threading.RLock, changed: Callable[[], None], *modules: str) -> None:
-        self.lock, self.changed, self.modules, self.error = lock, changed, modules, ""
-        self.work: Work | None = None
-        self._after: Work | None = None
+    def __init__(self, lock: threading.RLock, ended: Callable[[], None], *modules: str) -> None:
+        self.lock, self.ended, self.modules, self.error = lock, ended, modules, ""
+        self._under_way: Future[Any] | None = None
         self._process: ProcessPoolExecutor | None = None
         self._folder = tempfile.TemporaryDirectory(prefix="ddco-pyro-")
         self._told = Path(self._folder.name) / "done"
@@ -70,87 +46,64 @@ class Background:
             for module in self.modules:
                 self._submit(partial(importlib.import_module, module))
 
-    def begin(self, message: str, do: Callable[[Away], None], calls: int = 1) -> None:
-        """Begin a piece of work, or do so when what is under way has ended."""
+    def begin(self, call: Call, prepare: Callable[[Any], Callable[[], None]]) -> None:
+        """Make a call.
+
+        :param prepare: gets the result in a thread of its own. What it gives is called, with the lock, unless the call
+            was cancelled meanwhile.
+        """
         with self.lock:
-            work = Work(message, do, calls)
-            if self.work is None:
-                self.error = ""
-                self._start(work)
-            else:
-                self._after = work
+            self.error = ""
+            self._told.unlink(missing_ok=True)
+            self._under_way = self._submit(partial(_telling, call, self._told))
+            threading.Thread(target=self._finish, args=(self._under_way, prepare), daemon=True).start()
 
     def cancel(self) -> None:
-        """End what is under way at once, and its process; what waits for it is given up."""
+        """End what is under way at once, and its process."""
         with self.lock:
-            if self.work is not None:
-                self.work = self._after = None
+            if self.running:
+                self._under_way = None
                 self._end()
                 self.ready()
-                self.changed()
 
     def close(self) -> None:
         """End the process."""
         with self.lock:
-            self.work = self._after = None
+            self._under_way = None
             self._end()
             self._folder.cleanup()
 
     @property
+    def running(self) -> bool:
+        """Whether a call is under way."""
+        return self._under_way is not None
+
+    @property
     def progress(self) -> float | None:
-        """The share of the work that is done; None where it is not known yet."""
-        with self.lock:
-            told = self._told.read_text().split() if self._told.exists() else []
-            if self.work is None or not (told or self.work.done):
-                return None
-            return (self.work.done + float(told[-1] if told else 0)) / self.work.calls
+        """The share of the call that is done; None where it is not known yet."""
+        told = self._told.read_text().split() if self.running and self._told.exists() else []
+        return float(told[-1]) if told else None
 
-    def _start(self, work: Work) -> None:
-        self.work = work
-        threading.Thread(target=self._do, args=(work,), daemon=True).start()
-
-    def _do(self, work: Work) -> None:
-        error = ""
+    def _finish(self, call: Future[Any], prepare: Callable[[Any], Callable[[], None]]) -> None:
+        failed: Exception | None = None
         try:
-            work.do(partial(self._away, work))
-        except Exception as failed:  # the page says what has failed, and labelling goes on
-            error = reason(failed)
+            take = prepare(call.result())
+        except BrokenProcessPool:
+            failed = Failed("its process was ended from outside (too little memory?)")
+        except Exception as error:  # the page says what has failed, and labelling goes on
+            failed = error
         with self.lock:
-            if self.work is not work:
-                return  # it was cancelled
-            self.error = error and f"{work.message} failed: {error}"
-            if error:
+            if self._under_way is not call:
+                return
+            self._under_way = None
+            if failed is None:
+                take()
+            else:
+                self.error = reason(failed)
                 self._end()
-            self.work, after, self._after = None, self._after, None
-            self.changed()
-            if after is not None:
-                self._start(after)
+            self.ended()
 
-    def _away(self, work: Work, call: Call[Result]) -> Result:
-        """The result of a call in another process.
-
-        :raises Failed: the work was cancelled, or the process was ended from outside.
-        """
-        with self.lock:
-            self._refuse_cancelled(work)
-            self._told.unlink(missing_ok=True)
-            future = self._submit(partial(_telling, call, self._told))
-        try:
-            result = future.result()
-        except BrokenProcessPool as error:
-            raise Failed("its process was ended from outside (too little memory?)") from error
-        with self.lock:
-            self._refuse_cancelled(work)
-            work.done += 1
-            self._told.unlink(missing_ok=True)
-        return result
-
-    def _refuse_cancelled(self, work: Work) -> None:
-        if self.work is not work:
-            raise Failed("cancelled")
-
-    def _submit(self, call: Callable[[], Result]) -> Future[Result]:
-        """Have a call made by the process, which stays for the next call."""
+    def _submit(self, call: Callable[[], Any]) -> Future[Any]:
         if self._process is None:
             from joblib.externals.loky import ProcessPoolExecutor
 
@@ -164,7 +117,7 @@ class Background:
             self._process = None
 
 
-def _telling(call: Call[Result], file: Path) -> Result:
+def _telling(call: Call, file: Path) -> Any:
     """The result of a call, which adds the share of its epochs that are done to a file, a line for each event."""
     epochs, done = 0, 0
     with open(file, "a", buffering=1) as told:

@@ -1,7 +1,7 @@
 """The local web server of ``ddco-pyro label``: a :class:`Session` over HTTP, and the page that shows it.
 
 It listens on this machine alone. The first part of every path is a random token; a foreign ``Host`` or ``Origin`` is
-refused. No path of a request touches the file system.
+refused.
 """
 
 from __future__ import annotations
@@ -26,9 +26,11 @@ from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
+from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
-from starlette.routing import Route
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from ddco_pyro.errors import BadInput, Failed, reason
@@ -44,16 +46,8 @@ MOST_BYTES = 64 * 2**10
 PATIENCE = 2
 """Seconds that requests under way have when the server stops."""
 
-PAGE = {
-    "": ("labelling/static/index.html", "text/html"),
-    "page.css": ("labelling/static/page.css", "text/css"),
-    "canvas.js": ("drawing/canvas.js", "text/javascript"),
-    **{
-        name: (f"labelling/static/{name}", "text/javascript")
-        for name in ("app.js", "drawing.js", "panels.js", "timeline.js")
-    },
-}
-"""The files of the page: the path in a request, the file in the package and its type."""
+PAGE, CANVAS = files("ddco_pyro") / "labelling" / "static", files("ddco_pyro") / "drawing" / "canvas.js"
+"""The folder of the page, and a script that it shares with reports."""
 
 HEADERS = {
     "Cache-Control": "no-store",
@@ -140,18 +134,27 @@ def serve(session: Session, listening: Listening, ready: Callable[[], None] = la
 
 def application(session: Session, token: str, port: int) -> Starlette:
     """The web application of a session, for requests to ``127.0.0.1:port/token/``."""
-    routes = [*_page(), *_answers(session)]
-    guard = Middleware(Guard, token=token, hosts=frozenset(f"{host}:{port}" for host in (LOOPBACK, "localhost")))
+
+    async def canvas(request: Request) -> Response:
+        return FileResponse(str(CANVAS))
+
+    page = Mount("/", StaticFiles(directory=str(PAGE), html=True))
+    routes = [*_answers(session), Route("/canvas.js", canvas), page]
+    guards = [
+        Middleware(Guard, token=token, port=port),
+        Middleware(TrustedHostMiddleware, allowed_hosts=[LOOPBACK, "localhost"]),
+    ]
     return Starlette(
-        routes=routes, middleware=[guard], exception_handlers={HTTPException: _refused, ValueError: _refused}
+        routes=routes, middleware=guards, exception_handlers={HTTPException: _refused, ValueError: _refused}
     )
 
 
 class Guard:
     """Refuses requests of others, and gives every answer the headers that keep a browser from harm."""
 
-    def __init__(self, app: ASGIApp, token: str, hosts: frozenset[str]) -> None:
-        self.app, self.token, self.hosts = app, token, hosts
+    def __init__(self, app: ASGIApp, token: str, port: int) -> None:
+        self.app, self.token = app, token
+        self.origins = [None, *(f"http://{host}:{port}" for host in (LOOPBACK, "localhost"))]
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request, or refuse it."""
@@ -164,30 +167,14 @@ class Guard:
 
         if scope["type"] != "http":
             return
-        headers, (first, slash, _) = Headers(scope=scope), scope["path"].removeprefix("/").partition("/")
-        origin = headers.get("origin")
-        if headers.get("host") not in self.hosts or origin not in (None, f"http://{headers.get('host')}"):
+        first, slash, _ = scope["path"].removeprefix("/").partition("/")
+        if Headers(scope=scope).get("origin") not in self.origins:
             app: ASGIApp = _error(403, "this address is not the page's")
         elif not slash or not secrets.compare_digest(first.encode(), self.token.encode()):
             app = _error(404, "there is nothing here")
         else:
             app, scope = self.app, {**scope, "root_path": f"/{first}"}
         await app(scope, receive, headed)
-
-
-def _page() -> list[Route]:
-    """The routes of the page's files, which are read once."""
-    folder = files("ddco_pyro")
-
-    def route(path: str, name: str, kind: str) -> Route:
-        content = (folder / name).read_bytes()
-
-        async def sent(request: Request) -> Response:
-            return Response(content, media_type=kind)
-
-        return Route(f"/{path}", sent)
-
-    return [route(path, name, kind) for path, (name, kind) in PAGE.items()]
 
 
 def _answers(session: Session) -> list[Route]:
@@ -247,8 +234,6 @@ def _answers(session: Session) -> list[Route]:
         "edit": session.edit,
         "refit": lambda asked: session.refit(),
         "cancel": lambda asked: session.cancel(),
-        "ask": lambda asked: session.ask(),
-        "choose": lambda asked: session.choose(asked.get("proposal", "")),
         "save": lambda asked: {"message": session.save()},
     }
     return [

@@ -18,7 +18,7 @@ from ddco_pyro.drawing.timeline import text
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.inferred import within
 from ddco_pyro.fitting.fitted import Fit
-from ddco_pyro.labelling.background import Away, Background
+from ddco_pyro.labelling.background import Background
 from ddco_pyro.labelling.commands import Segment, View, whole
 from ddco_pyro.labelling.document import FREE, SUFFIX, Document, Journal, digest, version
 from ddco_pyro.labelling.following import Following
@@ -32,13 +32,10 @@ from ddco_pyro.labelling.proposals import (
     shown_segments,
     unforeseen,
 )
-from ddco_pyro.labelling.refitting import Ways, labelled, refit
+from ddco_pyro.labelling.refitting import labelled, refit
 from ddco_pyro.names import option_name
 from ddco_pyro.segmenting import Segmented
 from ddco_pyro.segmenting.formats.labels import check_copy, check_labels, write_labels
-
-REFIT, LOOK = "fitting the labels", "looking for other ways to cut"
-"""What a page says of the work in the background."""
 
 NEAREST = 5
 """Segments elsewhere that are shown for one."""
@@ -85,47 +82,34 @@ class Session:
         self.document = Document({demo.name: len(demo) for demo in self.demos}, fit.names[self.level][1:])
         self.journal = Journal(out.with_name(out.name + SUFFIX), self.document, digest(self.demos, self.level))
         self.lock, self.revision, self.edits, self.saved, self.changed = threading.RLock(), 0, 0, 0, set[int]()
-        self.ways: Ways | None = None
-        self.refits, self.turn, self.chosen = 0, 0, ""
-        self.background = Background(self.lock, self._changed, "ddco_pyro.labelling.refitting", "sklearn.linear_model")
+        self.refits, self.again = 0, False
+        self.background = Background(self.lock, self._ended, "ddco_pyro.labelling.refitting", "sklearn.linear_model")
         self.first, self.shown = dict[str, Shown](), dict[str, Shown]()
         self.following = Following(path, self.demos, fit.spec.report.trajectory)
-        self.take(fit)
+        self._prepare(fit)()
         self.proposed = self.proposals
         """By the run."""
 
     # --- the model ----------------------------------------------------------------------------------------------------
 
-    @property
-    def number(self) -> int:
-        """The level's number, 1 for the lowest."""
-        return [*self.fit.names].index(self.level) + 1
+    def _prepare(self, fit: Fit) -> Callable[[], None]:
+        """Infer by another model; what is given shows its proposals.
 
-    def take(self, fit: Fit, refit: int | None = None) -> None:
-        """Show another model's proposals; its options have the numbers that named steps and what is shown give them.
-
-        Where :attr:`turn` moves on meanwhile, nothing is shown: another model is taken, or the refit is cancelled.
-
-        :param refit: of a refit, the turn at which it began.
+        Its options get the numbers that named steps and what is shown give them.
         """
         with self.lock:
-            if refit not in (None, self.turn):
-                return
-            self.turn += 1
-            turn, before, count = self.turn, self._shown_now(), len(self.document.names)
+            before, count = self._shown_now(), len(self.document.names)
             labels = {name: own.copy() for name, own in self.document.labels.items()}
             accepted = [*self.document.accepted]
         proposals = Proposals(fit, self.demos, [*fit.names].index(self.level) + 1, count, before)
         held_out = proposals.held_out(labels, accepted if len(accepted) > 1 else ())
-        with self.lock:
-            if turn == self.turn:
-                self.fit, self.proposals = fit, proposals
-                self.excess = {name: excess(own, labels[name]) for name, own in held_out.items()}
-                self.refits += refit is not None
-                self._update(before)
 
-    def _changed(self) -> None:
-        self.revision += 1
+        def take() -> None:
+            self.fit, self.proposals = fit, proposals
+            self.excess = {name: excess(own, labels[name]) for name, own in held_out.items()}
+            self._update(before)
+
+        return take
 
     def _shown_now(self) -> dict[str, np.ndarray]:
         return {name: shown.options for name, shown in self.shown.items()}
@@ -190,13 +174,11 @@ class Session:
                 "can_undo": bool(document.done),
                 "can_redo": bool(document.undone),
                 "refit": {
-                    "running": self.background.work is not None,
+                    "running": self.background.running,
                     "progress": self.background.progress,
-                    "message": self.background.work.message if self.background.work else "",
                     "done": self.refits,
                     "error": self.background.error,
                 },
-                "question": self._question(),
                 "warnings": self.warnings(),
                 "out": str(self.out),
                 "dirty": self.edits != self.saved,
@@ -361,25 +343,36 @@ class Session:
     # --- in the background --------------------------------------------------------------------------------------------
 
     def refit(self) -> None:
-        """Fit again in another process, with the labels and a recogniser of them; what comes of it is shown then."""
+        """Fit again in another process, with the labels and a recogniser of them; what comes of it is shown then.
+
+        A refit that is asked for meanwhile begins when this one has ended.
+        """
         with self.lock:
             if not self._is_labelled():
                 raise BadInput("refit: nothing is labelled yet")
-            self.background.begin(REFIT, self._refit)
+            self.again = self.background.running
+            if not self.again:
+                self.background.begin(self._refitting(), self._refitted)
 
-    def _refits(self) -> bool:
-        return self.background.work is not None and self.background.work.message == REFIT
+    def _refitted(self, fit: Fit) -> Callable[[], None]:
+        take = self._prepare(fit)
+
+        def counted() -> None:
+            self.refits += 1
+            take()
+
+        return counted
+
+    def _ended(self) -> None:
+        self.revision += 1
+        if self.again and self._is_labelled():
+            self.refit()
 
     def _is_labelled(self) -> bool:
         return any(bool(self.document.said(name).any()) for name in self.demos.names)
 
-    def _refit(self, away: Away) -> None:
-        turn = self.turn
-        if self._is_labelled():  # or the labels are undone
-            self.take(away(self.refitting()), turn)
-
-    def refitting(self) -> Callable[..., Fit]:
-        """The call that fits to what is said so far, for any process; :meth:`take` shows its result."""
+    def _refitting(self) -> Callable[..., Fit]:
+        """The call that fits to what is said so far."""
         with self.lock:
             labels = {name: self.document.in_file(name) for name in self.demos.names}
             waiting = self.proposals.waiting
@@ -393,50 +386,11 @@ class Session:
         return partial(refit, trained, self.level, count, labelled(demos, labels), kept)
 
     def cancel(self) -> None:
-        """End what is under way in the background at once; what is shown stays."""
+        """End a refit at once; what is shown stays."""
         with self.lock:
-            self.turn += self._refits()
+            self.again = False
             self.background.cancel()
-
-    def ask(self) -> None:
-        """Look for other ways to cut, in the background; :meth:`choose` takes one.
-
-        A page asks for an answer while nothing is labelled.
-        """
-        with self.lock:
-            if self.ways is None or (len(self.ways.fits) == 1 and self.background.work is None):
-                ways = self.ways = Ways(self.run, self.demos, self.number)
-                self.background.begin(LOOK, partial(self._look, ways), len(ways.calls))
-
-    def _look(self, ways: Ways, away: Away) -> None:
-        for name, call in ways.calls.items():
-            found = away(call)
-            with self.lock:
-                ways.add(name, found)
-                self.revision += 1
-
-    def _question(self) -> dict[str, Any] | None:
-        if self.ways is None:
-            return None
-        answered = self.chosen or self.document.done
-        asked = not answered and (len(self.ways.fits) > 1 or self.background.work is not None)
-        return {**self.ways.shown(), "asked": asked, "chosen": self.chosen}
-
-    def choose(self, way: str) -> None:
-        """Go on with one of the ways to cut; all labels stay, and the model learns from them.
-
-        :raises BadInput: there is no such way.
-        """
-        with self.lock:
-            known = {} if self.ways is None else self.ways.fits
-            if way not in known:
-                raise BadInput(f"there is no way to cut {way!r}; there is: {', '.join(known) or 'none yet'}")
-            if self._refits():
-                self.background.cancel()
-            self.chosen = way
-        self.take(known[way])
-        if self._is_labelled():
-            self.refit()
+            self.revision += 1
 
     # --- files --------------------------------------------------------------------------------------------------------
 

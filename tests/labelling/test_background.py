@@ -1,4 +1,4 @@
-"""Work of the page in another process: how far it is, cancelling it, and processes that are ended from outside."""
+"""A call of the page in another process: how far it is, cancelling it, and processes that are ended from outside."""
 
 import os
 import signal
@@ -48,46 +48,36 @@ def training(folder, epochs=10, stop=True):
     return train
 
 
-def test_work_says_how_far_it_is_and_ends_at_once_when_it_is_cancelled(background, tmp_path):
-    found, begun = [], []
+def test_a_call_says_how_far_it_is_and_ends_at_once_when_it_is_cancelled(background, tmp_path):
+    found = []
 
-    def two(away):
-        found.append(away(training(tmp_path)))
-        found.append(away(training(tmp_path, 5, stop=False)))
+    def prepared(result):
+        return lambda: found.append(result)
 
-    background.begin("fitting", two, calls=2)
-    background.begin("waits", lambda away: begun.append(away))
-    until(lambda: background.progress == 0.75)  # one of two calls, and half of the other
-    ((pid, ready),) = found
+    background.begin(training(tmp_path, 5, stop=False), prepared)
+    until(lambda: background.progress == 0.5)
+    pid = int((tmp_path / "pid").read_text())
     assert alive(pid)
-    assert not ready
     before = time.monotonic()
     background.cancel()
     assert time.monotonic() - before < 1
-    assert (background.work, background.progress, background.error) == (None, None, "")
+    assert (background.running, background.progress, background.error) == (False, None, "")
     until(lambda: not alive(pid))
-    background.begin("fitting again", lambda away: found.append(away(training(tmp_path))))
-    until(lambda: background.work is None)
-    assert found[1][0] != pid
-    assert found[1][1]
-    assert (len(found), begun, background.error) == (2, [], "")
+    background.begin(training(tmp_path), prepared)
+    until(lambda: not background.running)
+    ((other, ready),) = found
+    assert other != pid
+    assert ready
+    assert background.error == ""
 
 
-def test_work_that_fails_says_so_and_what_waits_for_it_begins(background, tmp_path):
-    found, go_on = [], threading.Event()
-
-    def ended(away):
-        go_on.wait()
-        away(training(tmp_path, 1, stop=False))
-
-    background.begin("fitting", ended)
-    background.begin("fitting once", found.append)
-    background.begin("fitting again", lambda away: found.append(away(training(tmp_path))))  # in its place
-    go_on.set()
-    until((tmp_path / "pid").exists)
-    said = []
-    background.changed = lambda: said.append(background.error)
+def test_a_call_whose_process_is_ended_says_so_and_another_can_be_made(background, tmp_path):
+    found = []
+    background.begin(training(tmp_path, 1, stop=False), found.append)
+    until(lambda: background.progress == 0.1)
     os.kill(int((tmp_path / "pid").read_text()), signal.SIGKILL)
-    until(lambda: found and background.work is None)
-    assert "fitting failed: its process was ended from outside" in said[0]
-    assert (len(found), said[1]) == (1, "")
+    until(lambda: not background.running)
+    assert "its process was ended from outside" in background.error
+    background.begin(training(tmp_path), lambda result: lambda: found.append(result))
+    until(lambda: not background.running)
+    assert (len(found), background.error) == (1, "")

@@ -18,7 +18,6 @@ from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.planted import pick_and_place
 from ddco_pyro.labelling.background import Background
 from ddco_pyro.labelling.document import FREE, OPEN
-from ddco_pyro.labelling.refitting import Ways
 from ddco_pyro.labelling.server import Listening, running
 from ddco_pyro.labelling.session import Session
 
@@ -145,47 +144,6 @@ def labels(session, demo):
 
 def starts(session, demo):
     return [one.start for one in session.segments(session.demos.names[demo])]
-
-
-def test_the_question_comes_first_and_can_be_answered_again_once_something_is_named(tabs, session, run, monkeypatch):
-    turned, come = replace(run, named={}), threading.Event()  # another way to cut; that it is another model is enough
-
-    def coming(on_event):
-        assert come.wait(SOON)
-        return turned
-
-    monkeypatch.setattr(Ways, "calls", {"fine": coming})
-    session.ask()
-    with served(session) as address:
-        tab = tabs(address)
-        asked = tab.get_by_role("heading", name="Which of these ways")
-        playwright.expect(asked).to_be_visible()
-        cards, slider = tab.locator("#question canvas[role=img]"), tab.get_by_role("slider")
-        playwright.expect(cards).to_have_count(3)
-        playwright.expect(slider).to_be_focused()
-        playwright.expect(tab.get_by_role("progressbar")).to_be_visible()
-        come.set()
-        playwright.expect(cards).to_have_count(6)
-        assert slider.get_attribute("aria-valuetext") == "medium"
-        keys(tab, "End")
-        assert slider.get_attribute("aria-valuetext") == "fine"
-        keys(tab, "Enter")
-        playwright.expect(items(tab)).to_have_count(6)
-        assert session.fit is turned
-        keys(tab, "2")
-        said(tab, "option 2 in")
-        keys(tab, "w")
-        playwright.expect(asked).to_be_visible()
-        playwright.expect(tab.get_by_text("chosen")).to_be_visible()
-        assert slider.get_attribute("aria-valuetext") == "fine"
-        keys(tab, "Escape")
-        playwright.expect(asked).to_be_hidden()
-        tab.get_by_role("button", name="Ways to cut").click()
-        tab.get_by_role("button", name="Choose way 1").click()
-        playwright.expect(tab.get_by_role("slider", name="Step")).to_be_focused()
-        said(tab, "Cut as in medium")
-        assert session.fit is session.run
-        assert any((own == 2).any() for own in session.document.labels.values())
 
 
 def test_each_key_does_what_the_list_says(tab, session):
@@ -478,7 +436,6 @@ def test_a_server_killed_during_an_edit_loses_nothing_that_it_acknowledged(tabs,
 
         tab = tabs(address)
         tab.on("response", answered)
-        tab.get_by_role("button", name="Choose way 1").click()
         tab.get_by_role("slider", name="Step").focus()
         before = set(starts_of(address))
         for _ in range(12):
@@ -499,31 +456,19 @@ def starts_of(address):
 
 
 @pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.slow)])
-def test_axe_has_no_serious_complaint(browser, session, run, scheme, monkeypatch):
+def test_axe_has_no_serious_complaint(browser, session, scheme):
     axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe-playwright-python is not installed")
-    come = threading.Event()
-
-    def coming(on_event):
-        assert come.wait(SOON)
-        return replace(run, named={})
-
-    monkeypatch.setattr(Ways, "calls", {"fine": coming})
-    session.ask()
     context = browser.new_context(color_scheme=scheme, bypass_csp=True)
     with served(session) as address:
         tab = context.new_page()
         tab.goto(address)
-        playwright.expect(tab.get_by_role("slider")).to_be_focused()
 
         def complaints():
             found = axe.Axe().run(tab).response["violations"]
             return [(one["id"], one["nodes"][0]["html"]) for one in found if one["impact"] in ("serious", "critical")]
 
         assert complaints() == []
-        come.set()
-        playwright.expect(tab.locator("#question canvas[role=img]")).to_have_count(6)
-        keys(tab, "2")
-        playwright.expect(tab.get_by_role("slider", name="Step")).to_be_focused()
+        tab.get_by_role("slider", name="Step").focus()
         keys(tab, "0")
         said(tab, "Left open")
         keys(tab, "9")

@@ -2,7 +2,6 @@
 
 import csv
 import json
-import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -22,7 +21,7 @@ from ddco_pyro.fitting.fitted import load
 from ddco_pyro.labelling.background import Background
 from ddco_pyro.labelling.document import FREE, OPEN
 from ddco_pyro.labelling.proposals import USUAL, Proposals, Shown
-from ddco_pyro.labelling.refitting import Ways, labelled, refit_spec
+from ddco_pyro.labelling.refitting import labelled, refit_spec
 from ddco_pyro.labelling.session import Session
 from ddco_pyro.spec import parse_spec, with_overrides
 from ddco_pyro.training.labels import used
@@ -360,70 +359,6 @@ def test_a_new_option_is_proposed_after_a_refit(begin, demos):
 def test_without_labels_there_is_no_refit(begin):
     with pytest.raises(BadInput, match="nothing is labelled"):
         begin().refit()
-
-
-# --- ways to cut ------------------------------------------------------------------------------------------------------
-
-
-def test_ways_to_cut_are_asked_for_as_they_come_until_something_is_said(begin, run, monkeypatch):
-    session, go_on = begin(), threading.Semaphore(0)
-
-    def coming():
-        go_on.acquire()
-        return run
-
-    monkeypatch.setattr(Background, "_submit", lambda background, call: POOL.submit(coming))
-
-    def known():
-        return [own["id"] for own in session.state()["question"]["proposals"]]
-
-    assert session.state()["question"] is None
-    session.ask()
-    assert (known(), session.state()["question"]["asked"]) == (["medium"], True)
-    go_on.release()
-    while len(known()) < 2:
-        time.sleep(0.01)
-    assert known() == ["medium", "coarse"]
-    (way, *_) = session.state()["question"]["proposals"]
-    for index, segments in zip(session.state()["question"]["demos"], way["demos"], strict=True):
-        found = session.demo(index)["segments"]
-        assert segments == [{key: own[key] for key in ("start", "stop", "option")} for own in found]
-    go_on.release(3)
-    refitted(session)
-    assert known() == ["medium", "coarse", "fine"], "another seed gives the same options here"
-    with pytest.raises(BadInput, match="no way to cut 'x'; there is: medium, coarse, fine"):
-        session.choose("x")
-    session.edit(paint)
-    assert not session.state()["question"]["asked"]
-    session.edit({"do": "undo"})
-    session.choose("fine")
-    assert (session.state()["question"]["asked"], session.state()["question"]["chosen"]) == (False, "fine")
-
-
-def test_where_the_demonstrations_of_the_run_are_gone_no_other_way_is_asked_for(begin):
-    session = begin()
-    session.run = replace(session.run, given=None)
-    session.ask()
-    assert "looking for other ways to cut failed: demonstrations.path: none.hdf5" in refitted(session)["error"]
-    assert not session.state()["question"]["asked"]
-    session.edit(paint)
-
-
-def test_another_way_to_cut_keeps_the_labels_and_learns_from_them(begin, run, demos, monkeypatch):
-    """The other way has two options for four."""
-    coarse = fit(with_overrides(run.spec, {"hierarchy.levels.0.count": 2}), demos)
-    session = begin()
-    monkeypatch.setattr(Ways, "calls", {"coarse": lambda on_event: coarse})
-    label(session, 0, demos[0].labels["phase"])
-    before = session.document.labels["demo_0"].copy()
-    session.ask()
-    refitted(session)
-    session.choose("coarse")
-    assert session.state()["refit"]["message"] == "fitting the labels"
-    assert (refitted(session)["error"], session.state()["refit"]["done"]) == ("", 1)
-    assert shown(session)[0][1] == [(option, "said") for option in before]
-    np.testing.assert_array_equal(session.document.labels["demo_0"], before)
-    assert session.fit.spec.hierarchy.levels[0].count == COUNT, "a refit has an option for each name"
 
 
 # --- files ------------------------------------------------------------------------------------------------------------

@@ -1,10 +1,10 @@
 // The page: what the server says, what a person does, and the keys.
 import { Look, element, onScheme, percent, within } from "./drawing.js";
-import { List, Options, Question, alike, optionName, readout, summary } from "./panels.js";
+import { List, Options, alike, optionName, readout, summary } from "./panels.js";
 import { Timeline } from "./timeline.js";
 
 const $ = id => document.getElementById(id), EVERY = 1000, ALIKE = 250;
-let state = null, demo = null, cursor = 0, playing = null, painting = null, moving = null, waiting = Promise.resolve(), asked = 0, silent = false, asking = false;
+let state = null, demo = null, cursor = 0, playing = null, painting = null, moving = null, waiting = Promise.resolve(), asked = 0, silent = false;
 
 async function ask(path, body) {
   let answer, found;
@@ -42,23 +42,14 @@ const list = new List($("list"), $("find"), $("count"), index => open(index));
 const options = new Options($("options"), {
   name: number => act(number), rename: (number, text) => edit({ do: "rename", option: number, text }), add: text => edit({ do: "new", text }),
 });
-const question = new Question($("question"), {
-  choose: proposal => tried(async () => { await ask("choose", { proposal }); await leave(); say(`Cut as in ${proposal}`); }),
-  demo: index => ask(`demo/${index}`), back: () => leave(),
-});
-const asks = ({ question }) => Boolean(question) && (question.asked || asking);
-async function leave() { asking = false; await refresh(); $("timeline").focus(); }
-
 function render(keep = true) {
   document.title = `Labelling ${state.title}`;
   $("title").textContent = state.title;
   summary($("summary"), state);
   status(state);
-  const begun = $("question").hidden;
-  $("question").hidden = !asks(state); $("work").hidden = $("labels").hidden = asks(state);
+  $("work").hidden = false;
   document.querySelector("[data-do=undo]").disabled = !state.can_undo;
   document.querySelector("[data-do=redo]").disabled = !state.can_redo;
-  if (asks(state)) { tried(() => question.show(state, begun)); return; }
   if (!demo) return;
   list.show(state, demo.index, keep);
   options.show(state);
@@ -73,7 +64,6 @@ function status({ refit, warnings, dirty }) {
   $("fitting").hidden = !refit.running;
   const bar = $("fitting").querySelector("progress");
   if (refit.progress === null) bar.removeAttribute("value"); else bar.value = refit.progress;
-  $("fitting").querySelector("span").textContent = refit.message;
   document.querySelector("[data-do=refit]").disabled = refit.running;
   const lines = [...warnings, ...(refit.error ? [refit.error] : []), ...(silent ? ["the server does not answer; start it again and open the address it prints"] : [])];
   if ($("warnings").textContent !== lines.join("")) $("warnings").replaceChildren(...lines.map(text => element("p", { textContent: text })));
@@ -81,12 +71,12 @@ function status({ refit, warnings, dirty }) {
 }
 async function refresh(index = demo?.index, step = undefined, keep = true) {  // what the server shows, whole: no answer is mixed with an older one
   const found = await ask("state");
-  if (index === undefined && !asks(found)) [index, step] = whereTo(found);
-  const one = index === undefined || asks(found) ? null : await ask(`demo/${index}`);
+  if (index === undefined) [index, step] = whereTo(found);
+  const one = await ask(`demo/${index}`);
   if (state && found.revision < state.revision) return;
   if (state && state.refit.done < found.refit.done) say(`Refit ${found.refit.done} is done${change(state.summary, found.summary)}`);
   [state, silent] = [found, false];
-  if (one) { demo = one; cursor = step ?? cursor; }
+  demo = one; cursor = step ?? cursor;
   render(keep && list.active === index);
 }
 function whereTo(found) {
@@ -199,7 +189,6 @@ const commands = {
   undo: () => edit({ do: "undo" }), redo: () => edit({ do: "redo" }), split: here("split"), merge: here("merge"), open: here("open"), accept, play, uncertain,
   refit: () => tried(async () => { await ask("refit", {}); await poll(); say("Refit begun"); }),
   cancel: () => tried(async () => { if (!state.refit.running) { say("Nothing is under way"); return; } await ask("cancel", {}); await poll(); say("Cancelled; what is shown stays"); }),
-  ways: () => tried(async () => { stop(); asking = true; await ask("ask", {}); await refresh(); }),
   save: () => tried(async () => { say((await ask("save", {})).message); status(Object.assign(state, { dirty: false })); }),
   export: () => { const { left, bottom } = document.querySelector("[data-do=export]").getBoundingClientRect(); popup(left, bottom, "Export", state.formats.map(name => [name, () => download(name)])); },
   help: () => $("help").showModal(), find: () => $("find").focus(),
@@ -207,24 +196,17 @@ const commands = {
   next: () => seek(boundaries().find(step => step > cursor) ?? cursor), previous: () => seek(boundaries().reverse().find(step => step < cursor) ?? 0),
 };
 const KEYS = {
-  " ": "play", j: "next", k: "previous", s: "split", m: "merge", Enter: "accept", g: "uncertain", u: "undo", "/": "find", "?": "help", "+": "closer", "=": "closer", "-": "wider", a: "all", r: "refit", c: "cancel", w: "ways",
+  " ": "play", j: "next", k: "previous", s: "split", m: "merge", Enter: "accept", g: "uncertain", u: "undo", "/": "find", "?": "help", "+": "closer", "=": "closer", "-": "wider", a: "all", r: "refit", c: "cancel",
 };
 for (const button of document.querySelectorAll("[data-do]")) button.addEventListener("click", event => {
   commands[button.dataset.do]();
-  if (event.detail && demo && !["help", "export", "ways"].includes(button.dataset.do)) $("timeline").focus();  // a click leaves the keys to the time line
+  if (event.detail && demo && !["help", "export"].includes(button.dataset.do)) $("timeline").focus();  // a click leaves the keys to the time line
 });
 addEventListener("keydown", event => {
   const { target, key, code, shiftKey } = event, digit = code.match(/^(?:Digit|Numpad)(\d)$/)?.[1], typed = target.matches("input:not([type=range]), textarea, select");
   if (event.defaultPrevented || $("help").open || !state) return;
   if (typed) { if (key === "Escape" && target !== $("find")) $("timeline").focus(); return; }
   const alone = !event.ctrlKey && !event.metaKey && !event.altKey, graphic = alone || event.getModifierState("AltGraph");
-  if (asks(state)) {
-    const one = alone && (key === "Enter" && target.matches("input") ? question.coloured : state.question.proposals[digit - 1]);
-    if (one) question.calls.choose(one.id);
-    else if (alone && key === "c") commands.cancel();
-    else if (alone && ["w", "Escape"].includes(key) && !state.question.asked) leave();
-    return;
-  }
   if (!demo || (target.matches("button, a, summary") && (key === " " || key === "Enter"))) return;
   const bracket = graphic ? (key === "[" || code === "BracketLeft" && alone ? -1 : key === "]" || code === "BracketRight" && alone ? 1 : 0) : 0;
   if (bracket) shove(bracket * (shiftKey && alone ? 10 : 1));
@@ -246,7 +228,7 @@ addEventListener("keydown", event => {
 });
 addEventListener("keyup", event => { if (moving && /Bracket|^\[|^\]|Digit[89]/.test(event.code) || painting?.code === event.code) release(); });
 addEventListener("blur", () => { if (moving || painting) release(); });
-onScheme(() => { if (state) { question.restyle(); render(); } });
+onScheme(() => { if (state) render(); });
 
 async function poll() {
   try {

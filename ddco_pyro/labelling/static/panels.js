@@ -1,85 +1,10 @@
-// What stands beside the time line: the question, the list of demonstrations, options, the readout, and what is alike.
+// What stands beside the time line: the list of demonstrations, options, the readout, and what is alike.
 import { last, sharp } from "./canvas.js";
-import { Look, coloured, element, looks, percent, row, within } from "./drawing.js";
+import { coloured, element, looks, percent, row, within } from "./drawing.js";
 
 const swatch = colour => { const made = element("span", { className: "swatch" }); made.style.background = colour; return made; };
-const seconds = (steps, rate) => rate ? `${steps} steps (${+(steps / rate).toPrecision(2)} s)` : `${steps} steps`;
 
 export const optionName = (state, option, said) => said === "open" ? "open" : option ? state.names[option - 1] ?? `option ${option}` : "control";
-
-export class Question {  // which of some ways to cut is meant, shown on three demonstrations
-  constructor(root, calls) {  // calls: choose(id), demo(index), back()
-    Object.assign(this, { root, calls });
-    this.looks = []; this.rows = []; this.proposals = [];
-    this.slider = element("input", { type: "range", id: "grain", min: 0, step: 1 });
-    this.slider.oninput = () => this.colour(this.ranked[this.slider.value]);
-    this.cards = element("div", { className: "cards" }); this.heads = element("div", { className: "three" });
-    this.back = element("button", { type: "button", textContent: "Back", title: "Leave it as it is (Escape)", onclick: () => calls.back() });
-    root.append(
-      element("div", { className: "bar" }, element("h2", { textContent: "Which of these ways to cut do you mean?" }), element("span", { className: "gap" }), this.back),
-      element("p", { className: "note", textContent: "Three demonstrations, and what each way makes of them. The slider goes from long segments to short ones; point at a row to see its steps. Everything can be corrected afterwards, and steps that you name stay as you name them." }),
-      element("label", { htmlFor: "grain", className: "grain" }, "Segments ", this.slider, this.grain = element("output")),
-      this.heads, this.cards);
-    addEventListener("resize", () => this.draw());
-  }
-  async show(state, begun) {  // ways come one after another; `begun` where the question was hidden before
-    const { question } = state, more = question.proposals.slice(this.proposals.length);
-    this.state = state; this.back.hidden = question.asked;
-    this.cards.append(...more.map((proposal, place) => this.card(proposal, this.proposals.length + place)));
-    this.proposals.push(...more);
-    this.ranked = [...this.proposals].sort((a, b) => b.median - a.median);  // coarse to fine
-    this.slider.max = this.ranked.length - 1;
-    [...this.cards.querySelectorAll("em")].forEach((mark, place) => { mark.textContent = this.proposals[place].id === question.chosen ? "chosen" : ""; });
-    this.draw();
-    if (begun) this.slider.focus();
-    if (!this.looks.length) {
-      this.demos ??= Promise.all(question.demos.map(this.calls.demo));
-      const demos = await this.demos;
-      if (this.looks.length) return;
-      this.demos = demos;
-      this.heads.replaceChildren(...demos.map(demo => element("figure", {}, element("div"), element("figcaption", { textContent: demo.name }))));
-      this.looks = [...this.heads.querySelectorAll("div")].map(box => new Look(box, 200, 130));
-    }
-    const now = this.proposals.find(one => one.id === question.chosen) ?? this.proposals[0];
-    if (begun || !this.coloured) this.colour(now);
-    this.slider.value = this.ranked.indexOf(this.coloured);
-  }
-  restyle() { this.coloured = null; this.draw(); }
-  card(proposal, place) {
-    const count = proposal.demos.reduce((sum, one) => sum + one.length, 0) / proposal.demos.length, rate = this.state.frequency;
-    const button = element("button", { type: "button", textContent: `${place + 1}  This one` });
-    button.setAttribute("aria-label", `Choose way ${place + 1}, ${proposal.name}`);
-    button.onclick = () => this.calls.choose(proposal.id);
-    button.onfocus = () => this.colour(proposal);
-    const canvases = proposal.demos.map((segments, column) => {
-      const canvas = element("canvas"), { steps, name } = this.state.demos[this.state.question.demos[column]];
-      canvas.setAttribute("role", "img");
-      canvas.setAttribute("aria-label", `${name}: ${segments.map(one => `${proposal.names[one.option - 1] ?? "control"} to step ${one.stop - 1}`).join(", ")}`);
-      canvas.onpointermove = event => {
-        this.colour(proposal);
-        this.looks[column]?.at(Math.min(Math.floor(event.offsetX / canvas.clientWidth * steps), steps - 1));
-      };
-      this.rows.push({ canvas, segments, steps, proposal });
-      return canvas;
-    });
-    return element("section", { className: "card" }, element("div", { className: "bar" }, button, element("strong", { textContent: proposal.name }), element("em"),
-      element("span", { className: "note", textContent: `${+count.toFixed(1)} segments each, half longer than ${seconds(proposal.median, rate)}` })), element("div", { className: "three" }, ...canvases));
-  }
-  colour(proposal) {
-    if (this.coloured === proposal || !this.looks.length) return;
-    this.coloured = proposal;
-    this.slider.value = this.ranked.indexOf(proposal); this.slider.setAttribute("aria-valuetext", proposal.name);
-    this.grain.textContent = proposal.name;
-    [...this.cards.children].forEach((card, place) => card.classList.toggle("on", this.proposals[place] === proposal));
-    this.looks.forEach((look, column) => look.show(this.demos[column], proposal.demos[column], proposal.colours));
-  }
-  draw() {
-    for (const { canvas, segments, steps, proposal } of this.rows) {
-      const width = canvas.clientWidth, context = sharp(canvas, width, 24);
-      row(context, segments, { place: step => step / steps * width, edge: width, top: 0, height: 24, colours: proposal.colours, names: option => option ? proposal.names[option - 1] : "control" });
-    }
-  }
-}
 
 export class List {  // all demonstrations, the most informative first, each with its segments
   constructor(root, find, count, open) {
