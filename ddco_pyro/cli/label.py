@@ -62,7 +62,7 @@ def label(
     listening = Listening.at(port)
     session = Session(load(run, allow_code), file, place, level, _exporters(run, file))
     session.journal.at(listening.address)
-    session.background.ready()
+    session.begin()
 
     def ready() -> None:
         print(f"{listening.address}\nCtrl-C saves the labels and ends", flush=True)

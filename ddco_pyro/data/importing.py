@@ -13,7 +13,7 @@ from ddco_pyro.data.annotations import LabelTable, labels_of_table
 from ddco_pyro.data.arrays import NUMBERS, LazyArray, Observed, is_picture, network_input
 from ddco_pyro.data.demonstration import Demonstration, check, check_values
 from ddco_pyro.data.errors import DemonstrationsError
-from ddco_pyro.data.labels import BOUNDARY, LABEL_NAMES, UNKNOWN
+from ddco_pyro.data.labels import BOUNDARY, LABEL_NAMES, SOURCE, UNKNOWN
 from ddco_pyro.data.pictures import resized
 from ddco_pyro.data.sources import Source, open_source
 from ddco_pyro.data.sources.metadata import FREQUENCY
@@ -158,7 +158,7 @@ def _names(source: Source, choice: Choice) -> Sequence[str]:
 def _labelled(source: Source, labels: Mapping[str, Mapping[str, np.ndarray]], name: str) -> Demonstration:
     """A demonstration with the labels of a table, in place of those of the same name."""
     demo = source.read(name)
-    stale = {f"{key}{end}" for key in labels for end in ("", BOUNDARY)}
+    stale = {f"{key}{end}" for key in labels for end in ("", BOUNDARY, SOURCE)}
     given = {key: each.get(name, np.full(len(demo), UNKNOWN, np.int16)) for key, each in labels.items()}
     kept = {key: values for key, values in demo.labels.items() if key not in stale}
     return Demonstration.stored(name, demo.observations, demo.actions, {**kept, **given}, demo.attributes)

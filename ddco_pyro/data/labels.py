@@ -14,8 +14,8 @@ LABEL_NAMES = "label_names"
 UNKNOWN = -1
 """The label of a step without ground truth."""
 
-BOUNDARY = "_boundary"
-"""End of the name of labels that are 1 where a segment begins, beside the labels of a level."""
+BOUNDARY, SOURCE = "_boundary", "_source"
+"""Ends of the names of labels beside those of a level: 1 where a segment begins, and who says what a step is."""
 
 
 def label_names(attributes: Mapping[str, object]) -> dict[str, list[str]]:

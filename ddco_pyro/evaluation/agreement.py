@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ddco_pyro.data.labels import BOUNDARY, UNKNOWN, label_names
+from ddco_pyro.data.labels import BOUNDARY, SOURCE, UNKNOWN, label_names
 from ddco_pyro.data.sources import open_source
 from ddco_pyro.drawing.page import Table
 from ddco_pyro.drawing.words import duration, number
@@ -356,7 +356,7 @@ def _read(path: str | Path) -> tuple[dict[str, dict[str, np.ndarray]], dict[str,
             demo: {
                 name: values
                 for name, values in source.read(demo).labels.items()
-                if not name.endswith(BOUNDARY) and values.dtype.kind in "iub"
+                if not name.endswith((BOUNDARY, SOURCE)) and values.dtype.kind in "iub"
             }
             for demo in source.names
         }

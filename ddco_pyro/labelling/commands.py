@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,8 +10,9 @@ import numpy as np
 
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.inferred import runs
-from ddco_pyro.labelling.document import FREE, OPEN, Change, Document
-from ddco_pyro.labelling.proposals import Shown, first_wrong
+from ddco_pyro.labelling.document import CONFIRM, FREE, OPEN, PAINT, Change, Document
+from ddco_pyro.labelling.proposals import Shown, first_wrong, labels_shown, sources_shown
+from ddco_pyro.segmenting import SOURCES
 
 LONGEST = 80
 """Characters of a name."""
@@ -19,12 +20,15 @@ LONGEST = 80
 
 @dataclass(frozen=True)
 class Segment:
-    """A segment that is shown: an option 0 to k from one step to before another, and who says so."""
+    """A segment that is shown: an option 0 to k from one step to before another.
+
+    :param source: who says so, one of :data:`~ddco_pyro.segmenting.SOURCES`; the option of an open segment is 0.
+    """
 
     start: int
     stop: int
     option: int
-    said: str
+    source: str
 
 
 @dataclass(frozen=True)
@@ -40,15 +44,12 @@ class View:
 
     def segments(self, name: str) -> list[Segment]:
         """The segments of a demonstration that are shown."""
-        options, labels = self.shown[name].options, self.document.labels[name]
-        starts = (np.diff(options, prepend=-1) != 0) | (np.diff((labels == OPEN).astype(int), prepend=0) != 0)
-        starts[[*self.document.cuts[name], 0]] = True
-        found = []
-        for option, start, stop in runs(options, starts):
-            own = labels[start:stop]
-            said = "open" if (own == OPEN).all() else "said" if (own > 0).all() else "proposed"
-            found.append(Segment(start, stop, int(option), said))
-        return found
+        level = labels_shown(self.document, name, self.shown[name])
+        sources = sources_shown(self.document, name)
+        return [
+            Segment(start, stop, max(option, 0), SOURCES[sources[start:stop].min()])
+            for option, start, stop in level.runs()
+        ]
 
     def at(self, name: str, step: int) -> Segment:
         """The segment of a step.
@@ -68,70 +69,84 @@ class View:
         """
         names = self.document.names
         if do == "new":
-            return [("names", [*names, self._text(command)])]
+            return [("names", [*names, self._text(command, names)])]
         if do == "rename":
             option = self._option(command, 1)
-            return [("names", [*names[: option - 1], self._text(command), *names[option:]])]
+            before, after = names[: option - 1], names[option:]
+            return [("names", [*before, self._text(command, (*before, *after)), *after])]
         if name is None:
             raise BadInput(f"{do}: names no demonstration, or is no command")
         if do == "accept":
-            return self._accept(name)
+            return [] if name in self.document.accepted else self._accept(name, command.get("segments"))
+        if do == "reopen":
+            return [("accept", name, False, 0.0, 0)]
         if do == "paint":
             start, stop = (whole(command, key) for key in ("start", "stop"))
             if not 0 <= start < stop <= self.document.lengths[name]:
                 raise BadInput(
                     f"paint: steps {start} to {stop} are not in {name}, which has {self.document.lengths[name]}"
                 )
-            return [("paint", name, start, stop, self._option(command, 0) or OPEN)]
+            return [(PAINT, name, start, stop, self._option(command, 0) or OPEN)]
         if do == "move":
             return self._move(name, whole(command, "boundary"), whole(command, "to"))
         step = whole(command, "step")
         here = self.at(name, step)
         if do == "name":
-            return [("paint", name, here.start, here.stop, self._option(command, 1))]
+            return [(PAINT, name, here.start, here.stop, self._option(command, 1))]
         if do == "open":
-            return [("paint", name, here.start, here.stop, OPEN)]
-        if do == "free":
-            return [("paint", name, here.start, here.stop, FREE)]
+            return [(PAINT, name, here.start, here.stop, OPEN)]
         if do == "everywhere":
             option = self._option(command, 1)
             return [
-                ("paint", other, own.start, own.stop, option)
+                (PAINT, other, own.start, own.stop, option)
                 for other in self.document.lengths
                 if other == name or other not in self.document.accepted
                 for own in self.segments(other)
-                if own.option == here.option and own.said != "open"
+                if own.option == here.option and own.source != "open"
             ]
         if do == "split":
+            if here.source == "open":
+                raise BadInput(f"split: the segment at step {step} of {name} is open; name it first")
             if step == here.start:
                 raise BadInput(f"split: a segment of {name} begins at step {step} already")
             return [("cut", name, step, True)]
         if do == "merge":
             if here.stop == self.document.lengths[name]:
                 raise BadInput(f"merge: the segment at step {step} is the last of {name}; it has none to merge with")
-            after = self.at(name, here.stop)
+            following = self.at(name, here.stop)
             if not here.option:
                 raise BadInput(f"merge: the segment at step {step} of {name} has no option; name it first")
-            return [("cut", name, here.stop, False), ("paint", name, here.start, after.stop, here.option)]
+            return [("cut", name, here.stop, False), (PAINT, name, here.start, following.stop, here.option)]
         raise BadInput(f"{do}: is no command")
 
-    def _accept(self, name: str) -> list[Change]:
-        """Everything that is shown is said, except what is open; an accepted demonstration is accepted no longer."""
-        if name in self.document.accepted:
-            return [("accept", name, False, 0.0, 0)]
-        options, labels = self.shown[name].options, self.document.labels[name]
-        painted = [
-            ("paint", name, start, stop, int(option))
+    def _accept(self, name: str, seen: Any) -> list[Change]:
+        """What a person sees becomes labels where nothing was said.
+
+        :param seen: the first step and the option of each segment that the person sees.
+        :raises BadInput: these are no segments of the demonstration.
+        """
+        labels, last = self.document.labels[name], self.document.lengths[name]
+        try:
+            starts, options = np.array(seen, np.int64).reshape(-1, 2).T
+        except (TypeError, ValueError, OverflowError):
+            raise BadInput("accept: segments are pairs of a first step and an option") from None
+        lengths = np.diff(starts, append=last)
+        if (
+            not len(starts)
+            or starts[0]
+            or lengths.min() < 1
+            or not 0 <= options.min() <= options.max() <= len(self.document.names)
+        ):
+            raise BadInput(f"accept: these are no segments of {name}")
+        options = np.where(labels == FREE, np.repeat(options, lengths), 0)
+        confirmed = [
+            (CONFIRM, name, start, stop, option)
             for option, start, stop in runs(options, np.diff(options, prepend=-1) != 0)
-            if option > 0
+            if option
         ]
-        opened = [
-            ("paint", name, start, stop, OPEN)
-            for value, start, stop in runs(labels, np.diff(labels, prepend=-9) != 0)
-            if value == OPEN
-        ]
-        first = self.first.get(name, self.shown[name])
-        return [*painted, *opened, ("accept", name, True, *first_wrong(first, self.shown[name]))]
+        seen_options = np.where(labels == OPEN, self.shown[name].options, np.where(labels == FREE, options, labels))
+        accepted = Shown(seen_options, np.ones(last))
+        return [*confirmed, ("accept", name, True, *first_wrong(self.first.get(name, self.shown[name]), accepted))]
 
     def _move(self, name: str, boundary: int, to: int) -> list[Change]:
         """A boundary elsewhere: the steps between, and one on either side, are said."""
@@ -142,10 +157,10 @@ class View:
         left, right = own[place - 1], own[place]
         if not left.start < to < right.stop:
             raise BadInput(f"move: step {to} is not within the segments at both sides of step {boundary} of {name}")
-        sides = [(segment, OPEN if segment.said == "open" else segment.option) for segment in (left, right)]
+        sides = [(segment, OPEN if segment.source == "open" else segment.option) for segment in (left, right)]
         low, high = min(boundary, to) - 1, max(boundary, to) + 1
         changes: list[Change] = [
-            ("paint", name, *ends, option)
+            (PAINT, name, *ends, option)
             for (_, option), ends in zip(sides, ((low, to), (to, high)), strict=True)
             if option
         ]
@@ -159,10 +174,10 @@ class View:
             raise BadInput(f"there is no option {option}; there are {least} to {len(self.document.names)}")
         return option
 
-    def _text(self, command: Mapping[str, Any]) -> str:
+    def _text(self, command: Mapping[str, Any], others: Sequence[str]) -> str:
         text = command.get("text")
         name = text.strip() if isinstance(text, str) else ""
-        if not name or len(name) > LONGEST or not name.isprintable() or name in ("control", *self.document.names):
+        if not name or len(name) > LONGEST or not name.isprintable() or name in ("control", *others):
             raise BadInput(f"a name is one line of at most {LONGEST} characters that no other option has")
         return name
 

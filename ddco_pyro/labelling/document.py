@@ -27,9 +27,13 @@ from ddco_pyro.errors import BadInput
 FREE, OPEN = -1, -2
 """Steps of which nothing is said, and steps that are left open on purpose; both are -1 in files."""
 
+PAINT, CONFIRM = "paint", "confirm"
+"""A person gives steps a label, or accepts the one that is proposed."""
+
 Change = tuple[Any, ...]
-"""("paint", demonstration, start, stop, option), ("cut", demonstration, step, whether), ("accept", demonstration,
-whether, steps of it that were expected wrong, steps of it that were) or ("names", names of the options 1 to k)."""
+"""(:data:`PAINT` or :data:`CONFIRM`, demonstration, start, stop, option), ("cut", demonstration, step, whether),
+("accept", demonstration, whether, steps of it that were expected wrong, steps of it that were) or ("names", names of
+the options 1 to k)."""
 
 
 @dataclass
@@ -39,6 +43,7 @@ class Document:
     :param lengths: steps of each demonstration, by name.
     :param names: of the options 1 to k.
     :ivar labels: of each demonstration [T]: an option 1 to k, :data:`FREE` or :data:`OPEN`.
+    :ivar given: whether a person gave each label, rather than accepted what was proposed, bool [T].
     :ivar cuts: steps at which a segment begins although the option stays.
     :ivar accepted: demonstrations that a person is done with: of each the steps whose first proposal was expected to be
         wrong, and the steps in which it was.
@@ -48,6 +53,7 @@ class Document:
     lengths: Mapping[str, int]
     names: tuple[str, ...]
     labels: dict[str, np.ndarray] = field(init=False)
+    given: dict[str, np.ndarray] = field(init=False)
     cuts: dict[str, set[int]] = field(init=False)
     accepted: dict[str, tuple[float, int]] = field(init=False, default_factory=dict)
     done: list[tuple[Change, ...]] = field(init=False, default_factory=list)
@@ -55,7 +61,22 @@ class Document:
 
     def __post_init__(self) -> None:
         self.labels = {name: np.full(length, FREE, np.int16) for name, length in self.lengths.items()}
+        self.given = {name: np.ones(length, bool) for name, length in self.lengths.items()}
         self.cuts = {name: set() for name in self.lengths}
+
+    def alters(self, kind: str, *of: Any) -> bool:
+        """Whether a change makes a difference."""
+        if kind == "names":
+            return self.names != tuple(of[0])
+        name, *what = of
+        if kind in (PAINT, CONFIRM):
+            steps = slice(*what[:2])
+            return bool(
+                (self.labels[name][steps] != what[2]).any() or (self.given[name][steps] != (kind == PAINT)).any()
+            )
+        if kind == "cut":
+            return (what[0] in self.cuts[name]) != what[1]
+        return (name in self.accepted) != what[0]
 
     def edit(self, changes: Sequence[Change]) -> None:
         """Make an edit; what was undone can no longer be done again."""
@@ -88,12 +109,15 @@ class Document:
             self.names = tuple(of[0])
             return [back]
         name = of[0]
-        if kind == "paint":
+        if kind in (PAINT, CONFIRM):
             start, stop, option = of[1:]
-            labels = self.labels[name]
-            edges = [start, *(np.flatnonzero(np.diff(labels[start:stop])) + start + 1).tolist(), stop]
-            backs: list[Change] = [("paint", name, one, after, int(labels[one])) for one, after in pairwise(edges)]
-            labels[start:stop] = option
+            labels, given = self.labels[name], self.given[name]
+            differs = (np.diff(labels[start:stop]) != 0) | (np.diff(given[start:stop]) != 0)
+            edges = [start, *(np.flatnonzero(differs) + start + 1).tolist(), stop]
+            backs: list[Change] = [
+                (PAINT if given[one] else CONFIRM, name, one, after, int(labels[one])) for one, after in pairwise(edges)
+            ]
+            labels[start:stop], given[start:stop] = option, kind == PAINT
             return backs
         if kind == "cut":
             step, whether = of[1:]

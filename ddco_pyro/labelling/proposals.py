@@ -2,32 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from copy import copy, deepcopy
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
 import torch
 from scipy.optimize import linear_sum_assignment
+from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.data.labels import label_names
+from ddco_pyro.data.labels import BOUNDARY, SOURCE, UNKNOWN, label_names
 from ddco_pyro.data.sources import Source
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.agreement import agreement
 from ddco_pyro.evaluation.inferred import Inferred, runs
 from ddco_pyro.fitting.fitted import Fit
-from ddco_pyro.inference import posterior
-from ddco_pyro.labelling.document import FREE, Document
+from ddco_pyro.labelling.document import CONFIRM, FREE, OPEN, PAINT, Change, Document
 from ddco_pyro.model.recogniser import Windows
-from ddco_pyro.model.tables import NEVER
-from ddco_pyro.names import choice_names
-from ddco_pyro.segmenting import LevelLabels, Segmented, Segments, segments
+from ddco_pyro.model.tables import NEVER, Tables
+from ddco_pyro.names import choice_names, label_name, option_name
+from ddco_pyro.segmenting import SOURCES, LevelLabels, Segmented, Segments, segments
 from ddco_pyro.training.recognition import SHARES, learn
 
 RIDGE = 50.0
 """Of the recogniser of the steps that a person has named."""
+
+AT_ONCE = 8
+"""Demonstrations that are inferred together."""
 
 
 def weight(power: float) -> float:
@@ -50,18 +54,31 @@ class Shown:
     probability: np.ndarray
 
 
+@dataclass(frozen=True)
+class Learned:
+    """What is learned of the named steps.
+
+    :param windows: a recogniser of a model's options; None where fewer than two have named steps.
+    :param unknown: as :meth:`Proposals.unknown` gives them.
+    """
+
+    windows: Windows | None
+    unknown: Tensor
+
+
 class Proposals:
     """The exact posterior of a level, with the named steps clamped and a recogniser's evidence of the others.
 
     The model's options are numbered anew, as a person's: so that the model by itself agrees with the named steps, and
-    elsewhere with what was shown before.
+    elsewhere with what was shown before. A path has the model's own numbers, so that a new numbering holds at once for
+    all demonstrations, whenever each of them is inferred.
 
     :param level: 1 is the lowest.
+    :param labels: an option of the person for each step, [T], of every demonstration; below 1 where the model proposes.
+        An option that the model does not have yet clamps nothing.
     :param count: the options that a person can name.
     :param before: the person's option of each step [T] shown before; empty for the model's own numbers.
     :ivar options: of the person, for each option 0 to k of the model.
-    :ivar waiting: the person's options that occur, and that no named step tells of: it has none, and the named ones are
-        not those that the model by itself gives to it.
     """
 
     def __init__(
@@ -69,149 +86,219 @@ class Proposals:
         fit: Fit,
         demos: Demonstrations,
         level: int,
+        labels: Mapping[str, np.ndarray],
         count: int,
         before: Mapping[str, np.ndarray] = MappingProxyType({}),
     ) -> None:
         self.fit, self.level = fit, level
         levels = fit.spec.hierarchy.levels if fit.spec.hierarchy else ()
         self.lasts, self.size = [own.lasts for own in levels], levels[level - 1].count
-        self.pieces = list(fit.infer(demos))
-        self.options = np.arange(self.size + 1)
+        self.pieces, model = list(fit.infer(demos)), fit.hierarchy
         self.place = {name: (piece, row) for piece, own in enumerate(self.pieces) for row, name in enumerate(own.names)}
         with torch.no_grad():
             self.alone = [piece.outputs.tables(piece.batch.actions) for piece in self.pieces]
-        model = fit.hierarchy
-        self.alone_u = [
-            posterior(tables, piece.batch.lengths).u[level - 1]
-            for tables, piece in zip(self.alone, self.pieces, strict=True)
+        alone = [
+            Inferred(piece.names, piece.batch, piece.hierarchy, tables)
+            for piece, tables in zip(self.pieces, self.alone, strict=True)
         ]
-        self.windows = Windows(self.size, model.input_shape, len(model.scaling.varying), past=False)
-        every_run = [run for name in demos.names for run in self.runs(name)]
+        self.alone_u = [piece.posterior.u[level - 1] for piece in alone]
+        every_run = [
+            run
+            for piece in alone
+            for row in range(len(piece.names))
+            for run in runs(*piece.segmented(row, self.lasts)[level - 1])
+        ]
         self.occurring = {option for option, _, _ in every_run} - {0}
         typical = float(np.median([stop - start for _, start, stop in every_run]))
-        self.half, self.waiting = typical / 2, np.array([], int)
+        self.half = typical / 2
+        self.windows = Windows(self.size, model.input_shape, len(model.scaling.varying), past=False)
         self.windows.widths.copy_(torch.tensor([max(1, round(share * typical)) for share in SHARES]))
         self.features = [
             self.windows.features(piece.batch.inputs, piece.batch.actions, piece.batch.lengths) for piece in self.pieces
         ]
+        every = torch.cat([self._rows(name) for name in demos.names])
+        self.middle, self.spread = every.mean(0).numpy(), every.std(0).clamp(min=1e-9).numpy()
+        self.whole = np.concatenate([self.centres(name, [0]) for name in demos.names])
         self.usual = np.eye(self.size, count)
         if before:
-            self.usual = self._common(before, count)
+            self.usual = np.sum([self._common(name, own, count) for name, own in before.items()], axis=0)
             self.usual /= self.usual.sum(1, keepdims=True).clip(min=1)
         self.usual *= self.half
-        places = zip(demos, (self.place[name] for name in demos.names), strict=True)
-        every = torch.cat([self.features[piece][row, : len(demo)] for demo, (piece, row) in places])
-        self.middle, self.spread = every.mean(0), every.std(0).clamp(min=1e-9)
+        self.common, self.options = dict[str, np.ndarray](), np.array([], int)
+        self.number(labels)
+        self.learned = self.learn(labels)
+        self.paths = dict[str, tuple[np.ndarray, np.ndarray]]()
+        for piece in self.infer(demos.names, labels):
+            self.paths |= self.found(piece)
 
-    def update(self, labels: Mapping[str, np.ndarray]) -> None:
-        """Learn the recogniser of the named steps, clamp these, and infer everything else again.
+    def number(self, labels: Mapping[str, np.ndarray]) -> bool:
+        """Number the options by the named steps of these demonstrations, and of all others as they were.
 
-        The recogniser says nothing of steps that the model by itself gives to an option of :attr:`waiting`: it does not
-        know that option, and would speak against it.
+        Options keep their numbers unless named steps are against it by more than half a segment of each.
 
-        :param labels: an option of the person for each step, [T]; below 1 where the model proposes. An option that the
-            model does not have yet clamps nothing.
+        :return: whether a number changed.
         """
-        self.options = self.aligned(labels)
-        allowed = [self._allowed(piece, labels) for piece in self.pieces]
-        chosen = [torch.where(own.sum(-1) == 1, own.int().argmax(-1), -1) for own in allowed]
-        named = torch.cat([rows[own > 0] for rows, own in zip(self.features, chosen, strict=True)])
-        options = torch.cat([own[own > 0] for own in chosen])
-        seen = 1 + np.flatnonzero(self._common(labels, max(own.max() for own in labels.values())).sum(1) > self.half)
-        unknown = torch.tensor(sorted(self.occurring - {*options.tolist(), *seen.tolist()}))
-        self.waiting = self.options[unknown.int().numpy()]
-        evident = len(options.unique()) > 1
-        if evident:
-            learn(self.windows, named, options, RIDGE)
-        gamma, again = weight(float(self.fit.hierarchy.power)), []
-        every = zip(self.pieces, self.alone, self.alone_u, self.features, allowed, strict=True)
-        for piece, tables, u, rows, own in every:
-            if evident:
-                silent = torch.isin(u.argmax(-1), unknown).unsqueeze(-1)
-                ratio = gamma * self.windows.log_ratio(rows)
-                tables = tables.with_evidence(self.level, torch.where(silent, 0.0, ratio))
-            tables = tables.with_evidence(self.level, torch.where(own, 0.0, NEVER))
-            again.append(Inferred(piece.names, piece.batch, piece.hierarchy, tables))
-        self.pieces = again
+        new = {name: self._common(name, own, max(own.max(), 0)) for name, own in labels.items()}
+        self.common = {**self.common, **new}
+        before, self.options = self.options, self.aligned(self.common)
+        return not np.array_equal(before, self.options)
+
+    def aligned(self, common: Mapping[str, np.ndarray]) -> np.ndarray:
+        """The person's option for each option 0 to k of the model, another one for each where there are enough.
+
+        An option that is newer than the model is none of them.
+
+        :param common: of each demonstration, the steps that labels have in common with the model.
+        """
+        total = self.usual.copy()
+        for own in common.values():
+            known = own[:, : total.shape[1]]
+            total[:, : known.shape[1]] += known
+        best = total.argmax(1)
+        ours, theirs = linear_sum_assignment(-total)
+        best[ours] = theirs
+        return np.array([0, *(best + 1)])
+
+    def _common(self, name: str, labels: np.ndarray, count: int) -> np.ndarray:
+        """The steps that the model by itself expects to have in common with labels 1 to count, [its options, count]."""
+        piece, row = self.place[name]
+        common, said = np.zeros((count, self.size)), np.flatnonzero((labels > 0) & (labels <= count))
+        np.add.at(common, labels[said] - 1, self.alone_u[piece][row, said, 1:].numpy())
+        return common.T
+
+    def unknown(self, labels: Mapping[str, np.ndarray]) -> Tensor:
+        """The options of the model that occur, and that no named step tells of.
+
+        Such an option has none, and the named ones are not those that the model by itself gives to it.
+        """
+        named = {option for own in labels.values() for option in self._by_model(own)[1].tolist()}
+        each = np.sum([common.sum(1) for common in self.common.values()], axis=0)
+        seen = (1 + np.flatnonzero(each > self.half)).tolist()
+        return torch.tensor(sorted(self.occurring - {*named, *seen}), dtype=torch.int64)
+
+    def waiting(self, labels: Mapping[str, np.ndarray]) -> np.ndarray:
+        """The person's options that occur, and that no named step tells of."""
+        return self.options[self.unknown(labels).numpy()]
+
+    def _by_model(self, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The named steps of a demonstration whose label stands for one option of the model, and that option."""
+        counts = np.bincount(self.options[1:], minlength=labels.max(initial=0) + 1)
+        said = np.flatnonzero((labels > 0) & (counts[labels.clip(0)] == 1))
+        return said, (self.options[1:] == labels[said, None]).argmax(1) + 1
+
+    def learn(self, labels: Mapping[str, np.ndarray]) -> Learned:
+        """Learn the recogniser of the named steps."""
+        each = {name: self._by_model(labels[name]) for name in self.place}
+        options = torch.as_tensor(np.concatenate([own for _, own in each.values()]))
+        windows, unknown = None, self.unknown(labels)
+        if len(options.unique()) > 1:
+            rows = torch.cat([self._rows(name)[said] for name, (said, _) in each.items()])
+            learn(windows := deepcopy(self.windows), rows, options, RIDGE)
+        return Learned(windows, unknown)
+
+    def infer(self, names: Iterable[str], labels: Mapping[str, np.ndarray]) -> Iterator[Inferred]:
+        """The posterior of some demonstrations, a few at a time: named steps are clamped, the recogniser is evidence.
+
+        The recogniser says nothing of steps that the model by itself gives to an option that is unknown to it.
+        """
+        rows: dict[int, list[int]] = {}
+        for name in names:
+            place, row = self.place[name]
+            rows.setdefault(place, []).append(row)
+        gamma, level = weight(float(self.fit.hierarchy.power)), self.level
+        for place, own in rows.items():
+            for some in torch.tensor(own).split(AT_ONCE):
+                piece, alone = self.pieces[place], self.alone[place]
+                batch = piece.batch.select(some)
+                steps = slice(int(batch.lengths.max()))
+                leaves = [None if table is None else table[some, steps] for table in alone.leaves()]
+                tables = Tables.of(alone.depth, leaves, alone.power)
+                if self.learned.windows is not None:
+                    silent = torch.isin(self.alone_u[place][some, steps].argmax(-1), self.learned.unknown).unsqueeze(-1)
+                    ratio = gamma * self.learned.windows.log_ratio(self.features[place][some, steps])
+                    tables = tables.with_evidence(level, torch.where(silent, 0.0, ratio))
+                chosen = tuple(piece.names[row] for row in some.tolist())
+                allowed = self._allowed([labels[name] for name in chosen])
+                tables = tables.with_evidence(level, torch.where(allowed, 0.0, NEVER))
+                yield Inferred(chosen, batch, piece.hierarchy, tables)
+
+    def found(self, piece: Inferred) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """The most likely path of each demonstration, and how probable each of its steps is."""
+        u, found = piece.posterior.u[self.level - 1].numpy(), {}
+        for row, (name, steps) in enumerate(zip(piece.names, piece.lengths, strict=True)):
+            path = piece.path.choices[self.level - 1][row, :steps].numpy()
+            found[name] = path, np.minimum(u[row, np.arange(steps), path], 1.0)
+        return found
 
     def held_out(self, labels: Mapping[str, np.ndarray], names: Iterable[str]) -> dict[str, Shown]:
         """What would be shown of each of these demonstrations if nothing were said of it.
 
         The recogniser is learned without its labels; the model stays, which may have been trained with them.
-        :meth:`update` has to follow.
         """
         found = {}
         for name in names:
-            self.update({**labels, name: np.full_like(labels[name], FREE)})
-            found[name] = self.shown(name)
+            others, without = copy(self), {**labels, name: np.full_like(labels[name], FREE)}
+            others.number({name: without[name]})
+            others.learned = others.learn(without)
+            (piece,) = others.infer([name], without)
+            others.paths = others.found(piece)
+            found[name] = others.shown(name)
         return found
 
-    def aligned(self, labels: Mapping[str, np.ndarray]) -> np.ndarray:
-        """The person's option for each option 0 to k of the model, another one for each where there are enough.
-
-        An option that is newer than the model is none of them.
-        Options keep their numbers unless named steps are against it by more than half a segment of each.
-        """
-        common = self.usual + self._common(labels, self.usual.shape[1])
-        best = common.argmax(1)
-        ours, theirs = linear_sum_assignment(-common)
-        best[ours] = theirs
-        return np.array([0, *(best + 1)])
-
-    def _common(self, labels: Mapping[str, np.ndarray], count: int) -> np.ndarray:
-        """The steps that the model by itself expects to have in common with labels 1 to count, [its options, count]."""
-        common = np.zeros((max(count, 0), self.size))
-        for piece, u in zip(self.pieces, self.alone_u, strict=True):
-            for row, name in enumerate(piece.names):
-                said = np.flatnonzero((labels[name] > 0) & (labels[name] <= count))
-                np.add.at(common, labels[name][said] - 1, u[row, said, 1:].numpy())
-        return common.T
-
-    def _allowed(self, piece: Inferred, labels: Mapping[str, np.ndarray]) -> Tensor:
+    def _allowed(self, labels: Sequence[np.ndarray]) -> Tensor:
         """The model's choices that a person allows at each step, bool [N, T, 1 + k]."""
-        every, ours = torch.full(piece.batch.actions.shape[:2], -1), torch.as_tensor(self.options)
-        for row, name in enumerate(piece.names):
-            own = labels[name]
+        every, ours = torch.full((len(labels), max(map(len, labels))), -1), torch.as_tensor(self.options)
+        for row, own in enumerate(labels):
             every[row, : len(own)] = torch.as_tensor(np.where(np.isin(own, self.options[1:]), own, -1))
         return (every.unsqueeze(-1) == ours) | (every < 1).unsqueeze(-1)
 
     def shown(self, name: str, labels: np.ndarray | None = None) -> Shown:
         """The most likely options of a demonstration where its labels say nothing."""
-        piece, row = self.place[name]
-        own, steps = self.pieces[piece], self.pieces[piece].lengths[row]
-        path = own.path.choices[self.level - 1][row, :steps].numpy()
-        probability = own.posterior.u[self.level - 1][row, :steps].numpy()[np.arange(steps), path]
+        path, probability = self.paths[name]
         options = self.options[path]
         if labels is not None:
             options = np.where(labels > 0, labels, options)
             probability = np.where(labels > 0, 1.0, probability)
-        return Shown(options, np.minimum(probability, 1.0))
+        return Shown(options, probability)
 
-    def runs(self, name: str) -> list[tuple[int, int, int]]:
-        """The segments of the most likely path: (option of the model, first step, step after the last)."""
-        piece, row = self.place[name]
-        return runs(*self.pieces[piece].segmented(row, self.lasts)[self.level - 1])
+    def centres(self, name: str, starts: Sequence[int]) -> np.ndarray:
+        """The mean standardised features of each segment of a demonstration, [segments, 3 F].
 
-    def drawn(self, name: str) -> dict[int, np.ndarray]:
-        """The steps of each boundary of the most likely path in draws from the posterior, by its step in the path."""
-        piece, row = self.place[name]
-        return self.pieces[piece].drawn(row, self.lasts)[self.level - 1]
+        :param starts: their first steps.
+        """
+        rows = self._rows(name).numpy()
+        lengths = np.diff(starts, append=len(rows))[:, None]
+        centres: np.ndarray = (np.add.reduceat(rows, starts) / lengths - self.middle) / self.spread
+        return centres
 
-    def upper(self, name: str) -> list[tuple[int, list[tuple[int, int, int]]]]:
-        """The segments of the other levels, with their numbers, 1 for the lowest."""
+    def _rows(self, name: str) -> Tensor:
+        """The features of each step of a demonstration, [T, 3 F]."""
         piece, row = self.place[name]
-        every = self.pieces[piece].segmented(row, self.lasts)
-        return [(n, runs(*own)) for n, own in enumerate(every, start=1) if n != self.level]
-
-    def centre(self, name: str, start: int, stop: int) -> np.ndarray:
-        """The mean standardised features of steps of a demonstration."""
-        piece, row = self.place[name]
-        rows = self.features[piece][row, start:stop]
-        centre: np.ndarray = ((rows - self.middle) / self.spread).mean(0).numpy()
-        return centre
+        return self.features[piece][row, : self.pieces[piece].lengths[row]]
 
 
 # --- segments to write ------------------------------------------------------------------------------------------------
+
+
+def labels_shown(document: Document, name: str, shown: Shown) -> LevelLabels:
+    """What is shown of a demonstration, -1 where a person left it open."""
+    left = document.labels[name] == OPEN
+    options = np.where(left, UNKNOWN, shown.options)
+    return LevelLabels(options, _starts(document, name, options), np.where(left, 0.0, shown.probability))
+
+
+def _starts(document: Document, name: str, options: np.ndarray) -> np.ndarray:
+    """Whether a segment begins at each step, [T]."""
+    starts = np.diff(options, prepend=-9) != 0
+    starts[[cut for cut in document.cuts[name] if document.labels[name][cut] != OPEN]] = True
+    return starts
+
+
+def sources_shown(document: Document, name: str) -> np.ndarray:
+    """The place in :data:`~ddco_pyro.segmenting.SOURCES` of who says what each step is, [T]."""
+    labels = document.labels[name]
+    said = np.where(document.given[name], SOURCES.index("given"), SOURCES.index("accepted"))
+    return np.select([labels == OPEN, labels == FREE], [SOURCES.index("open"), SOURCES.index("proposed")], said)
 
 
 def said_segments(document: Document, level: str, source: Source, frequency: float | None) -> Segmented:
@@ -219,30 +306,68 @@ def said_segments(document: Document, level: str, source: Source, frequency: flo
     each, count = [], len(document.names)
     for name in document.lengths:
         labels = document.in_file(name)
-        starts = np.diff(labels, prepend=-9) != 0
-        starts[[*document.cuts[name]]] = True
-        each.append(Segments(name, {level: LevelLabels(labels, starts, np.ones(len(labels)))}, 0.0, False))
+        levels = {level: LevelLabels(labels, _starts(document, name, labels), np.ones(len(labels)))}
+        each.append(Segments(name, levels, 0.0, False, baselines={level + SOURCE: sources_shown(document, name)}))
     names: dict[str, Sequence[str]] = {level: choice_names(count, document.names)}
-    return Segmented(tuple(each), {level: count}, frequency, {}, names, label_names(source.attributes))
+    known = {**label_names(source.attributes), level + SOURCE: list(SOURCES)}
+    return Segmented(tuple(each), {level: count}, frequency, {}, names, known)
+
+
+def said_in(demos: Demonstrations, level: str, names: Sequence[str]) -> list[Change]:
+    """What the labels of a file say of a level: those that a page saved, or those of another program.
+
+    Labels that ``segment`` wrote say nothing: a model proposed them.
+
+    :param names: of the options 1 to k, as the run has them. A name that none of them has is given to one that has no
+        name of its own, or is new.
+    """
+    known = label_names(demos.attributes).get(level, ())
+    words = label_names(demos.attributes).get(level + SOURCE, SOURCES)
+    ours, changes = any(level + SOURCE in demo.labels for demo in demos), list[Change]()
+    if not ours and any(level + BOUNDARY in demo.labels for demo in demos):
+        return []
+    found, options = [*names], dict[int, int]()
+    values = {value for demo in demos for value in np.unique(demo.labels.get(level, UNKNOWN)).tolist()}
+    for value in sorted(values - {UNKNOWN}):
+        name = option_name(value, known) if ours else label_name(level, value, known)
+        if name not in found:
+            unnamed = next((n for n, own in enumerate(found) if own == option_name(n + 1)), len(found))
+            found[unnamed : unnamed + 1] = [name]
+        options[value] = found.index(name) + 1
+    for demo in demos:
+        labels = demo.labels.get(level, np.full(len(demo), UNKNOWN))
+        sources = demo.labels.get(level + SOURCE, np.where(labels == UNKNOWN, UNKNOWN, SOURCES.index("given")))
+        edges = (np.diff(labels, prepend=-9) != 0) | (np.diff(sources, prepend=-9) != 0)
+        for value, start, stop in runs(labels, edges):
+            source = "proposed" if sources[start] == UNKNOWN else words[sources[start]]
+            if source != "proposed":
+                kind = CONFIRM if source == "accepted" else PAINT
+                changes.append((kind, demo.name, start, stop, OPEN if source == "open" else options[value]))
+    return [("names", found), *changes] if changes else []
 
 
 def shown_segments(
-    fit: Fit, source: Source, level: str, proposed: Mapping[str, Shown], names: Sequence[str]
+    fit: Fit, source: Source, level: str, proposed: Mapping[str, Shown], document: Document
 ) -> Segmented:
     """All levels of a model, one of them as it is shown.
 
-    :param names: of that level's options.
     :raises BadInput: the model lacks an option.
     """
+    names = document.names
     if len(names) + 1 != len(fit.names[level]):
         raise BadInput("an option is new; refit before you write segments")
     model = segments(fit, source)
     each = []
     for demo in model.segments:
-        own = proposed[demo.name]
-        labels = LevelLabels(own.options, np.diff(own.options, prepend=-1) != 0, own.probability)
-        each.append(replace(demo, levels={**demo.levels, level: labels}))
-    return replace(model, segments=tuple(each), names={**model.names, level: choice_names(len(names), names)})
+        levels = {**demo.levels, level: labels_shown(document, demo.name, proposed[demo.name])}
+        sources = {level + SOURCE: sources_shown(document, demo.name)}
+        each.append(replace(demo, levels=levels, baselines=sources))
+    return replace(
+        model,
+        segments=tuple(each),
+        names={**model.names, level: choice_names(len(names), names)},
+        label_names={**model.label_names, level + SOURCE: list(SOURCES)},
+    )
 
 
 # --- what is expected wrong -------------------------------------------------------------------------------------------
@@ -308,7 +433,7 @@ def ranking(
     :param centres: mean features, [N, F].
     :param accepted: whether a person is done with each, [N].
     """
-    away = np.linalg.norm(centres[:, None] - centres, axis=-1)
+    away = cdist(centres, centres)
     usual = float(np.median(away[np.triu_indices(len(away), 1)])) if len(away) > 1 else 0.0
     like = np.exp(-((away / (usual or 1.0)) ** 2) / 2)
     worth = wrong / edits

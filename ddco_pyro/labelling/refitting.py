@@ -39,19 +39,20 @@ def refit(
     level: str,
     count: int,
     demos: Demonstrations,
+    labels: Mapping[str, np.ndarray],
     kept: Mapping[str, np.ndarray],
     on_event: OnEvent = ignore,
 ) -> Fit:
-    """The model with so many options at a level, fitted to all demonstrations and to the labels :data:`SAID`.
+    """The model with so many options at a level, fitted to all demonstrations and to a person's labels.
 
     Option h stands for label h. A level that EM trains, under a meta-policy alone, takes a few steps from the options
     that a recogniser of the labelled steps finds. Other models are fitted as their spec says.
 
-    :param demos: as :func:`labelled` gives them.
+    :param labels: an option of each step, [T], by demonstration; below 1 for none.
     :param kept: the option that each step begins with whatever the recogniser finds, [T], by demonstration; below 1 for
         none.
     """
-    spec, before = refit_spec(trained, level, count), trained.hierarchy
+    spec, before, demos = refit_spec(trained, level, count), trained.hierarchy, labelled(demos, labels)
     with one_thread():
         if before.depth > 1 or not _by_em(trained):
             return fit(spec, _tuned(spec, demos), on_event=on_event)
@@ -64,8 +65,8 @@ def refit(
         known = _padded([demo.labels[SAID] for demo in demos])
         known = torch.where(known > 0, known, -1)
         fitted = before.encoder.state_dict(), scaling.state_dict()
-        labels = Labels(1, tuple(range(1, count + 1)), names, known, known)
-        data = TrainingData(spec, size, batch, batch, names, *fitted, labels)
+        named = Labels(1, tuple(range(1, count + 1)), names, known, known)
+        data = TrainingData(spec, size, batch, batch, names, *fitted, named)
         model = data.hierarchy(0)
         data, _ = recognise(model, data, demos)
         taught = data.labels
@@ -77,8 +78,8 @@ def refit(
         evidence = torch.where(silent.unsqueeze(-1), 0.0, taught.evidence[0])
         starts = torch.where(silent, own, taught.starts[0])
         starts = torch.where(alive, torch.where(known > 0, known, starts), -1)
-        by_em(data, model, batch, replace(labels, train=starts, tune=starts), EM_STEPS, on_event)
-        by_em(data, model, batch, replace(labels, evidence=(evidence, evidence)), STEPS, on_event)
+        by_em(data, model, batch, replace(named, train=starts, tune=starts), EM_STEPS, on_event)
+        by_em(data, model, batch, replace(named, evidence=(evidence, evidence)), STEPS, on_event)
     return Fit(spec, model.eval(), trained.metrics.model_copy(update={"agreement": None}))
 
 

@@ -60,9 +60,6 @@ HEADERS = {
 }
 """Headers of every answer."""
 
-POLLED = ("revision", "refit", "warnings", "dirty")
-"""What a page that knows the revision is told of the state."""
-
 
 @dataclass(frozen=True)
 class Listening:
@@ -180,13 +177,10 @@ class Guard:
 def _answers(session: Session) -> list[Route]:
     """The routes of the session's methods, each of which runs in a thread."""
 
-    def state(request: Request) -> dict[str, Any]:
-        found = session.state()
-        known = request.query_params.get("since") == str(found["revision"])
-        return {key: found[key] for key in POLLED} if known else found
-
-    def demo(request: Request) -> dict[str, Any]:
-        return session.demo(request.path_params["index"])
+    def view(request: Request) -> dict[str, Any]:
+        with session.lock:  # both are of one revision
+            demo = session.demo(request.path_params["index"])
+            return {"state": session.state(), "demo": demo}
 
     def nearest(request: Request) -> list[dict[str, Any]]:
         return session.nearest(request.path_params["index"], request.path_params["step"])
@@ -224,8 +218,9 @@ def _answers(session: Session) -> list[Route]:
         return Route(f"/{path}", answer, methods=[method])
 
     gets = {
-        "state": state,
-        "demo/{index:int}": demo,
+        "poll": lambda asked: session.progress(),
+        "state": lambda asked: session.state(),
+        "view/{index:int}": view,
         "demo/{index:int}/nearest/{step:int}": nearest,
         "demo/{index:int}/picture/{step:int}": picture,
         "export/{format}": exported,

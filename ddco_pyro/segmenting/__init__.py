@@ -27,6 +27,7 @@ from ddco_pyro.segmenting import baselines
 from ddco_pyro.training.data import train_and_valid
 
 __all__ = [
+    "SOURCES",
     "LevelLabels",
     "Segmented",
     "Segments",
@@ -37,11 +38,16 @@ __all__ = [
 ]
 
 
+SOURCES = ("open", "proposed", "accepted", "given")
+"""Who says what a step is: none, as a person left it open; the model; a person who accepts that; a person."""
+
+
 @dataclass(frozen=True)
 class LevelLabels:
     """One level over one demonstration of T steps.
 
-    :param options: choices of the most likely path [T]: 1 to k, or 0 where the caller emits the control.
+    :param options: choices of the most likely path [T]: 1 to k, or 0 where the caller emits the control; -1 where
+        a person left the step open.
     :param boundaries: whether the path makes a new choice at this step [T], which may be the same option; true at the
         first step. Where options end after every step: whether the option differs from the step before.
     :param probability: posterior probability of the chosen option at each step [T].
@@ -70,7 +76,8 @@ class Segments:
     :param log_likelihood: log p(ξ) per step, nats.
     :param held_out: whether the run's fit held the demonstration out.
     :param labels: ground-truth labels in the file, name to [T].
-    :param baselines: labels of baselines, ``<level>_<baseline>`` to kinds from 1 on [T].
+    :param baselines: labels of baselines, ``<level>_<baseline>`` to kinds from 1 on [T]; where a person labelled, also
+        ``<level>_source``, the place in :data:`SOURCES` [T].
     """
 
     name: str

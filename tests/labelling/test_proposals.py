@@ -13,7 +13,7 @@ from planted import make_spec, make_truth, plant
 import ddco_pyro
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.labelling.proposals import Proposals, weight
-from ddco_pyro.labelling.refitting import labelled, refit
+from ddco_pyro.labelling.refitting import refit
 from ddco_pyro.labelling.session import Session
 
 COUNTS = (3,)
@@ -42,11 +42,9 @@ def test_it_is_the_sum_over_the_paths_that_have_the_labels_with_a_regression_of_
     labels = free(demos)
     labels["demo_0"][:] = [1, -1, 2, counts[level - 1]]
     labels["demo_1"][3] = 1
-    proposals = Proposals(fit, demos, level, counts[level - 1])
-    proposals.update(labels)
-    proposals.update(labels)  # nothing is counted twice
-    (piece,), (tables,) = proposals.pieces, proposals.alone
-    ratio = weight(1.0) * proposals.windows.log_ratio(proposals.features[0])
+    proposals = Proposals(fit, demos, level, labels, counts[level - 1])
+    (piece,), (tables,) = proposals.infer(demos.names, labels), proposals.alone
+    ratio = weight(1.0) * proposals.learned.windows.log_ratio(proposals.features[0])
     assert level == 2 or ratio.abs().max() > 0.1  # it says something
     sizes = [1 + count for count in counts]
     for n, demo in enumerate(demos):
@@ -77,30 +75,26 @@ def test_one_named_demonstration_numbers_the_options_of_the_others(order):
     mine = {name: np.array([0, *order])[own] for name, own in truth.items()}
     named = next(name for name in demos.names if len(np.unique(mine[name])) == 3)
     labels = free(demos) | {named: mine[named]}
-    proposals = Proposals(fit, demos, 1, 3)
-    proposals.update(labels)
+    proposals = Proposals(fit, demos, 1, labels, 3)
     others = [name for name in demos.names if name != named]
     right = np.concatenate([proposals.shown(name).options == mine[name] for name in others])
     assert right.mean() > 0.95
-    proposals.update(free(demos))  # undone
+    assert proposals.number(free(demos)) == (order != (1, 2, 3))  # undone
     assert proposals.options.tolist() == [0, 1, 2, 3]
 
 
 def test_a_short_correction_numbers_nothing_anew():
     fit, demos, truth = planted(8, 40)
-    proposals = Proposals(fit, demos, 1, 3)
     labels = free(demos)
-    typical = np.median([stop - start for name in demos.names for _, start, stop in proposals.runs(name)])
+    typical = np.median([segment.steps for segment in fit.segment(demos)[0].segments])
     labels["demo_0"][: int(typical / 2) - 1] = truth["demo_0"][0] % 3 + 1
-    proposals.update(labels)
-    assert proposals.options.tolist() == [0, 1, 2, 3]
+    assert Proposals(fit, demos, 1, labels, 3).options.tolist() == [0, 1, 2, 3]
 
 
 def test_another_model_keeps_the_numbers_that_were_shown():
     fit, demos, truth = planted(8, 40)
     before = {name: np.array([0, 3, 1, 2])[own] for name, own in truth.items()}
-    proposals = Proposals(fit, demos, 1, 3, before)
-    proposals.update(free(demos))
+    proposals = Proposals(fit, demos, 1, free(demos), 3, before)
     assert proposals.options.tolist() == [0, 3, 1, 2]
 
 
@@ -129,10 +123,9 @@ def test_the_runs_options_get_the_names_of_those_that_they_stand_for(tmp_path):
 
 def test_an_option_that_the_model_lacks_clamps_nothing():
     fit, demos, _ = planted(4, 20)
-    proposals = Proposals(fit, demos, 1, 3)
     labels = free(demos)
     labels["demo_1"][4:9] = 4  # it was new after the proposals were made
-    proposals.update(labels)
+    proposals = Proposals(fit, demos, 1, labels, 3)
     shown = proposals.shown("demo_1", labels["demo_1"])
     assert (shown.options[4:9] == 4).all()
     assert not (shown.options[9:] == 4).any()
@@ -143,18 +136,15 @@ def test_an_option_that_the_model_lacks_clamps_nothing():
 def test_a_demonstration_that_is_held_out_is_proposed_as_if_nothing_were_said_of_it():
     fit, demos, truth = planted(5, 20)
     said = free(demos) | {name: truth[name] for name in demos.names[:3]}
-    proposals = Proposals(fit, demos, 1, 3)
-    proposals.update(said)
+    proposals = Proposals(fit, demos, 1, said, 3)
     found = proposals.held_out(said, demos.names[:3])
     assert [*found] == [*demos.names[:3]]
     for name, own in found.items():
-        other = Proposals(fit, demos, 1, 3)
-        other.update({**said, name: np.full(20, -1)})
+        other = Proposals(fit, demos, 1, {**said, name: np.full(20, -1)}, 3)
         expected = other.shown(name)
         np.testing.assert_array_equal(own.options, expected.options)
         np.testing.assert_allclose(own.probability, expected.probability)
         assert own.probability.min() < 1  # nothing is clamped
-    proposals.update(said)
     assert all((proposals.shown(name, said[name]).options == said[name]).all() for name in found)
 
 
@@ -169,13 +159,11 @@ def begun(demos, count, **training):
 
 def after(fit, demos, said, count):
     """The proposals before and after a refit."""
-    both = [Proposals(fit, demos, 1, count)]
-    both[0].update(said)
+    both = [Proposals(fit, demos, 1, said, count)]
     shown = {name: both[0].shown(name, said[name]).options for name in demos.names}
-    kept = {name: np.where(np.isin(own, both[0].waiting), own, -1) for name, own in shown.items()}
-    again = refit(fit, LEVEL, count, labelled(demos, said), kept)
-    both.append(Proposals(again, demos, 1, count, shown))
-    both[1].update(said)
+    kept = {name: np.where(np.isin(own, both[0].waiting(said)), own, -1) for name, own in shown.items()}
+    again = refit(fit, LEVEL, count, demos, said, kept)
+    both.append(Proposals(again, demos, 1, said, count, shown))
     return both
 
 
@@ -223,12 +211,10 @@ def test_an_option_that_is_named_anew_wherever_it_would_occur_is_not_waited_for(
     _, demos, truth = planted(8, 30)
     mine = {name: np.array([0, 1, 2, 4])[own] for name, own in truth.items()}
     said = {name: mine[name] if number < 3 else np.full(30, -1) for number, name in enumerate(demos.names)}
-    before = Proposals(begun(demos, 3), demos, 1, 3)  # option 4 was new after that
-    before.update(said)
-    assert not before.waiting.size
-    again = refit(before.fit, LEVEL, 4, labelled(demos, said), free(demos))
-    proposals = Proposals(again, demos, 1, 4)
-    proposals.update(said)
+    before = Proposals(begun(demos, 3), demos, 1, said, 3)  # option 4 was new after that
+    assert not before.waiting(said).size
+    again = refit(before.fit, LEVEL, 4, demos, said, free(demos))
+    proposals = Proposals(again, demos, 1, said, 4)
     assert right(proposals, mine, said) > 0.95
 
 
@@ -237,7 +223,7 @@ def test_a_model_of_several_levels_is_fitted_as_its_spec_says():
     _, demos, truth = planted(6, 12, (2, 2))
     trained = ddco_pyro.fit(spec, demos)
     said = {name: truth[name] if number < 3 else np.full(12, -1) for number, name in enumerate(demos.names)}
-    again = refit(trained, LEVEL, 2, labelled(demos, said), free(demos))
+    again = refit(trained, LEVEL, 2, demos, said, free(demos))
     assert again.hierarchy.depth == 2
     assert again.metrics.trained_labels.level == LEVEL
 
@@ -247,5 +233,5 @@ def test_a_refit_by_gradient_steps_is_tuned_by_demonstrations_without_labels():
     trained = begun(demos, 3, optimizer={"lr": 0.03}, tune_fraction=0.4)
     for chosen in demos.names:
         said = free(demos) | {chosen: truth[chosen]}
-        again = refit(trained, LEVEL, 3, labelled(demos, said), free(demos))
+        again = refit(trained, LEVEL, 3, demos, said, free(demos))
         assert again.metrics.trained_labels.level == LEVEL

@@ -2,10 +2,13 @@
 
 import csv
 import json
+import shutil
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import pairwise
+from xml.etree import ElementTree
 
 import h5py
 import numpy as np
@@ -14,7 +17,9 @@ from time_lines import unpacked
 
 from ddco_pyro.cli.label import _exporters, _fitted
 from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.labels import LABEL_NAMES, UNKNOWN
 from ddco_pyro.data.planted import pick_and_place
+from ddco_pyro.data.sources import open_source
 from ddco_pyro.errors import BadInput
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.fitted import load
@@ -23,6 +28,8 @@ from ddco_pyro.labelling.document import FREE, OPEN
 from ddco_pyro.labelling.proposals import USUAL, Proposals, Shown
 from ddco_pyro.labelling.refitting import labelled, refit_spec
 from ddco_pyro.labelling.session import Session
+from ddco_pyro.segmenting import segments as segment_all
+from ddco_pyro.segmenting.formats.labels import write_labels
 from ddco_pyro.spec import parse_spec, with_overrides
 from ddco_pyro.training.labels import used
 
@@ -96,14 +103,21 @@ def here(background, call):
 
 
 def refitted(session):
-    """The session's state once nothing is under way."""
-    while session.state()["refit"]["running"]:
+    """What is said of refits once nothing is under way."""
+    while (known := session.progress())["refit"]["running"] or known["behind"]:
         time.sleep(0.01)
-    return session.state()["refit"]
+    return known["refit"]
+
+
+def accept(session, index):
+    """Accept what is shown of a demonstration."""
+    seen = [[own["start"], own["option"]] for own in session.demo(index)["segments"]]
+    return session.edit({"do": "accept", "demo": index, "segments": seen})
 
 
 def shown(session):
-    """The option and who says so, of each step of every demonstration, and where segments begin."""
+    """Where segments begin, and the option and who says so, of each step of every demonstration."""
+    refitted(session)
     found = []
     for own in session.state()["demos"]:
         starts, options, said = zip(*own["strip"], strict=True)
@@ -114,7 +128,7 @@ def shown(session):
 
 def by_step(segments):
     """The option and who says so, of each step."""
-    return [(own["option"], own["said"]) for own in segments for _ in range(own["start"], own["stop"])]
+    return [(own["option"], own["source"]) for own in segments for _ in range(own["start"], own["stop"])]
 
 
 # --- what is shown ----------------------------------------------------------------------------------------------------
@@ -144,9 +158,9 @@ def test_before_any_label_the_fit_proposes(begin, run, demos):
 
 def test_the_segments_that_are_nearest_are_of_the_same_skill(begin, demos):
     session = begin()
-    for name, demo in zip(demos.names[:-1], demos, strict=False):
-        session.journal.edit([("paint", name, *own) for own in stretches(demo.labels["phase"])])
-    label(session, len(demos) - 1, demos[-1].labels["phase"])
+    for index, demo in enumerate(demos):
+        label(session, index, demo.labels["phase"])
+    refitted(session)
     for phase in range(COUNT):
         found = session.nearest(0, int(np.flatnonzero(demos[0].labels["phase"] == phase)[0]))
         (first, *_) = found
@@ -184,8 +198,8 @@ def test_a_command_changes_these_labels(begin, commands, labels):
     for (start, stop), option in labels.items():
         expected[start:stop] = option
     np.testing.assert_array_equal(session.document.labels["demo_0"], expected)
-    for (option, said), own in zip(shown(session)[0][1], expected, strict=True):
-        assert said == "open" if own == OPEN else (option, said) == (own, "said")
+    for (option, source), own in zip(shown(session)[0][1], expected, strict=True):
+        assert source == "open" if own == OPEN else (option, source) == (own, "given")
 
 
 def test_a_boundary_that_is_moved_is_pinned_on_both_sides(begin):
@@ -218,16 +232,76 @@ def test_everywhere_names_all_segments_of_an_option(begin):
 
 
 @pytest.mark.usefixtures("quiet")
-def test_accepting_says_what_is_shown_except_what_is_open(begin):
+def test_accepting_says_what_is_seen_except_what_is_open(begin):
     session = begin()
+    session.edit({"do": "paint", "demo": 1, "start": 0, "stop": 2, "option": 3})
     session.edit({"do": "paint", "demo": 1, "start": 4, "stop": 8, "option": 0})
     before = by_step(session.demo(1)["segments"])
-    session.edit({"do": "accept", "demo": 1})
+    accept(session, 1)
+    refitted(session)
     labels, state = session.document.labels["demo_1"], session.state()
     assert labels[4:8].tolist() == [OPEN] * 4
     expected = [option for step, (option, _) in enumerate(before) if not 4 <= step < 8]
     assert labels[[*range(4), *range(8, len(labels))]].tolist() == expected
     assert (state["demos"][1]["accepted"], state["summary"]["labelled"], state["order"][-1]) == (True, 1, 1)
+    sources = [source for _, source in by_step(session.demo(1)["segments"])]
+    assert sources == ["given"] * 2 + ["accepted"] * 2 + ["open"] * 4 + ["accepted"] * (len(labels) - 8)
+    before = session.journal.path.read_bytes()
+    assert not accept(session, 1)["done"], "what is accepted stays so"
+    assert session.journal.path.read_bytes() == before
+    session.edit({"do": "reopen", "demo": 1})
+    assert not session.document.accepted
+    seen = [[0, 1], [20, 2]]  # whatever is shown meanwhile
+    session.edit({"do": "accept", "demo": 0, "segments": seen})
+    assert session.document.labels["demo_0"].tolist() == [1] * 20 + [2] * (len(session.document.labels["demo_0"]) - 20)
+
+
+@pytest.mark.usefixtures("quiet")
+def test_open_steps_are_one_segment_which_has_boundaries_at_its_ends_alone(begin):
+    session = begin()
+    session.edit({"do": "split", "demo": 0, "step": 20})
+    session.edit({"do": "paint", "demo": 0, "start": 8, "stop": 30, "option": 0})
+    refitted(session)
+    demo = session.demo(0)
+    (own,) = [own for own in demo["segments"] if own["start"] < 30 and own["stop"] > 8]
+    assert (own["start"], own["stop"], own["option"], own["source"]) == (8, 30, 0, "open")
+    assert not [own for own in demo["boundaries"] if 8 < own["step"] < 30]
+    with pytest.raises(BadInput, match="is open; name it first"):
+        session.edit({"do": "split", "demo": 0, "step": 12})
+    session.edit({"do": "move", "demo": 0, "boundary": 30, "to": 28})
+    session.edit({"do": "move", "demo": 0, "boundary": 8, "to": 10})
+    assert np.flatnonzero(session.document.labels["demo_0"] == OPEN).tolist() == [*range(10, 28)]
+
+
+def test_what_changes_nothing_is_no_edit(begin):
+    session = begin()
+    commands = [paint, {"do": "rename", "option": 1, "text": "come"}, {**paint, "demo": 1, "option": 0}]
+    assert all(session.edit(command)["done"] for command in commands)
+    content = session.journal.path.read_bytes()
+    again = [*commands, {"do": "name", "demo": 0, "step": 12, "option": 3}, {"do": "open", "demo": 1, "step": 12}]
+    assert not any(session.edit(command)["done"] for command in [*again, {"do": "reopen", "demo": 0}])
+    assert session.journal.path.read_bytes() == content
+
+
+def test_an_edit_waits_for_no_other_demonstration(begin, demos, monkeypatch):
+    """Other demonstrations follow the newest edit."""
+    session, go_on, learned, learn = begin(), threading.Event(), [], Proposals.learn
+
+    def late(proposals, labels):
+        learned.append(sum((own > 0).sum() for own in labels.values()))
+        assert go_on.wait(20)
+        return learn(proposals, labels)
+
+    monkeypatch.setattr(Proposals, "learn", late)
+    for index in (0, 1):
+        label(session, index, COUNT - 1 - demos[index].labels["phase"])
+        own = session.demo(index)["segments"]
+        assert by_step(own) == [(COUNT - phase, "given") for phase in demos[index].labels["phase"].tolist()]
+    assert session.progress()["behind"]
+    go_on.set()
+    refitted(session)
+    assert learned[-1] == len(demos[0]) + len(demos[1])
+    assert right(session, demos, range(2, 5)) > 0.9
 
 
 @pytest.mark.parametrize(
@@ -250,6 +324,10 @@ def test_accepting_says_what_is_shown_except_what_is_open(begin):
         {"do": "rename", "option": 1, "text": "control"},
         {"do": "undo"},
         {"do": "redo"},
+        {"do": "accept", "demo": 0},
+        {"do": "accept", "demo": 0, "segments": [[1, 1]]},
+        {"do": "accept", "demo": 0, "segments": [[0, 1], [0, 2]]},
+        {"do": "accept", "demo": 0, "segments": [[0, 9]]},
     ],
     ids=json.dumps,
 )
@@ -272,10 +350,9 @@ def stretches(truth):
 
 
 def label(session, index, truth):
-    """Say the truth of a demonstration, the last segment at last."""
-    *first, (start, stop, option) = stretches(truth)
-    session.journal.edit([("paint", session.demos.names[index], *own) for own in first])
-    session.edit({"do": "paint", "demo": index, "start": start, "stop": stop, "option": option})
+    """Say the truth of a demonstration."""
+    for start, stop, option in stretches(truth):
+        session.edit({"do": "paint", "demo": index, "start": start, "stop": stop, "option": option})
 
 
 def right(session, demos, rest):
@@ -318,7 +395,7 @@ def test_expected_wrong_steps_follow_from_accepted_demonstrations_that_are_held_
     session = begin()
     monkeypatch.setattr(Proposals, "held_out", wrong_at_every_second_step)
     for index in (0, 1):
-        session.edit({"do": "accept", "demo": index})
+        accept(session, index)
         refitted(session)
     assert asked == [[], ["demo_0", "demo_1"]]  # one alone has nothing to be compared with
     rows = [(session.document.accepted[name], session.document.lengths[name]) for name in asked[-1]]
@@ -339,13 +416,13 @@ def by_csv(file, names):
     return [[row["option_name"] for row in rows if row["demonstration"] == name] for name in names]
 
 
-def test_a_new_option_is_proposed_after_a_refit(begin, demos):
+def test_a_new_option_such_as_none_is_proposed_after_a_refit(begin, demos):
     session = begin()
-    session.edit({"do": "new", "text": "rest"})
+    session.edit({"do": "new", "text": "none"})
     for index in (0, 1):
         truth = np.where(demos[index].labels["phase"] == 1, 4, demos[index].labels["phase"])
         label(session, index, truth)  # option 2 has no steps
-    session.edit({"do": "accept", "demo": 0})
+    accept(session, 0)
     assert refitted(session)["error"] == ""
     grasped = [
         option == 5
@@ -359,6 +436,130 @@ def test_a_new_option_is_proposed_after_a_refit(begin, demos):
 def test_without_labels_there_is_no_refit(begin):
     with pytest.raises(BadInput, match="nothing is labelled"):
         begin().refit()
+
+
+@pytest.mark.usefixtures("quiet")
+def test_after_a_kill_the_refit_is_made_again_and_what_the_file_lacks_can_be_saved(begin, run, tmp_path, monkeypatch):
+    session = begin()
+    session.edit(paint)
+    accept(session, 0)
+    session.journal.close()  # as a kill does
+    monkeypatch.undo()
+    monkeypatch.setattr(Background, "_submit", here)
+    again = begin()
+    assert again.state()["dirty"]
+    again.begin()
+    assert (refitted(again)["done"], again.document.accepted.keys()) == (1, {"demo_0"})
+    again.save()
+    again.journal.close()
+    third = begin()
+    assert not third.state()["dirty"]
+    third.edit({"do": "undo"})
+    third.journal.close()
+    assert begin().state()["dirty"]
+
+
+# --- exports ----------------------------------------------------------------------------------------------------------
+
+GIVEN, LEFT, REST = range(10), range(10, 25), range(25, 48)
+"""The steps of a demonstration that a person gives, leaves open, and accepts or leaves to the model."""
+
+
+@pytest.fixture
+def mixed(begin, monkeypatch):
+    """A session with two demonstrations of these steps, the first accepted."""
+    monkeypatch.setattr(Session, "refit", lambda session: None)
+    session = begin()
+    for index in (0, 1):
+        session.edit({**paint, "demo": index, "start": 0, "stop": 10})
+        session.edit({**paint, "demo": index, "start": 10, "stop": 25, "option": 0})
+    accept(session, 0)
+    refitted(session)
+    assert session.document.lengths["demo_0"] == session.document.lengths["demo_1"] == 48
+    return session
+
+
+def sources_of(index):
+    return ["given"] * 10 + ["open"] * 15 + [["accepted", "proposed"][index]] * 23
+
+
+def test_tables_say_who_says_each_step_and_have_no_option_where_steps_are_open(mixed, tmp_path):
+    rows = list(csv.DictReader(mixed.export("csv", tmp_path).read_text().splitlines()))
+    for index in (0, 1):
+        own = [row for row in rows if row["demonstration"] == f"demo_{index}"]
+        assert [row["option_source"] for row in own] == sources_of(index)
+        assert {(own[step]["option"], own[step]["option_name"], own[step]["option_probability"]) for step in LEFT} == {
+            ("-1", "", "0.0")
+        }
+        assert {own[step]["option"] for step in GIVEN} == {"3"}
+        assert all(int(own[step]["option"]) > 0 for step in REST)
+    page = mixed.export("html", tmp_path).read_text()
+    assert '"name":"option_source","names":{"0":"open"' in page
+    assert '"-1":"open"' in page
+
+
+def test_other_programs_get_a_gap_where_steps_are_open_and_who_says_each_segment(mixed, tmp_path):
+    folder = mixed.export("elan", tmp_path)
+    tasks = json.loads((mixed.export("label-studio", tmp_path) / "tasks.json").read_text())
+    for index in (0, 1):
+        root = ElementTree.parse(folder / f"demo_{index}.eaf").getroot()
+        slots = {own.get("TIME_SLOT_ID"): int(own.get("TIME_VALUE")) // 1000 for own in root.iter("TIME_SLOT")}
+        tiers = {
+            tier.get("TIER_ID"): {
+                step: own.findtext("ANNOTATION_VALUE")
+                for own in tier.iter("ALIGNABLE_ANNOTATION")
+                for step in range(slots[own.get("TIME_SLOT_REF1")], slots[own.get("TIME_SLOT_REF2")])
+            }
+            for tier in root.iter("TIER")
+        }
+        assert tiers["option"].keys() == {*GIVEN, *REST}
+        said = {step: source for step, source in enumerate(sources_of(index)) if source != "open"}
+        assert tiers["option_source"] == said
+        regions = {
+            step: own["meta"]["text"]
+            for own in tasks[index]["predictions"][0]["result"]
+            for step in range(own["value"]["start"], own["value"]["end"] + 1)
+        }
+        assert regions == {step: [source] for step, source in said.items()}
+
+
+def test_a_saved_file_is_gone_on_with_by_anyone(mixed, run, tmp_path, monkeypatch):
+    mixed.edit({"do": "rename", "option": 3, "text": "carry"})
+    mixed.save()
+    saved = tmp_path / "handed_over.hdf5"
+    shutil.copyfile(mixed.out, saved)
+    other = Session(replace(run, named={}), saved, tmp_path / "mine.hdf5")
+    assert other.document.names == mixed.document.names
+    for name, own in mixed.document.labels.items():
+        np.testing.assert_array_equal(other.document.labels[name], own)
+        np.testing.assert_array_equal(other.document.given[name], mixed.document.given[name])
+    other.journal.close()
+    segments = tmp_path / "segments.hdf5"  # a model's proposals are nobody's labels
+    with open_source(mixed.path) as source:
+        write_labels(mixed.path, segments, segment_all(run, source))
+    another = Session(replace(run, named={}), segments, tmp_path / "other.hdf5")
+    assert not another.document.done
+    another.journal.close()
+
+
+def test_labels_of_another_program_are_gone_on_with_by_their_names(run, demos, tmp_path):
+    """As ``import --labels`` reads them, with a name that the run does not have."""
+    path, names = tmp_path / "imported.hdf5", [*NAMES, "wait"]
+    truth = [np.where(np.arange(len(demo)) < 5, UNKNOWN, demo.labels["phase"]) for demo in demos]
+    truth[0][-3:] = 4
+    each = (replace(demo, labels={"option": own}) for demo, own in zip(demos, truth, strict=True))
+    Demonstrations(tuple(each), attributes={LABEL_NAMES: json.dumps({"option": names})}).write(path)
+    session = Session(
+        replace(run, named={"option": ("carry", "option 2", "option 3", "option 4")}), path, tmp_path / "o.hdf5"
+    )
+    own = session.document.names
+    assert (own[0], {*own}) == ("carry", {*names})
+    for name, expected in zip(demos.names, truth, strict=True):
+        labels = session.document.labels[name]
+        assert [own[label - 1] if label > 0 else "" for label in labels] == [
+            names[value] if value >= 0 else "" for value in expected
+        ]
+    session.journal.close()
 
 
 # --- files ------------------------------------------------------------------------------------------------------------

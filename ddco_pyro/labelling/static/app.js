@@ -3,8 +3,8 @@ import { Look, element, onScheme, percent, within } from "./drawing.js";
 import { List, Options, alike, optionName, readout, summary } from "./panels.js";
 import { Timeline } from "./timeline.js";
 
-const $ = id => document.getElementById(id), EVERY = 1000, ALIKE = 250;
-let state = null, demo = null, cursor = 0, playing = null, painting = null, moving = null, waiting = Promise.resolve(), asked = 0, silent = false;
+const $ = id => document.getElementById(id), EVERY = 1000, SOON = 150, ALIKE = 250;
+let state = null, demo = null, wanted = null, cursor = 0, playing = null, painting = null, moving = null, waiting = Promise.resolve(), asked = 0, silent = false;
 
 async function ask(path, body) {
   let answer, found;
@@ -19,14 +19,13 @@ const say = (text, bad = false) => { $("said").textContent = text; $("said").cla
 const tried = async work => { try { return await work(); } catch (error) { say(error.message, true); return null; } };
 const option = number => optionName(state, number);
 const change = ({ expected_wrong: before }, { expected_wrong: after }) => before === null || after === null ? "" : `: expected wrong steps ${percent(before)} before, ${percent(after)} now`;
-const others = indices => indices.length ? `; ${indices.length} other${indices.length > 1 ? "s" : ""} changed` : "";
 
 const seek = step => {
   cursor = Math.min(Math.max(step, 0), demo.steps - 1);
   timeline.seek(cursor); look.at(cursor); readout($("readout"), state, demo, cursor);
-  const segment = within(demo.segments, cursor), name = optionName(state, segment.option, segment.said);
+  const segment = within(demo.segments, cursor), name = optionName(state, segment.option, segment.source);
   $("timeline").setAttribute("aria-valuenow", cursor);
-  $("timeline").setAttribute("aria-valuetext", `step ${cursor} of ${demo.steps}, ${name}, ${segment.said}, steps ${segment.start} to ${segment.stop - 1}`);
+  $("timeline").setAttribute("aria-valuetext", `step ${cursor} of ${demo.steps}, ${name}, ${segment.source}, steps ${segment.start} to ${segment.stop - 1}`);
   clearTimeout(asked);
   if (!playing) asked = setTimeout(neighbours, ALIKE);
 };
@@ -50,11 +49,11 @@ function render(keep = true) {
   $("work").hidden = false;
   document.querySelector("[data-do=undo]").disabled = !state.can_undo;
   document.querySelector("[data-do=redo]").disabled = !state.can_redo;
-  if (!demo) return;
   list.show(state, demo.index, keep);
   options.show(state);
   const { name, accepted, held_out: held, reason } = state.demos[demo.index];
   $("name").textContent = name;
+  document.querySelector("[data-do=accept]").hidden = accepted; document.querySelector("[data-do=reopen]").hidden = !accepted;
   $("reason").textContent = [accepted && "accepted", held && "held out", reason].filter(Boolean).join(" · ");
   timeline.show(demo, state); look.show(demo, demo.segments, state.colours);
   $("timeline").setAttribute("aria-valuemin", 0); $("timeline").setAttribute("aria-valuemax", demo.steps - 1);
@@ -69,40 +68,45 @@ function status({ refit, warnings, dirty }) {
   if ($("warnings").textContent !== lines.join("")) $("warnings").replaceChildren(...lines.map(text => element("p", { textContent: text })));
   document.querySelector("[data-do=save]").textContent = dirty ? "Save •" : "Save";
 }
-async function refresh(index = demo?.index, step = undefined, keep = true) {  // what the server shows, whole: no answer is mixed with an older one
-  const found = await ask("state");
-  if (index === undefined) [index, step] = whereTo(found);
-  const one = await ask(`demo/${index}`);
-  if (state && found.revision < state.revision) return;
-  if (state && state.refit.done < found.refit.done) say(`Refit ${found.refit.done} is done${change(state.summary, found.summary)}`);
-  [state, silent] = [found, false];
-  demo = one; cursor = step ?? cursor;
-  render(keep && list.active === index);
+// Every answer says which demonstration it shows, and of which revision. What is no longer wanted, or older than what is shown, is dropped.
+async function show(index, step, keep = true) {
+  wanted = { index, step: step ?? (index === wanted?.index ? wanted.step : undefined), keep };
+  const found = await ask(`view/${index}`);
+  if (found.demo.index !== wanted.index || found.state.revision < (state?.revision ?? 0)) return;
+  if (state && state.refit.done < found.state.refit.done) say(`Refit ${found.state.refit.done} is done${change(state.summary, found.state.summary)}`);
+  [state, demo, silent, cursor] = [found.state, found.demo, false, wanted.step ?? cursor];
+  wanted.step = undefined;
+  render(wanted.keep && list.active === index);
 }
-function whereTo(found) {
-  const [, index, step] = location.hash.match(/^#(\d+)\/(\d+)$/) ?? [];
-  return index < found.demos.length ? [Number(index), Number(step)] : [found.order.find(one => !found.demos[one].accepted) ?? found.order[0], 0];
+async function begin() {
+  const found = await ask("state"), [, index, step] = location.hash.match(/^#(\d+)\/(\d+)$/) ?? [];
+  if (index < found.demos.length) await show(Number(index), Number(step)); else await show(found.order[0], 0);
 }
-const open = (index, step = 0, keep = true) => tried(async () => { stop(); await refresh(index, step, keep); });
+const open = (index, step = 0, keep = true) => tried(async () => { stop(); await show(index, step, keep); });
 
 // One edit after the other: each is in the journal when the server answers.
+const DONE = { undo: "Undone", redo: "Done again", split: "Split", merge: "Merged", open: "Left open", move: "Moved", rename: "Renamed", new: "New option", accept: "Accepted", reopen: "Taken back" };
 const edit = (command, words) => waiting = waiting.then(() => tried(async () => {
-  const before = demo.index, found = await ask("edit", command), there = ["undo", "redo"].includes(command.do) ? found.demo : before;
-  await refresh(there, there === before ? undefined : 0);
-  say(`${words ?? { undo: "Undone", redo: "Done again", split: "Split", merge: "Merged", open: "Left open", move: "Moved", rename: "Renamed", new: "New option" }[command.do]} in ${state.demos[found.demo ?? before].name}${others(found.changed)}`);
-  return true;
+  const made = typeof command === "function" ? command() : command, at = wanted.index;
+  if (!made) return false;
+  const found = await ask("edit", made), back = ["undo", "redo"].includes(made.do) && wanted.index === at && found.demo !== null && found.demo !== at;
+  await show(back ? found.demo : wanted.index, back ? 0 : undefined);
+  say(found.done ? `${words ?? DONE[made.do]} in ${state.demos[found.demo ?? at].name}` : "That changes nothing");
+  return found.done;
 }));
 const act = number => edit({ do: "name", demo: demo.index, step: cursor, option: number }, option(number));
 const everywhere = number => edit({ do: "everywhere", demo: demo.index, step: cursor, option: number }, `${option(number)} everywhere, as`);
 function drop({ boundary, to }) {
   return boundary === to ? timeline.hold(null) : edit({ do: "move", demo: demo.index, boundary, to }).then(done => { timeline.hold(null); if (done) seek(Math.min(to, demo.steps - 1)); });
 }
-async function accept() {  // an accepted demonstration is taken back
-  const before = state.demos[demo.index].accepted;
-  if (!await edit({ do: "accept", demo: demo.index }, before ? "Taken back" : "Accepted") || before) return;
-  const next = state.order.find(index => !state.demos[index].accepted);
-  if (next === undefined) say("All demonstrations are accepted");
-  else await open(next, 0, false);
+function accept() {  // what is seen; what is accepted stays so
+  const { index } = demo, next = () => {
+    const other = state.order.find(one => !state.demos[one].accepted);
+    if (other === undefined) say("All demonstrations are accepted"); else open(other, 0, false);
+  };
+  if (state.demos[index].accepted) { next(); return; }
+  const seen = () => demo.index === index && !state.demos[index].accepted && { do: "accept", demo: index, segments: demo.segments.map(one => [one.start, one.option]) };
+  edit(seen).then(done => { if (done && wanted.index === index) next(); });
 }
 function uncertain() {  // the most uncertain boundary; pressed again there, the next one
   const places = state.uncertain, at = places.findIndex(one => one.demo === demo.index && one.step === cursor), next = places[(at + 1) % places.length];
@@ -186,7 +190,7 @@ const download = format => tried(async () => {  // leaves the page where it is
 
 const here = name => () => edit({ do: name, demo: demo.index, step: cursor });
 const commands = {
-  undo: () => edit({ do: "undo" }), redo: () => edit({ do: "redo" }), split: here("split"), merge: here("merge"), open: here("open"), accept, play, uncertain,
+  undo: () => edit({ do: "undo" }), redo: () => edit({ do: "redo" }), split: here("split"), merge: here("merge"), open: here("open"), accept, reopen: () => edit({ do: "reopen", demo: demo.index }), play, uncertain,
   refit: () => tried(async () => { await ask("refit", {}); await poll(); say("Refit begun"); }),
   cancel: () => tried(async () => { if (!state.refit.running) { say("Nothing is under way"); return; } await ask("cancel", {}); await poll(); say("Cancelled; what is shown stays"); }),
   save: () => tried(async () => { say((await ask("save", {})).message); status(Object.assign(state, { dirty: false })); }),
@@ -232,10 +236,13 @@ onScheme(() => { if (state) render(); });
 
 async function poll() {
   try {
-    const found = await ask(`state?since=${state?.revision ?? ""}`);
+    const { revision, ...found } = await ask("poll");
     silent = false;
-    if (found.order) { if (!playing && !timeline.drag && !moving) await refresh(); } else { Object.assign(state, found); status(state); }
+    if (!state) await begin();
+    else if (revision > state.revision && !playing && !timeline.drag && !moving) await show(wanted.index);
+    else if (revision >= state.revision) status(Object.assign(state, found));
   } catch { silent = true; if (state) status(state); }
+  setTimeout(poll, state?.behind ? SOON : EVERY);
 }
-await tried(() => refresh());
-setInterval(poll, EVERY);
+await tried(begin);
+poll();

@@ -32,16 +32,16 @@ function hatch(context, left, top, width, height) {
 
 // Segments in a row of a canvas; `place` is the x of a step, `heights` the probability of each step times 255, `edge` the end of the row.
 export function row(context, segments, { place, edge, top, height, colours, names, heights }) {
-  for (const { start, stop, option, said } of segments) {
+  for (const { start, stop, option, source } of segments) {
     const left = Math.max(place(start), place.least ?? 0), right = Math.min(place(stop), edge), colour = coloured(colours, option);
     if (right <= left) continue;
-    if (said === "open") hatch(context, left, top, right - left, height);
+    if (source === "open") hatch(context, left, top, right - left, height);
     else {
       context.fillStyle = colour;
-      context.globalAlpha = heights && said === "proposed" ? .3 : 1;
+      context.globalAlpha = heights && source === "proposed" ? .3 : 1;
       context.fillRect(left, top, right - left, height);
       context.globalAlpha = 1;
-      if (heights && said === "proposed") {
+      if (heights && source === "proposed") {
         const each = place(1) - place(0), wide = Math.max(1, each), bottom = top + height;
         context.beginPath(); context.moveTo(left, bottom);
         for (let x = Math.max(place(start), left - wide); x < right - .01; x += wide) {
@@ -51,15 +51,15 @@ export function row(context, segments, { place, edge, top, height, colours, name
         context.lineTo(right, bottom); context.fill();
       }
     }
-    if (heights && said === "said") { context.fillStyle = looks.ink; context.fillRect(left, top + height - 3, right - left, 3); }
+    if (heights && ["given", "accepted"].includes(source)) { const thick = source === "given" ? 4 : 2; context.fillStyle = looks.ink; context.fillRect(left, top + height - thick, right - left, thick); }
     if (right - left > 6) { context.fillStyle = looks.paper; context.fillRect(right - 1, top, 1, height); }
     if (!names || right - left < 14) continue;
-    const name = said === "open" ? "open" : names(option), wide = context.measureText(name).width, short = wide < right - left - 6 ? name : String(option);
+    const name = source === "open" ? "open" : names(option), wide = context.measureText(name).width, short = wide < right - left - 6 ? name : String(option);
     if (context.measureText(short).width >= right - left - 4) continue;
-    const dark = said !== "open" && !bright(colour), x = (left + right) / 2, y = top + height / 2 + 1;
+    const dark = source !== "open" && !bright(colour), x = (left + right) / 2, y = top + height / 2 + 1;
     context.textAlign = "center"; context.lineWidth = 2.5;
-    context.strokeStyle = said === "open" ? looks.panel : dark ? "#000a" : "#fffa";
-    context.fillStyle = said === "open" ? looks.ink : dark ? "#fff" : "#000";
+    context.strokeStyle = source === "open" ? looks.panel : dark ? "#000a" : "#fffa";
+    context.fillStyle = source === "open" ? looks.ink : dark ? "#fff" : "#000";
     context.strokeText(short, x, y); context.fillText(short, x, y);
     context.textAlign = "left";
   }
@@ -80,7 +80,7 @@ export class Look {  // a demonstration at a step: its picture, and its path in 
     this.picture.hidden = !demo.pictures; this.path.hidden = !(view && paths?.length);
     this.picture.alt = `Picture of ${demo.name} at the cursor`;
     if (!this.path.hidden) {
-      const runs = segments.map(({ start, stop, option, said }) => [start, stop, coloured(colours, said === "open" ? 0 : option)]);
+      const runs = segments.map(({ start, stop, option, source }) => [start, stop, coloured(colours, source === "open" ? 0 : option)]);
       this.drawn = new Path(numbers.decoded ?? new Numbers(numbers, demo.steps), demo, runs, this.width, this.height);
     }
     this.at(Math.min(this.step, demo.steps - 1));

@@ -4,7 +4,7 @@ import { coloured, element, looks, percent, row, within } from "./drawing.js";
 
 const swatch = colour => { const made = element("span", { className: "swatch" }); made.style.background = colour; return made; };
 
-export const optionName = (state, option, said) => said === "open" ? "open" : option ? state.names[option - 1] ?? `option ${option}` : "control";
+export const optionName = (state, option, source) => source === "open" ? "open" : option ? state.names[option - 1] ?? `option ${option}` : "control";
 
 export class List {  // all demonstrations, the most informative first, each with its segments
   constructor(root, find, count, open) {
@@ -61,7 +61,7 @@ export class List {  // all demonstrations, the most informative first, each wit
       const { canvas, row: box } = this.rows[index], key = JSON.stringify([strip, width, longest, this.state.colours, looks.paper]);
       if (box.hidden || canvas.key === key) return;
       canvas.key = key;
-      const segments = strip.map(([start, option, said], n) => ({ start, stop: strip[n + 1]?.[0] ?? steps, option, said }));
+      const segments = strip.map(([start, option, source], n) => ({ start, stop: strip[n + 1]?.[0] ?? steps, option, source }));
       row(sharp(canvas, width, 8), segments, { place: step => step / longest * width, edge: width, top: 0, height: 8, colours: this.state.colours });
     });
   }
@@ -69,26 +69,32 @@ export class List {  // all demonstrations, the most informative first, each wit
 
 export class Options {  // names of the options: a key or a click names the segment, a text renames the option
   constructor(root, calls) {  // calls: name(option), rename(option, text), add(text)
-    Object.assign(this, { root, calls });
+    Object.assign(this, { root, calls, rows: [] });
     this.added = element("input", { placeholder: "new option", maxLength: 60 });
     this.added.setAttribute("aria-label", "Name of a new option");
-    this.added.onchange = async () => { const text = this.added.value; if (text.trim() && await calls.add(text)) this.added.value = ""; };
+    this.added.onchange = async () => {  // another one can be typed at once
+      const text = this.added.value.trim();
+      this.added.value = "";
+      if (text && !await calls.add(text)) this.added.value ||= text;
+    };
+    root.append(element("div", {}, element("span", { className: "note", textContent: "+" }), this.added));
   }
-  show(state) {
-    const key = JSON.stringify([state.names, state.colours]), focused = this.root.contains(document.activeElement);
-    if (key === this.key) return;
-    this.key = key;
-    const place = focused ? [...this.root.querySelectorAll("input")].indexOf(document.activeElement) : -1;
-    this.root.replaceChildren(...state.names.map((name, n) => {
-      const button = element("button", { type: "button", title: `Name the segment under the cursor (${n + 1})` }, swatch(state.colours[n]), String(n + 1));
-      button.setAttribute("aria-label", `Name the segment ${name}`);
-      button.onclick = () => this.calls.name(n + 1);
-      const input = element("input", { value: name, maxLength: 60 });
-      input.setAttribute("aria-label", `Name of option ${n + 1}`);
-      input.onchange = async () => { if (!await this.calls.rename(n + 1, input.value)) input.value = name; };
-      return element("div", {}, button, input);
-    }), element("div", {}, element("span", { className: "note", textContent: "+" }), this.added));
-    if (place >= 0) this.root.querySelectorAll("input")[Math.min(place, state.names.length)].focus();
+  show({ names, colours }) {
+    while (this.rows.length > names.length) this.rows.pop().row.remove();
+    while (this.rows.length < names.length) this.rows.push(this.row(this.rows.length + 1));
+    this.rows.forEach(({ button, colour, input }, n) => {
+      colour.style.background = colours[n];
+      button.setAttribute("aria-label", `Name the segment ${names[n]}`);
+      if (input.known !== names[n]) input.value = input.known = names[n];
+    });
+  }
+  row(number) {
+    const colour = swatch(""), button = element("button", { type: "button", title: `Name the segment under the cursor (${number})`, onclick: () => this.calls.name(number) }, colour, String(number));
+    const input = element("input", { maxLength: 60, onchange: async () => { if (!await this.calls.rename(number, input.value)) input.value = input.known; } });
+    input.setAttribute("aria-label", `Name of option ${number}`);
+    const row = element("div", {}, button, input);
+    this.root.lastChild.before(row);
+    return { row, button, colour, input };
   }
 }
 
@@ -96,8 +102,8 @@ export function readout(root, state, demo, cursor) {
   const segment = within(demo.segments, cursor), rate = state.frequency, boundary = demo.boundaries.find(one => one.step === segment.start), lines = [];
   const at = step => rate ? `${step} (${(step / rate).toFixed(2)} s)` : String(step);
   lines.push(["step", `${at(cursor)} of ${demo.steps}`]);
-  lines.push([state.level, optionName(state, segment.option, segment.said), segment.said === "open" ? null : coloured(state.colours, segment.option)]);
-  lines.push(["", segment.said === "proposed" ? `proposed, probability ${(demo.heights[cursor] / 255).toFixed(2)}` : segment.said === "said" ? "said by you" : "left open"]);
+  lines.push([state.level, optionName(state, segment.option, segment.source), segment.source === "open" ? null : coloured(state.colours, segment.option)]);
+  lines.push(["", { open: "left open", proposed: `proposed, probability ${(demo.heights[cursor] / 255).toFixed(2)}`, accepted: "accepted by you", given: "given by you" }[segment.source]]);
   lines.push(["steps", `${segment.start} to ${segment.stop - 1}`]);
   if (boundary && !boundary.said && boundary.high > boundary.low) lines.push(["begins at", `${boundary.low} to ${boundary.high}`]);
   for (const level of demo.upper) {
@@ -117,10 +123,10 @@ export function summary(root, { summary, demos }) {
 
 export function alike(root, state, found, pictures, open) {
   root.hidden = !found.length;
-  root.replaceChildren(element("h3", { textContent: "Alike elsewhere" }), element("div", { className: "bar" }, ...found.map(({ index, start, stop, option, said }) => {
+  root.replaceChildren(element("h3", { textContent: "Alike elsewhere" }), element("div", { className: "bar" }, ...found.map(({ index, start, stop, option }) => {
     const { name } = state.demos[index], middle = (start + stop) >> 1;
     const button = element("button", { type: "button" }, ...(pictures ? [element("img", { src: `demo/${index}/picture/${middle}`, alt: "", height: 72 })] : []),
-      element("span", {}, swatch(coloured(state.colours, option)), `${name}, steps ${start} to ${stop - 1}, ${optionName(state, option, said)}`));
+      element("span", {}, swatch(coloured(state.colours, option)), `${name}, steps ${start} to ${stop - 1}, ${optionName(state, option)}`));
     button.onclick = () => open(index, start);
     return button;
   })));

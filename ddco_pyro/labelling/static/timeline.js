@@ -12,7 +12,7 @@ export class Timeline {
     new ResizeObserver(() => this.redraw()).observe(root);
     root.addEventListener("pointerdown", event => this.down(event));
     root.addEventListener("pointermove", event => this.point(event));
-    root.addEventListener("pointerup", () => this.up());
+    root.addEventListener("pointerup", event => this.up(event));
     root.addEventListener("pointercancel", () => { this.drag = null; this.hold(null); });
     root.addEventListener("dblclick", event => { if (event.offsetX >= GUTTER) calls.split(this.step(event)); });
     root.addEventListener("contextmenu", event => {
@@ -86,11 +86,11 @@ export class Timeline {
     else if (this.drag.boundary === null) this.calls.seek(this.step(event));
     else this.moved(this.drag.boundary, Math.round(this.from + (event.clientX - this.root.getBoundingClientRect().left - GUTTER) / this.each));
   }
-  up() {
+  up(event) {
     const { drag, preview } = this;
     this.drag = null;
     if (drag && preview) this.calls.drop(preview);
-    else if (drag && drag.boundary !== null) this.calls.seek(drag.boundary);
+    else if (drag) this.calls.seek(this.step(event));  // a click that moves nothing
   }
   redraw() { this.stale = true; this.refresh(); }
   refresh() { if (!this.asked) { this.asked = true; requestAnimationFrame(() => { this.asked = false; this.frame(); }); } }

@@ -9,10 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
+from ddco_pyro.data.labels import SOURCE, UNKNOWN
 from ddco_pyro.data.sources import Source
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.names import name_in_level
-from ddco_pyro.segmenting import Segmented, Segments
+from ddco_pyro.segmenting import SOURCES, Segmented, Segments
 
 Run = tuple[int, int, int]
 """An option that stays active: (option, first step, step after the last)."""
@@ -69,14 +70,22 @@ class Writer(ABC):
         """
 
     def runs(self, demo: Segments) -> list[Run]:
-        """The subtasks of a demonstration: its level's options, where the same option chosen anew stays one run."""
-        return demo.levels[self.asked.level].runs(anew=False)
+        """The subtasks of a demonstration: its level's options, where the same option chosen anew stays one run.
+
+        There is none where a person left steps open.
+        """
+        return [run for run in demo.levels[self.asked.level].runs(anew=False) if run[0] != UNKNOWN]
+
+    def source(self, demo: Segments, start: int, stop: int) -> str | None:
+        """Who says what steps of the level are, one of :data:`~ddco_pyro.segmenting.SOURCES`; None without a person."""
+        known = demo.baselines.get(self.asked.level + SOURCE)
+        return None if known is None else SOURCES[known[start:stop].min()]
 
     def order(self, segmented: Segmented) -> list[int]:
         """The options that are active at all, by how far through a demonstration they are active on average."""
         places: dict[int, list[float]] = {}
         for demo in segmented.segments:
             options = demo.levels[self.asked.level].options
-            for option in np.unique(options).tolist():
+            for option in np.unique(options[options != UNKNOWN]).tolist():
                 places.setdefault(option, []).append(float(np.flatnonzero(options == option).mean()) / len(options))
         return sorted(places, key=lambda option: float(np.mean(places[option])))

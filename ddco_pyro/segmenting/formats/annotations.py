@@ -12,10 +12,12 @@ import numpy as np
 
 from ddco_pyro.data.arrays import NUMBERS, blocks, is_picture
 from ddco_pyro.data.files import whole_folder, write_text
+from ddco_pyro.data.labels import SOURCE, UNKNOWN
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.errors import BadInput
+from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.names import name_in_level
-from ddco_pyro.segmenting import Segmented, Segments
+from ddco_pyro.segmenting import SOURCES, Segmented, Segments
 from ddco_pyro.segmenting.formats import Writer
 
 SCHEMA = "http://www.mpi.nl/tools/elan/EAFv3.0.xsd"
@@ -29,6 +31,7 @@ class ELAN(Writer):
     """A folder with ``<demonstration>.eaf``; times are milliseconds.
 
     The highest level comes first. An annotation lasts from the first step of a segment to the first step of the next.
+    Steps that a person left open have none. A tier ``<level>_source`` says who says each segment of a level.
     A controlled vocabulary has the names of all choices of a level.
     """
 
@@ -50,37 +53,44 @@ class ELAN(Writer):
         ElementTree.SubElement(root, "HEADER", MEDIA_FILE="", TIME_UNITS="milliseconds")
         times = ElementTree.SubElement(root, "TIME_ORDER")
         levels = dict(reversed(demo.levels.items()))
-        edges = {0, len(demo)}.union(*(run[1:] for level in levels.values() for run in level.runs(anew=False)))
+        tiers = {
+            name: [
+                (_names(self.asked.fit, name)[option], start, stop)
+                for option, start, stop in level.runs(anew=False)
+                if option != UNKNOWN
+            ]
+            for name, level in levels.items()
+        }
+        asked = [(start, stop) for _, start, stop in self.runs(demo)]
+        if said := [(word, *ends) for ends in asked if (word := self.source(demo, *ends)) is not None]:
+            tiers[self.asked.level + SOURCE] = said
+        edges = {0, len(demo)}.union(*(run[1:] for runs in tiers.values() for run in runs))
         for step in sorted(edges):
             value = str(round(step * milliseconds))
             ElementTree.SubElement(times, "TIME_SLOT", TIME_SLOT_ID=f"ts{step}", TIME_VALUE=value)
         number = 0
-        for name, level in levels.items():
+        for name, segments in tiers.items():
             tier = ElementTree.SubElement(root, "TIER", TIER_ID=name, LINGUISTIC_TYPE_REF=name)
-            for option, start, stop in level.runs(anew=False):
+            for word, start, stop in segments:
                 number += 1
                 annotation = ElementTree.SubElement(ElementTree.SubElement(tier, "ANNOTATION"), "ALIGNABLE_ANNOTATION")
                 annotation.attrib |= {
                     "ANNOTATION_ID": f"a{number}", "TIME_SLOT_REF1": f"ts{start}", "TIME_SLOT_REF2": f"ts{stop}"
                 }  # fmt: skip
                 text = ElementTree.SubElement(annotation, "ANNOTATION_VALUE")
-                text.text = self._names(name)[option]
-        for name in levels:
+                text.text = word
+        for name in tiers:
             kind = {"LINGUISTIC_TYPE_ID": name, "TIME_ALIGNABLE": "true", "CONTROLLED_VOCABULARY_REF": name}
             ElementTree.SubElement(root, "LINGUISTIC_TYPE", kind)
         ElementTree.SubElement(root, "LANGUAGE", LANG_ID=UNDETERMINED)
-        for name in levels:
+        for name in tiers:
             vocabulary = ElementTree.SubElement(root, "CONTROLLED_VOCABULARY", CV_ID=name)
             ElementTree.SubElement(vocabulary, "DESCRIPTION", LANG_REF=UNDETERMINED)
-            for option, word in enumerate(self._names(name)):
+            for option, word in enumerate(_names(self.asked.fit, name) if name in levels else SOURCES):
                 entry = ElementTree.SubElement(vocabulary, "CV_ENTRY_ML", CVE_ID=f"{name}_{option}")
                 ElementTree.SubElement(entry, "CVE_VALUE", LANG_REF=UNDETERMINED).text = word
         ElementTree.indent(root)
         return '<?xml version="1.0" encoding="UTF-8"?>\n' + ElementTree.tostring(root, "unicode") + "\n"
-
-    def _names(self, level: str) -> list[str]:
-        names = self.asked.fit.names[level]
-        return [name_in_level(option, level, names) for option in range(len(names))]
 
 
 # --- Label Studio -----------------------------------------------------------------------------------------------------
@@ -97,7 +107,8 @@ class LabelStudio(Writer):
 
     A task shows the controls over time, with the subtasks as predicted ``timeserieslabels``. A subtask's ``score`` is
     its mean posterior probability; the score of the prediction is the lowest of them, so that Label Studio can begin
-    with the demonstration that is least certain. Times are steps, inclusive. Regions have the name of the level.
+    with the demonstration that is least certain. Times are steps, inclusive. Regions have the name of the level, and
+    who says so as ``meta``. Steps that a person left open have no region.
     """
 
     def write(self, segmented: Segmented) -> str:
@@ -116,13 +127,15 @@ class LabelStudio(Writer):
         for number, (option, start, stop) in enumerate(self.runs(demo)):
             labels = {"start": start, "end": stop - 1, "instant": False, REGIONS: [self.asked.names[option]]}
             scores.append(float(probability[start:stop].mean()))
+            source = self.source(demo, start, stop)
+            meta = {} if source is None else {"meta": {"text": [source]}}
             found.append({
                 "id": f"{demo.name}-{number}", "from_name": self.asked.level, "to_name": "series", "type": REGIONS,
-                "score": scores[-1], "value": labels,
+                "score": scores[-1], "value": labels, **meta,
             })  # fmt: skip
         return {
             "data": {"series": series, DEMO: demo.name},
-            "predictions": [{"model_version": str(self.asked.run), "score": min(scores), "result": found}],
+            "predictions": [{"model_version": str(self.asked.run), "score": min(scores, default=0.0), "result": found}],
         }
 
     def _config(self, order: list[int], series: list[str]) -> str:
@@ -182,11 +195,16 @@ class Rerun(Writer):
                 times.append(rerun.TimeColumn("time", duration=at / frequency))
             stream.send_columns(entity, times, columns)
 
+        states = {
+            name: (level.options, [*_names(self.asked.fit, name), SOURCES[UNKNOWN + 1]])
+            for name, level in demo.levels.items()
+        }
+        states |= {name: (own, [*SOURCES]) for name, own in demo.baselines.items() if name.endswith(SOURCE)}
+        for name, (values, words) in states.items():
+            starts = np.flatnonzero(np.diff(values, prepend=-9))
+            changes = rerun.StateChange.columns(state=[words[value] for value in values[starts]])
+            log(f"segments/{_entity(name)}", starts, changes)
         for name, level in demo.levels.items():
-            runs = level.runs(anew=False)
-            states = [name_in_level(option, name, self.asked.fit.names[name]) for option, _, _ in runs]
-            starts = np.array([start for _, start, _ in runs])
-            log(f"segments/{_entity(name)}", starts, rerun.StateChange.columns(state=states))
             log(f"probability/{_entity(name)}", steps, rerun.Scalars.columns(scalars=level.probability))
         numbers = {key: array for key, array in found.observations.items() if array.dtype.kind in NUMBERS}
         for key, array in {**numbers, "control": found.actions}.items():
@@ -198,6 +216,11 @@ class Rerun(Writer):
                 values = np.asarray(array).reshape(len(demo), -1).astype(float)
                 log(_entity(key), steps, rerun.Scalars.columns(scalars=values))
         stream.disconnect()
+
+
+def _names(fit: Fit, level: str) -> list[str]:
+    """The name of each choice of a level, control first."""
+    return [name_in_level(option, level, fit.names[level]) for option in range(len(fit.names[level]))]
 
 
 def _entity(name: str) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.files import whole_file
 from ddco_pyro.data.hdf5 import attributes_of, opened, written
-from ddco_pyro.data.labels import BOUNDARY, LABEL_NAMES, label_names
+from ddco_pyro.data.labels import BOUNDARY, LABEL_NAMES, SOURCE, label_names
 from ddco_pyro.errors import BadInput
 from ddco_pyro.names import choice_names
 from ddco_pyro.segmenting import Segmented, Segments, chosen_names
@@ -32,7 +32,7 @@ COPIED = "segmented_from"
 def labels_of(demo: Segments) -> dict[str, np.ndarray]:
     """Labels of a demonstration: ``<level>``, its options [T], and ``<level>_boundary``, 1 at each new choice [T].
 
-    Baselines likewise, with ``<level>_<baseline>`` as name.
+    Baselines likewise, with ``<level>_<baseline>`` as name, and who says so.
     """
     labels = {}
     each = {name: (level.options, level.boundaries) for name, level in demo.levels.items()}
@@ -94,18 +94,21 @@ def write_labels(path: Path, out: Path, segmented: Segmented) -> None:
     labels and names is not written again. For a copy, ``path`` must also be unchanged since it was copied.
     """
     in_place = _same(out, path)
-    if (in_place or _copied_from(out) == _version(path)) and _has(out, segmented):
+    if (in_place or _copied_from(out) == _version(path)) and has_labels(out, segmented):
         return
     with whole_file(out) as temporary:
         shutil.copyfile(path, temporary)
         with written(temporary, "r+") as file:
             for demo in segmented.segments:
                 group = file["data"][demo.name].require_group("labels")
-                for name, values in labels_of(demo).items():
-                    if name in group:
-                        del group[name]
+                labels = labels_of(demo)
+                stale = {level + SOURCE + end for level in segmented.counts for end in ("", BOUNDARY)}
+                ours = {name for name in stale & {*group} if group[name].attrs.get(OURS) == SIGNATURE}
+                for name in ours | labels.keys() & {*group}:
+                    del group[name]
+                for name, values in labels.items():
                     group.create_dataset(name, data=values).attrs[OURS] = SIGNATURE
-            if (names := _names(segmented)) != segmented.label_names:
+            if (names := _names(segmented)) != label_names(attributes_of(file["data"]) | attributes_of(file)):
                 holder = file if LABEL_NAMES in file.attrs else file["data"]
                 holder.attrs[LABEL_NAMES] = json.dumps(names)
             if not in_place:
@@ -139,7 +142,8 @@ def _copied_from(copy: Path) -> list[str]:
         return []
 
 
-def _has(path: Path, segmented: Segmented) -> bool:
+def has_labels(path: Path, segmented: Segmented) -> bool:
+    """Whether a file has these labels and names."""
     with opened(path) as file:
         if label_names(attributes_of(file["data"]) | attributes_of(file)) != _names(segmented):
             return False

@@ -53,7 +53,7 @@ class MimicGen(Writer):
                     _forget(file, set(left_out))
                 for name, each in runs.items():
                     group = file[f"data/{name}"].require_group(self.place)
-                    steps = np.arange(each[-1][2])
+                    steps = np.arange(len(file[f"data/{name}/actions"]))
                     for subtask, (_, _, stop) in zip(names[:-1], each, strict=False):
                         signal = f"subtask_term_signals/{subtask.replace('/', '_')}"
                         if signal in group:

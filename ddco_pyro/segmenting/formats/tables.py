@@ -9,11 +9,11 @@ from typing import Any
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import whole_file
-from ddco_pyro.data.labels import BOUNDARY
+from ddco_pyro.data.labels import BOUNDARY, SOURCE, UNKNOWN
 from ddco_pyro.drawing.shown import paths_of, stored_pictures
 from ddco_pyro.errors import BadInput
 from ddco_pyro.names import option_name
-from ddco_pyro.segmenting import Segmented, recorded
+from ddco_pyro.segmenting import SOURCES, Segmented, recorded
 from ddco_pyro.segmenting.formats import Writer
 from ddco_pyro.segmenting.page import followed, write_page
 
@@ -27,7 +27,9 @@ def cell(value: Any) -> Any:
 
 
 def columns(segmented: Segmented) -> list[str]:
-    """Names of the columns: for each level the option, whether it is a new choice, probability, name; baselines."""
+    """Names of the columns: of each level the option, whether it is a new choice, probability, name; of baselines, and
+    who says so.
+    """
     levels = [f"{name}{suffix}" for name in segmented.counts for suffix in ("", BOUNDARY, "_probability", "_name")]
     return [
         "demonstration",
@@ -46,8 +48,10 @@ def rows(segmented: Segmented) -> Iterator[list[Any]]:
             for name, level in demo.levels.items():
                 option = int(level.options[step])
                 row += [option, int(level.boundaries[step]), float(level.probability[step])]
-                row.append(option_name(option, segmented.names.get(name, ())))
-            yield row + [int(kinds[step]) for kinds in demo.baselines.values()]
+                row.append("" if option == UNKNOWN else option_name(option, segmented.names.get(name, ())))
+            for name, kinds in demo.baselines.items():
+                row.append(SOURCES[kinds[step]] if name.endswith(SOURCE) else int(kinds[step]))
+            yield row
 
 
 class CSV(Writer):
