@@ -328,11 +328,12 @@ def said_in(demos: Demonstrations, level: str, names: Sequence[str]) -> list[Cha
         return []
     found, options = [*names], dict[int, int]()
     values = {value for demo in demos for value in np.unique(demo.labels.get(level, UNKNOWN)).tolist()}
-    for value in sorted(values - {UNKNOWN}):
+    for value in sorted(values - {UNKNOWN} | {*range(ours, len(known))}):
         name = option_name(value, known) if ours else label_name(level, value, known)
         if name not in found:
-            unnamed = next((n for n, own in enumerate(found) if own == option_name(n + 1)), len(found))
-            found[unnamed : unnamed + 1] = [name]
+            unnamed = [n for n, own in enumerate(found) if own == option_name(n + 1)]
+            place = value - 1 if value - 1 in unnamed else [*unnamed, len(found)][0]
+            found[place : place + 1] = [name]
         options[value] = found.index(name) + 1
     for demo in demos:
         labels = demo.labels.get(level, np.full(len(demo), UNKNOWN))
