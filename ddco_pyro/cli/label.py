@@ -57,19 +57,21 @@ def label(
         raise BadInput(f"label needs {error.name}; install it with: pip install 'ddco-pyro[label]'") from None
     from ddco_pyro.fitting.fitted import load
     from ddco_pyro.labelling.session import Session
+    from ddco_pyro.training.processes import one_thread
 
     run = paths[0] if len(paths) == 2 else _fitted(file)
     listening = Listening.at(port)
-    session = Session(load(run, allow_code), file, place, level, _exporters(run, file))
-    session.journal.at(listening.address)
-    session.begin()
 
     def ready() -> None:
         print(f"{listening.address}\nCtrl-C saves the labels and ends", flush=True)
         if browser:
             webbrowser.open(listening.address)
 
-    print(serve(session, listening, ready))
+    with one_thread():  # a demonstration is inferred sooner so, and a refit has a core of its own
+        session = Session(load(run, allow_code), file, place, level, _exporters(run, file))
+        session.journal.at(listening.address)
+        session.begin()
+        print(serve(session, listening, ready))
 
 
 def _fitted(file: Path) -> Path:

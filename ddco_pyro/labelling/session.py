@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import sklearn.linear_model
+import sklearn.metrics  # noqa: F401  (the first edit does not wait for these)
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.labels import SOURCE
