@@ -14,7 +14,7 @@ import numpy as np
 from ddco_pyro.data.arrays import Observed
 from ddco_pyro.data.demonstrations import Demonstration
 from ddco_pyro.data.files import write_text
-from ddco_pyro.data.labels import BOUNDARY, UNKNOWN
+from ddco_pyro.data.labels import BOUNDARY, SOURCE, UNKNOWN
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.drawing.page import Block, Cell, Page, Section, Table, Text, footnote, note
 from ddco_pyro.drawing.timeline import Lane, Runs, Timelines, Track, following
@@ -85,8 +85,9 @@ def timelines(
     """
     lanes = {}
     for name, count in reversed(segmented.counts.items()):
-        names = {choice: option_name(choice, segmented.names.get(name, ())) for choice in range(count + 1)}
-        lanes[name] = Lane(name, names | {UNKNOWN: SOURCES[0]}, dict(enumerate(map(option_colour, range(count + 1)))))
+        names = [option_name(choice, segmented.names.get(name, ())) for choice in range(count + 1)]
+        known = dict(enumerate(names)) | {UNKNOWN: SOURCES[0]} if name + SOURCE in segmented.label_names else names
+        lanes[name] = Lane(name, known, list(map(option_colour, range(count + 1))))
     lanes |= {name: Lane(name, names, segmented.label_colours(name)) for name, names in _values(segmented).items()}
     before = accumulate((len(demo) * len(segmented.counts) for demo in segmented.segments), initial=0)
     shown = [demo for demo, steps in zip(segmented.segments, before, strict=False) if steps < most_steps]
