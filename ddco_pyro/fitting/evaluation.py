@@ -230,7 +230,8 @@ def marginal(spec: Spec, size: Sizes, parts: Mapping[str, Demonstrations]) -> Ma
     stds = {path: std if isinstance(std, LearnedStd) else LearnedStd(learn=True) for path, std in own.items() if std}
     learned = {path: {"learn": True, "floor": std.floor} for path, std in stds.items()}
     train = _unseen(tuning_split(spec, size, parts["train"])[0])
-    model = train_model(with_overrides(spec, {**CONSTANT, **learned}), Sizes.of(train), train).hierarchy
+    alike = replace(size, shapes=train.observation_shapes, steps=max(train.lengths))  # of the same kinds
+    model = train_model(with_overrides(spec, {**CONSTANT, **learned}), alike, train).hierarchy
     values = {
         name: float(sum(piece.log_likelihood.sum() for piece in infer(model, _unseen(part))) / sum(part.lengths))
         for name, part in parts.items()

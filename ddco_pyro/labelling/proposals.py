@@ -132,7 +132,7 @@ class Proposals:
             self.paths |= self.found(piece)
 
     def number(self, labels: Mapping[str, np.ndarray]) -> bool:
-        """Number the options by the named steps of these demonstrations, and of all others as they were.
+        """Number the options by the named steps of these demonstrations, and leave all others unchanged.
 
         Options keep their numbers unless named steps are against it by more than half a segment of each.
 

@@ -145,7 +145,7 @@ def _read(spec: Spec, path: Path, ready: Callable[[Demonstration], Demonstration
         )
     with stored(path, spec.observed, _labels(spec), spec.demonstrations.exclude) as (found, masks, attributes):
         remedy = "leave observations out, or make its demonstrations fewer, shorter or equally long"
-        refuse_too_much(needed(found), f"{path}: a fit to {', '.join(spec.observed)}", remedy)
+        refuse_too_much(needed(found), f"a fit to {', '.join(spec.observed)}", remedy)
         return _set_apart(spec, Demonstrations(tuple(ready(demo) for demo in found), masks, attributes))
 
 

@@ -12,10 +12,8 @@ from random_demonstrations import numbered
 from sklearn.metrics import normalized_mutual_info_score
 
 import ddco_pyro
-from ddco_pyro.acting.monitor import run_lengths
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.options import segments_of
-from ddco_pyro.labelling.refitting import Ways
 from ddco_pyro.selection.small import heavy_tails, in_steps, lasting, overrides
 from ddco_pyro.spec import load_spec, parse_spec, with_overrides
 
@@ -92,15 +90,6 @@ def test_init_writes_what_it_found(tmp_path: Path):
     both = call("init", file, "--out", spec, "--force", "--segments", "5", "--segment", "3s")
     assert both.status == 2
     assert "exclude each other" in both.err
-
-
-def test_other_ways_to_cut_are_longer_or_shorter():
-    demos = skills_within_which_speed_varies(4, 100)
-    trained = ddco_pyro.fit(parse_spec(yaml.safe_load(SPEC)), demos)
-    calls = Ways(trained, demos, 1).calls
-    fits = (calls["fine"](), trained, calls["coarse"]())
-    fine, own, coarse = (np.median(np.concatenate(run_lengths([*fit.segment(demos)[0]], 2))) for fit in fits)
-    assert fine <= own < coarse
 
 
 def test_heavy_tails_are_found_where_they_predict_better():
