@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
 from pathlib import Path
 from shutil import get_terminal_size
 from typing import Annotated, Any
@@ -16,24 +13,6 @@ NARROW = get_terminal_size().columns < 60
 """Whether tables of help would cut the names of options: help is plain text then."""
 BRACKET = "[" if NARROW else "\\["
 """A bracket in a help text, which tables would take for markup."""
-
-
-_goes_on: ContextVar[bool] = ContextVar("goes_on", default=False)
-
-
-@contextmanager
-def going_on() -> Iterator[None]:
-    """Inside, a command calls others and goes on by itself: these name no next step."""
-    token = _goes_on.set(True)
-    try:
-        yield
-    finally:
-        _goes_on.reset(token)
-
-
-def hint(text: str) -> str:
-    """The next step, in words; empty where a command takes the step itself (:func:`going_on`)."""
-    return "" if _goes_on.get() else text
 
 
 def out_file(text: str | os.PathLike[str]) -> Path:
@@ -62,11 +41,11 @@ def written(parser: Any, text: str, **how: Any) -> Any:
     return typer.Option(help=text, parser=parser, metavar="PATH", **how)
 
 
-SpecPath = Annotated[Path, typer.Argument(metavar="SPEC", help="The spec, a YAML file.", show_default=False)]
+SpecPath = Annotated[Path, typer.Argument(metavar="SPEC", help="The spec, a YAML file.")]
 Overrides = Annotated[
     list[str], typer.Option("--set", metavar="KEY=VALUE", help="Override a key of the spec; repeatable.")
 ]
-RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="The folder of a finished fit.", show_default=False)]
+RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="The folder of a finished fit.")]
 Level = Annotated[str | None, typer.Option(help="Name of their level; by default the lowest.")]
 AllowCode = Annotated[
     bool, typer.Option("--allow-code", help="Import the user code (module:name) that the spec names.")

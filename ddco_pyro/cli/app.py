@@ -60,8 +60,7 @@ def _print_version(asked: bool) -> None:
 @app.callback()
 def top(
     _: Annotated[
-        bool,
-        typer.Option("--version", help="Print the version.", is_eager=True, callback=_print_version),
+        bool, typer.Option("--version", help="Print the version.", is_eager=True, callback=_print_version)
     ] = False,
 ) -> None:
     """Options that need no command."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from ddco_pyro.cli import AllowCode, Overrides, SpecPath, hint, out_file, written
+from ddco_pyro.cli import AllowCode, Overrides, SpecPath, out_file, written
 from ddco_pyro.data.files import Output, check_outputs, write_text
 from ddco_pyro.data.formats import FORMATS
 from ddco_pyro.errors import BadInput, Failed, command
@@ -26,10 +26,7 @@ SourcePath = Annotated[
     Path, typer.Argument(metavar="FILE", help=f"Demonstrations: {', '.join(about.text for about in FORMATS.values())}.")
 ]
 FormatOption = Annotated[
-    str | None,
-    typer.Option(
-        "--format", metavar="NAME", help=f"One of {', '.join(FORMATS)}; recognised unless given.", show_default=False
-    ),
+    str | None, typer.Option("--format", metavar="NAME", help=f"One of {', '.join(FORMATS)}; recognised unless given.")
 ]
 
 TimeUnit = Literal["seconds", "milliseconds", "steps"]
@@ -59,10 +56,7 @@ def inspect(
     form: FormatOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print all of it as JSON.")] = False,
     against: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="Compare labels with those of another annotator instead.", show_default=False
-        ),
+        Path | None, typer.Option(metavar="FILE", help="Compare labels with those of another annotator instead.")
     ] = None,
     tolerance: Annotated[int, typer.Option(min=0, help="Steps between boundaries that match, for --against.")] = 5,
 ) -> None:
@@ -111,7 +105,6 @@ def init(
         typer.Option(
             metavar="ATTRIBUTE",
             help="Hold out all demonstrations with some values of an attribute, such as the operator.",
-            show_default=False,
         ),
     ] = None,
     segment: Annotated[
@@ -119,12 +112,10 @@ def init(
         typer.Option(
             metavar="LENGTH",
             help="How long options last, by the median: such as 2s, or 20 for steps. Small fits find the settings.",
-            show_default=False,
         ),
     ] = None,
     segments: Annotated[
-        int | None,
-        typer.Option(min=1, help="The same by the number of segments in a demonstration.", show_default=False),
+        int | None, typer.Option(min=1, help="The same by the number of segments in a demonstration.")
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace a file that is there already.")] = False,
 ) -> None:
@@ -132,6 +123,19 @@ def init(
 
     Without --segment or --segments, options do not switch within half a second, or five steps, all the time.
     """
+    write_spec(file, out, hold_out_by, segment, segments, force)
+    print(f"{out}: fit it with: {command('fit', out, '--out', f'runs/{out.stem}')}")
+
+
+def write_spec(
+    file: Path,
+    out: Path,
+    hold_out_by: str | None = None,
+    segment: str | None = None,
+    segments: int | None = None,
+    force: bool = False,
+) -> None:
+    """Write the spec of ``init``, and print what was decided."""
     from ddco_pyro.data.inspection import inspect as look
     from ddco_pyro.data.sources import refuse_foreign
     from ddco_pyro.data.starting import starting_spec
@@ -151,8 +155,6 @@ def init(
     write_text(out, starting.text.replace("THIS_FILE", quote(str(out))))
     for note in starting.notes:
         print(note)
-    fit = command("fit", out, "--out", f"runs/{out.stem}")
-    print(f"{out}{hint(f': fit it with: {fit}')}")
 
 
 def _decided(spec: Spec, facts: Inspection, segment: str | None, segments: int | None) -> Decided | None:
@@ -178,7 +180,7 @@ def _decided(spec: Spec, facts: Inspection, segment: str | None, segments: int |
 
 def import_(
     source: SourcePath,
-    out: Annotated[Path, written(out_file, "The HDF5 file to write.", show_default=False)],
+    out: Annotated[Path, written(out_file, "The HDF5 file to write.")],
     form: FormatOption = None,
     observations: Annotated[
         list[str], typer.Option("--observation", metavar="KEY", help="Import only this one; repeatable.")
@@ -203,23 +205,15 @@ def import_(
             metavar="TABLE",
             help="A table (CSV, TSV, Parquet) of segments that become labels, such as exported by ELAN, BORIS or "
             "Label Studio.",
-            show_default=False,
         ),
     ] = None,
     columns: Annotated[
         str | None,
-        typer.Option(
-            metavar="ROLE=NAME,...",
-            help="The columns of TABLE: demonstration=A,label=B,start=C,stop=D.",
-            show_default=False,
-        ),
+        typer.Option(metavar="ROLE=NAME,...", help="The columns of TABLE: demonstration=A,label=B,start=C,stop=D."),
     ] = None,
-    unit: Annotated[
-        TimeUnit | None, typer.Option(help="The unit of TABLE's times, unless its columns say it.", show_default=False)
-    ] = None,
+    unit: Annotated[TimeUnit | None, typer.Option(help="The unit of TABLE's times, unless its columns say it.")] = None,
     fps: Annotated[
-        float | None,
-        typer.Option(min=0.001, help="Steps per second, for --labels; by default what FILE says.", show_default=False),
+        float | None, typer.Option(min=0.001, help="Steps per second, for --labels; by default what FILE says.")
     ] = None,
     skip_broken: Annotated[
         bool, typer.Option("--skip-broken", help="Leave out demonstrations that cannot be used, and list them.")
@@ -262,25 +256,16 @@ def _columns(text: str | None) -> dict[str, str]:
 
 def encode(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="An HDF5 file of demonstrations.")],
-    observation: Annotated[str, typer.Option(metavar="KEY", help="The pictures to encode.", show_default=False)],
+    observation: Annotated[str, typer.Option(metavar="KEY", help="The pictures to encode.")],
     encoder: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME",
-            help="timm:NAME, such as timm:resnet18.a1_in1k, or your own module:function.",
-            show_default=False,
-        ),
+        str, typer.Option(metavar="NAME", help="timm:NAME, such as timm:resnet18.a1_in1k, or your own module:function.")
     ],
-    out: Annotated[Path, written(out_file, "The HDF5 file to write.", show_default=False)],
+    out: Annotated[Path, written(out_file, "The HDF5 file to write.")],
     size: Annotated[
-        int | None,
-        typer.Option(
-            min=1, help="Principal components to keep; 64 unless there are fewer features.", show_default=False
-        ),
+        int | None, typer.Option(min=1, help="Principal components to keep; 64 unless there are fewer features.")
     ] = None,
     name: Annotated[
-        str | None,
-        typer.Option("--as", metavar="NAME", help="The new observation; KEY_features by default.", show_default=False),
+        str | None, typer.Option("--as", metavar="NAME", help="The new observation; KEY_features by default.")
     ] = None,
     allow_code: Annotated[
         bool, typer.Option("--allow-code", help="Import the user code that --encoder names.")

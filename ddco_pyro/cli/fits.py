@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ddco_pyro.cli import AllowCode, Overrides, SpecPath, hint, out_folder, written
+from ddco_pyro.cli import AllowCode, Overrides, SpecPath, out_folder, written
 from ddco_pyro.data.files import Output, check_outputs
 from ddco_pyro.errors import BadInput, Failed, command
 from ddco_pyro.events import Event, Log
@@ -21,7 +21,6 @@ from ddco_pyro.spec import Spec, SpecError, dump_spec, load_spec, spec_schema, u
 
 if TYPE_CHECKING:
     from ddco_pyro.fitting.fitted import Fit
-    from ddco_pyro.training.processes import Ranks
 
 
 def check(
@@ -68,16 +67,11 @@ def fit(
         ),
     ] = None,
     seeds: Annotated[
-        int | None,
-        typer.Option(min=2, help="Fit with so many training seeds in all, and report their variation."),
+        int | None, typer.Option(min=2, help="Fit with so many training seeds in all, and report their variation.")
     ] = None,
     log: Annotated[
         list[str],
-        typer.Option(
-            "--log",
-            metavar="NAME",
-            help="Log training, too: tensorboard or wandb-offline; repeatable.",
-        ),
+        typer.Option("--log", metavar="NAME", help="Log training, too: tensorboard or wandb-offline; repeatable."),
     ] = [],  # noqa: B006
     resume: Annotated[
         bool, typer.Option("--resume", help="Where --out holds this run, finished, show it again.")
@@ -96,39 +90,38 @@ def fit(
 
     with together() as ranks:
         if ranks.rank > 0:
-            _follow(ranks)
+            from ddco_pyro.training.restarts import follow
+
+            with suppress(BadInput, Failed):  # the first process reports an error that all have
+                follow(ranks)
             return
         loaded = load_spec(spec, overrides, allow_code)
         if ranks.size > 1 and jobs not in (None, 1):
             raise SpecError(f"--jobs {jobs}: the processes of torchrun train together; leave --jobs out")
         jobs = 1 if ranks.size > 1 else -1 if jobs is None else jobs
-        _fit_and_report(loaded, spec, out, jobs, seeds, resume, [*dict.fromkeys(log)])
+        folder = out or Path("runs") / f"{spec.stem}-{time.strftime('%Y%m%d-%H%M%S')}"
+        fit_and_report(loaded, spec, folder, jobs, seeds, resume, [*dict.fromkeys(log)])
+        file = loaded.demonstrations.path
+        if loaded.hierarchy and file:
+            print(f"next: {command('segment', folder, file, '--html', 'segments.html', *_allowed(loaded))}")
 
 
-def _follow(ranks: Ranks) -> None:
-    """Train along with the first process of ``torchrun``, which alone reports an error that both have."""
-    from ddco_pyro.training.restarts import follow
-
-    with suppress(BadInput, Failed):
-        follow(ranks)
-
-
-def _fit_and_report(
+def fit_and_report(
     loaded: Spec,
     spec: Path,
-    out: Path | None,
-    jobs: int,
-    seeds: int | None,
-    resume: bool,
-    logs: Sequence[str],
+    folder: Path,
+    jobs: int = -1,
+    seeds: int | None = None,
+    resume: bool = False,
+    logs: Sequence[str] = (),
 ) -> None:
+    """Do what ``fit`` does with a spec that is read from ``spec``."""
     from ddco_pyro.cli import console
     from ddco_pyro.fitting.fit import fit as fitted_to
     from ddco_pyro.fitting.seeds import check_seeds, repeat
 
     if seeds is not None:
         check_seeds(loaded, seeds)
-    folder = out or Path("runs") / f"{spec.stem}-{time.strftime('%Y%m%d-%H%M%S')}"
     _check_folder(folder, spec, loaded)
     repeated = () if seeds is None else ("--seeds", str(seeds))
     more = [word for name in logs for word in ("--log", name)]
@@ -156,10 +149,6 @@ def _fit_and_report(
     console.log_likelihoods(fitted)
     console.seeds(fitted.metrics)
     print(f"report: {write_report(fitted, fitted.demonstrations)}")
-    file = loaded.demonstrations.path
-    segment = command("segment", folder, file or "", "--html", "segments.html", *_allowed(loaded))
-    if loaded.hierarchy and file and (said := hint(f"next: {segment}")):
-        print(said)
 
 
 def _held_out(fitted: Fit) -> dict[str, float]:

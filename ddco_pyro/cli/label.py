@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ddco_pyro.cli import AllowCode, Level, demos, going_on, out_file, runs, written
+from ddco_pyro.cli import AllowCode, Level, demos, out_file, runs, written
 from ddco_pyro.cli.starting import refuse_other
 from ddco_pyro.data.files import Output, check_outputs
 from ddco_pyro.errors import BadInput
@@ -87,9 +87,8 @@ def _fitted(file: Path) -> Path:
     if not (run / "metrics.json").exists():
         refuse_foreign(file)
         folder.mkdir(parents=True, exist_ok=True)
-        with going_on():
-            if not spec.exists():
-                demos.init(file, spec)
+        if not spec.exists():
+            demos.write_spec(file, spec)
         with console.Progress() as progress:
             fit(load_spec(spec, ["compare_with=[]"]), None, run, progress)
     return run
@@ -105,11 +104,10 @@ def _export(option: str, run: Path, file: Path, segmented: Segmented, fit: Fit, 
     from ddco_pyro.data.sources import open_source
     from ddco_pyro.segmenting.formats import Asked
 
-    kind = runs.FORMATS[option].kind
-    suffix = "" if kind == "folder" else SUFFIXES.get(option, f".{option[2:]}")
-    place = Output(option, folder / f"segments{suffix}", kind)
+    suffix = "" if runs.FORMATS[option].kind == "folder" else SUFFIXES.get(option, f".{option[2:]}")
+    place = folder / f"segments{suffix}"
     with open_source(file) as source:
-        writer = runs.writer_of(place, Asked(fit, run, file, source, level))
-        writer.check()
-        writer.write(segmented)
-    return place.path
+        asked = Asked(option, place, fit, run, file, source, level)
+        runs.check_format(asked)
+        runs.write_format(asked, segmented)
+    return place

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import time
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
@@ -19,7 +20,8 @@ if TYPE_CHECKING:
     from ddco_pyro.data.sources import Source
     from ddco_pyro.exporting import Exported
     from ddco_pyro.fitting.fitted import Fit
-    from ddco_pyro.segmenting.formats import Asked, Writer
+    from ddco_pyro.segmenting import Segmented
+    from ddco_pyro.segmenting.formats import Asked
 
 FILMED = 3
 """Episodes of each method that ``rollout --video`` films."""
@@ -116,33 +118,55 @@ def _check_run(run: Path, *names: str) -> None:
 class Format(NamedTuple):
     """A format of segments.
 
-    :param writer: its class in :mod:`ddco_pyro.segmenting.formats`, ``module:Class``.
+    :param write: its function in :mod:`ddco_pyro.segmenting.formats`, ``module:function``.
     :param text: what is written, in words.
     :param takes: the format of demonstrations that it copies; empty where it takes any.
+    :param check: the function that refuses demonstrations and places; empty where none does.
+    :param extra: of this project, where the format needs a package: a key of :data:`PACKAGES`.
     """
 
     kind: Literal["file", "folder", "stream"]
-    writer: str
+    write: str
     text: str
     takes: Literal["", "robomimic", "lerobot"] = ""
+    check: str = ""
+    extra: str = ""
 
+
+PACKAGES = {"lerobot": "pyarrow", "rerun": "rerun"}
 
 FORMATS = {
-    "--html": Format("stream", "tables:Page", "A page with the timeline of every demonstration."),
-    "--csv": Format("stream", "tables:CSV", "A table with a row for each step."),
-    "--parquet": Format("stream", "tables:Parquet", "The same table as Parquet."),
-    "--out": Format("file", "labels:Labels", "A copy of the HDF5 file with labels for each step.", "robomimic"),
-    "--lerobot": Format("folder", "lerobot:Annotated", "A copy of a LeRobot dataset with subtasks.", "lerobot"),
-    "--sarm": Format("folder", "lerobot:SARM", "The same with the stages of SARM's reward model.", "lerobot"),
-    "--mimicgen": Format(
-        "file", "mimicgen:MimicGen", "A copy of a prepared file with MimicGen's signals.", "robomimic"
+    "--html": Format("stream", "tables:write_html", "A page with the timeline of every demonstration."),
+    "--csv": Format("stream", "tables:write_csv", "A table with a row for each step."),
+    "--parquet": Format("stream", "tables:write_parquet", "The same table as Parquet.", extra="lerobot"),
+    "--out": Format(
+        "file", "labels:write", "A copy of the HDF5 file with labels for each step.", "robomimic", "labels:check"
     ),
-    "--isaac": Format("file", "mimicgen:Isaac", "The same for Isaac Lab Mimic.", "robomimic"),
-    "--label-studio": Format("folder", "annotations:LabelStudio", "Predictions for Label Studio."),
-    "--elan": Format("folder", "annotations:ELAN", "ELAN's .eaf of each demonstration."),
-    "--rerun": Format("folder", "annotations:Rerun", "Rerun's .rrd of each demonstration."),
+    "--lerobot": Format(
+        "folder",
+        "lerobot:write_subtasks",
+        "A copy of a LeRobot dataset with subtasks.",
+        "lerobot",
+        "lerobot:check_subtasks",
+        "lerobot",
+    ),
+    "--sarm": Format(
+        "folder",
+        "lerobot:write_stages",
+        "The same with the stages of SARM's reward model.",
+        "lerobot",
+        "lerobot:check",
+        "lerobot",
+    ),
+    "--mimicgen": Format(
+        "file", "mimicgen:write", "A copy of a prepared file with MimicGen's signals.", "robomimic", "mimicgen:check"
+    ),
+    "--isaac": Format("file", "mimicgen:write", "The same for Isaac Lab Mimic.", "robomimic", "mimicgen:check"),
+    "--label-studio": Format("folder", "annotations:write_label_studio", "Predictions for Label Studio."),
+    "--elan": Format("folder", "annotations:write_elan", "ELAN's .eaf of each demonstration."),
+    "--rerun": Format("folder", "annotations:write_rerun", "Rerun's .rrd of each demonstration.", extra="rerun"),
 }
-"""Every format, by its option of ``segment``. A new one is a :class:`Writer`, a row here and a parameter there."""
+"""Every format, by its option of ``segment``. A new one is a function, a row here and a parameter there."""
 
 TAKEN = {"robomimic": "HDF5 file in robomimic's layout", "lerobot": "LeRobot dataset"}
 
@@ -151,7 +175,7 @@ def _to(option: str) -> Any:
     """The option of a format."""
     form = FORMATS[option]
     parser = out_folder if form.kind == "folder" else out_file
-    return written(parser, form.text, show_default=False, rich_help_panel="Formats")
+    return written(parser, form.text, rich_help_panel="Formats")
 
 
 def segment(
@@ -171,9 +195,6 @@ def segment(
     elan: Annotated[Path | None, _to("--elan")] = None,
     rerun: Annotated[Path | None, _to("--rerun")] = None,
     in_place: Annotated[bool, typer.Option("--in-place", help="Write the labels into the HDF5 file itself.")] = False,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Let --out replace a file that is no labelled copy of DEMOS.")
-    ] = False,
     same_order: Annotated[
         bool,
         typer.Option(
@@ -181,16 +202,10 @@ def segment(
             help="Leave demonstrations out of --mimicgen and --isaac if their options follow another order than most.",
         ),
     ] = False,
-    level: Annotated[
-        str | None, typer.Option(help="The level that gives the subtasks; the lowest by default.", show_default=False)
-    ] = None,
+    level: Annotated[str | None, typer.Option(help="The level that gives the subtasks; the lowest by default.")] = None,
     fps: Annotated[
         float | None,
-        typer.Option(
-            min=0.001,
-            help="Steps per second; by default the control frequency that DEMOS says.",
-            show_default=False,
-        ),
+        typer.Option(min=0.001, help="Steps per second; by default the control frequency that DEMOS says."),
     ] = None,
     baselines: Annotated[
         bool,
@@ -210,12 +225,10 @@ def segment(
 
     DEMOS is changed with --in-place only.
     """
-    each = zip(
-        FORMATS,
-        (html, csv, parquet, out, lerobot, sarm, mimicgen, isaac, label_studio, elan, rerun),
-        strict=True,
+    paths = zip(
+        FORMATS, (html, csv, parquet, out, lerobot, sarm, mimicgen, isaac, label_studio, elan, rerun), strict=True
     )
-    places = [Output(option, path, FORMATS[option].kind) for option, path in each if path]
+    places = [Output(option, path, FORMATS[option].kind) for option, path in paths if path]
     if not (places or in_place or baselines):
         raise BadInput(
             "name what to write, such as --html PAGE or --csv FILE; labels for each step go to --out FILE (a copy) or "
@@ -239,15 +252,17 @@ def segment(
         raise BadInput(f"--level: there is no level {level!r} (there is: {', '.join(fit.names)})")
     with open_source(demos) as source, console.Progress("segmenting") as progress:
         beside = baseline_labels(fit) if baselines else ()
-        asked = Asked(fit, run, demos, source, level or next(iter(fit.names), ""), beside, overwrite, same_order)
-        writers = [writer_of(place, asked) for place in places]
+        subtasks = level or next(iter(fit.names), "")
+        asked = [
+            Asked(place.option, place.path, fit, run, demos, source, subtasks, beside, same_order) for place in places
+        ]
         if fit.names:  # without options, segments() refuses the run
-            for writer in writers:
-                writer.check()
+            for each in asked:
+                check_format(each)
         missing = _missing_labels(fit, source) if baselines else ""
         if baselines:
             check_installed(BASELINES)
-            if missing and not writers:
+            if missing and not asked:
                 raise BadInput(f"--baselines: {missing}; name what to write, such as --html PAGE")
         segmented = segments(fit, source, progress, intervals=html is not None)
         segmented = replace(segmented, frequency=fps or segmented.frequency)
@@ -260,27 +275,37 @@ def segment(
                     console.say(said)
             if missing:
                 print(f"--baselines: {missing}; no agreement is measured")
-        for writer in writers:
-            print(writer.write(segmented))
+        for each in asked:
+            print(write_format(each, segmented))
 
 
-def writer_of(place: Output, asked: Asked) -> Writer:
-    """What writes a format's file or folder.
+def check_format(asked: Asked) -> None:
+    """Check, before anything is segmented, that a format can be written.
 
-    :raises BadInput: the format copies other demonstrations, or a package that it needs is missing.
+    :raises BadInput: the format copies other demonstrations, its place is taken, or a package that it needs is missing.
     """
-    form = FORMATS[place.option.replace("--in-place", "--out")]
+    form = format_of(asked.option)
     if form.takes not in ("", asked.source.format):
         raise BadInput(
-            f"{asked.demos}: is no {TAKEN[form.takes]}, which {place.option} needs; name another format, such as --csv "
+            f"{asked.demos}: is no {TAKEN[form.takes]}, which {asked.option} needs; name another format, such as --csv "
             "or --html"
         )
-    try:
-        kind = resolve_name(f"ddco_pyro.segmenting.formats.{form.writer}")
-    except ModuleNotFoundError as error:
-        raise BadInput(f"{place.option} needs {error.name}; install it with: pip install {error.name}") from None
-    writer: Writer = kind(place.option, place.path, asked)
-    return writer
+    if form.extra and find_spec(PACKAGES[form.extra]) is None:
+        remedy = f"install it with: pip install 'ddco-pyro[{form.extra}]'"
+        raise BadInput(f"{asked.option} needs {PACKAGES[form.extra]}; {remedy}")
+    if form.check:
+        resolve_name(f"ddco_pyro.segmenting.formats.{form.check}")(asked)
+
+
+def write_format(asked: Asked, segmented: Segmented) -> str:
+    """Write segments in a format, and say what was written."""
+    said: str = resolve_name(f"ddco_pyro.segmenting.formats.{format_of(asked.option).write}")(asked, segmented)
+    return said
+
+
+def format_of(option: str) -> Format:
+    """The format of an option; ``--in-place`` writes what ``--out`` does."""
+    return FORMATS[option.replace("--in-place", "--out")]
 
 
 def _missing_labels(fit: Fit, source: Source) -> str:
@@ -297,10 +322,9 @@ def _missing_labels(fit: Fit, source: Source) -> str:
 
 def export(
     run: RunPath,
-    out: Annotated[Path | None, written(out_folder, "The folder to write.", show_default=False)] = None,
+    out: Annotated[Path | None, written(out_folder, "The folder to write.")] = None,
     lerobot: Annotated[
-        Path | None,
-        written(out_folder, "The folder of a LeRobot policy, for lerobot_policy_ddco.", show_default=False),
+        Path | None, written(out_folder, "The folder of a LeRobot policy, for lerobot_policy_ddco.")
     ] = None,
     best: Best = False,
     onnx: Annotated[

@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from ddco_pyro.cli import demos, fits, going_on, out_folder, runs, written
+from ddco_pyro.cli import demos, fits, out_folder, runs, written
 from ddco_pyro.data.files import Output, check_outputs
 from ddco_pyro.errors import BadInput, Failed, command
 from ddco_pyro.spec import load_spec
@@ -23,7 +23,7 @@ Show = Annotated[
 
 
 def new(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="An HDF5 file of demonstrations.", show_default=False)],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="An HDF5 file of demonstrations.")],
     out: Annotated[Path | None, written(out_folder, "The folder to write to; by default runs/FILE.")] = None,
     show: Show = True,
 ) -> None:
@@ -45,11 +45,9 @@ def new(
     else:
         _say("init", file, "--out", spec)
         folder.mkdir(parents=True, exist_ok=True)
-        with going_on():
-            demos.init(file, spec)
+        demos.write_spec(file, spec)
     _say("fit", spec, "--out", run)
-    with going_on():
-        fits.fit(spec, run, resume=True)
+    fits.fit_and_report(load_spec(spec), spec, run, resume=True)
     _say("segment", run, file, "--html", page)
     runs.segment(run=run, demos=file, html=page)
     if show and sys.stdout.isatty() and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
@@ -93,8 +91,7 @@ def demo(
     (point,) = (point for point in entry_points(group="ddco_pyro.tasks") if point.name == TASK)
     with as_file(files(point.module) / "demo.yaml") as spec:
         _say("fit", spec, "--out", out)
-        with going_on():
-            fits.fit(spec, out, resume=True)
+        fits.fit_and_report(load_spec(spec), spec, out, resume=True)
     _say("rollout", out)
     runs.rollout(out, resume=True)
 

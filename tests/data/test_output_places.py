@@ -55,7 +55,7 @@ class Command(NamedTuple):
 
 COMMANDS = {
     "segment --csv": Command("segment run demos.hdf5 --csv", "demos.hdf5"),
-    "segment --out": Command("segment run demos.hdf5 --overwrite --out", "demos.hdf5"),
+    "segment --out": Command("segment run demos.hdf5 --out", "demos.hdf5"),
     "segment --elan": Command("segment run demos.hdf5 --elan", "run", folder=True),
     "export": Command("export run --out", "run", folder=True),
     "compare": Command("compare run run/baselines/flat --out", "run", folder=True),
@@ -144,32 +144,25 @@ def test_a_link_is_kept(toy_run, file: Path, tmp_path: Path) -> None:
     assert (tmp_path / "there.csv").read_text().startswith("<!doctype html>")
 
 
-def segment(run: Path, file: Path, out: Path, *more: str) -> Ended:
-    return call("segment", run, file, "--out", out, *more)
+def segment(run: Path, file: Path, out: Path) -> Ended:
+    return call("segment", run, file, "--out", out)
 
 
-def test_another_file_is_replaced_only_where_that_is_said(toy_run, file: Path, tmp_path: Path) -> None:
+def test_no_file_but_a_labelled_copy_is_replaced(toy_run, file: Path, tmp_path: Path) -> None:
     """A file of somebody else, and a labelled copy of other demonstrations."""
     other, copy = tmp_path / "other.hdf5", tmp_path / "copy.hdf5"
     Demonstrations(Demonstrations.read(file, labels=["phase"]).demonstrations[:9]).write(other)
     assert segment(toy_run.folder, other, copy).status == 0
     for there in (other, copy):
         before = there.read_bytes()
-        says = f"--out {there}: exists and is not a labelled copy of {file}; choose another --out, or replace"
+        says = f"--out {there}: exists and is not a labelled copy of {file}; choose another --out, or remove it"
         refused(segment(toy_run.folder, file, there), says)
         assert there.read_bytes() == before
-        ended = segment(toy_run.folder, file, there, "--overwrite")
-        assert ended.status == 0, ended.err
-        assert len(Demonstrations.read(there, labels=["option"])) == 12
 
 
-def test_a_copy_is_renewed_where_its_file_has_changed(toy_run, file: Path, tmp_path: Path) -> None:
-    """Even where no label is another, and the copy is larger than the file."""
+def test_a_labelled_copy_is_replaced(toy_run, file: Path, tmp_path: Path) -> None:
     copy = tmp_path / "copy.hdf5"
     assert segment(toy_run.folder, file, copy).status == 0
-    before = copy.stat().st_ino, copy.stat().st_mtime_ns
-    assert segment(toy_run.folder, file, copy).status == 0
-    assert (copy.stat().st_ino, copy.stat().st_mtime_ns) == before  # nothing has changed
     with h5py.File(file, "r+") as opened:
         opened["data/demo_0"].attrs["note"] = "seen"
     assert segment(toy_run.folder, file, copy).status == 0

@@ -18,6 +18,7 @@ import pyarrow.parquet as parquet
 import pytest
 from command_line import call
 
+from ddco_pyro.cli.runs import check_format, write_format
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.importing import import_demonstrations
 from ddco_pyro.data.planted import pick_and_place
@@ -26,10 +27,6 @@ from ddco_pyro.errors import BadInput
 from ddco_pyro.exporting.runner import Runner
 from ddco_pyro.segmenting import LevelLabels, Segmented, Segments
 from ddco_pyro.segmenting.formats import Asked
-from ddco_pyro.segmenting.formats.annotations import ELAN, LabelStudio
-from ddco_pyro.segmenting.formats.lerobot import SARM, Annotated
-from ddco_pyro.segmenting.formats.mimicgen import Isaac, MimicGen
-from ddco_pyro.segmenting.formats.tables import CSV
 
 HERE = Path(__file__).parents[1]
 NAMES = ("control", "place", "reach", "grasp")
@@ -78,15 +75,15 @@ class Planted:
         edges = [0, *(np.flatnonzero(np.diff(options)) + 1), len(options)]
         return [(NAMES[options[a]], int(a), int(b)) for a, b in pairwise(edges)]
 
-    def write(self, kind, name, option="--option", demos=None, **more):
-        """What a writer writes, checked as the command checks it before."""
+    def write(self, option, name, demos=None, **more):
+        """What is written in a format, checked as the command checks it before."""
         spec = SimpleNamespace(demonstrations=SimpleNamespace(path=None, exclude=()))
         fit = SimpleNamespace(names={"skill": NAMES}, spec=spec)
         out, demos = self.folder / name, demos or self.file
         with open_source(demos) as source:
-            writer = kind(option, out, Asked(fit, self.folder / "run", demos, source, "skill", **more))
-            writer.check()
-            self.said = writer.write(self.segmented)
+            asked = Asked(option, out, fit, self.folder / "run", demos, source, "skill", **more)
+            check_format(asked)
+            self.said = write_format(asked, self.segmented)
         return out
 
 
@@ -98,8 +95,8 @@ def planted(tmp_path):
 # --- MimicGen and Isaac Lab Mimic -------------------------------------------------------------------------------------
 
 PREPARED = {
-    MimicGen: ("datagen_info", ("eef_pose", "object_poses/cube", "target_pose", "gripper_action")),
-    Isaac: ("obs/datagen_info", ("eef_pose/arm", "object_pose/cube", "target_eef_pose/arm")),
+    "--mimicgen": ("datagen_info", ("eef_pose", "object_poses/cube", "target_pose", "gripper_action")),
+    "--isaac": ("obs/datagen_info", ("eef_pose/arm", "object_pose/cube", "target_eef_pose/arm")),
 }
 
 
@@ -136,7 +133,7 @@ def spans(signals, subtasks, steps):
     return list(pairwise([0, *stops, steps]))
 
 
-@pytest.mark.parametrize("kind", [MimicGen, Isaac])
+@pytest.mark.parametrize("kind", ["--mimicgen", "--isaac"])
 def test_signals_give_the_true_ends_of_subtasks_back(planted, kind):
     prepare(planted, kind)
     with h5py.File(planted.write(kind, "copy.hdf5")) as copy, h5py.File(planted.file) as file:
@@ -155,15 +152,15 @@ def test_signals_give_the_true_ends_of_subtasks_back(planted, kind):
 
 def test_an_order_that_differs_is_refused_or_left_out(tmp_path):
     planted = Planted(tmp_path, OTHER)
-    prepare(planted, MimicGen)
+    prepare(planted, "--mimicgen")
     with pytest.raises(BadInput) as refused:
-        planted.write(MimicGen, "copy.hdf5", "--mimicgen")
+        planted.write("--mimicgen", "copy.hdf5")
     assert str(refused.value) == (
         "--mimicgen: demo_3: its subtasks are reach, place, reach, place, and those of 3 of 4 demonstrations are "
         "reach, grasp, place; --same-order leaves such demonstrations out (1 of 4)"
     )
     assert not (tmp_path / "copy.hdf5").exists()
-    with h5py.File(planted.write(MimicGen, "copy.hdf5", same_order=True)) as copy:
+    with h5py.File(planted.write("--mimicgen", "copy.hdf5", same_order=True)) as copy:
         assert set(copy["data"]) == {"demo_0", "demo_1", "demo_2"}
         assert list(copy["mask/train"]) == [b"demo_0"]
         assert copy["data"].attrs["total"] == sum(map(len, planted.options[:3]))
@@ -172,8 +169,8 @@ def test_an_order_that_differs_is_refused_or_left_out(tmp_path):
 
 def test_a_subtask_that_occurs_twice_has_a_number(tmp_path):
     planted = Planted(tmp_path, [[(2, 3), (3, 2), (2, 2), (1, 4)]] * 2)
-    prepare(planted, MimicGen)
-    with h5py.File(planted.write(MimicGen, "copy.hdf5")) as copy:
+    prepare(planted, "--mimicgen")
+    with h5py.File(planted.write("--mimicgen", "copy.hdf5")) as copy:
         signals = copy["data/demo_1/datagen_info/subtask_term_signals"]
         found = spans(signals, ["reach", "grasp", "reach_2", "place"], 11)
     assert found == [(0, 3), (3, 5), (5, 7), (7, 11)]
@@ -188,18 +185,20 @@ def test_a_subtask_that_occurs_twice_has_a_number(tmp_path):
 )
 def test_ends_that_no_signal_can_mark_are_refused(tmp_path, plan, message):
     planted = Planted(tmp_path, plan)
-    prepare(planted, MimicGen)
+    prepare(planted, "--mimicgen")
     with pytest.raises(BadInput, match=message):
-        planted.write(MimicGen, "copy.hdf5", same_order=True)
+        planted.write("--mimicgen", "copy.hdf5", same_order=True)
     assert not (tmp_path / "copy.hdf5").exists()
 
 
-@pytest.mark.parametrize(("kind", "first"), [(MimicGen, "datagen_info/eef_pose"), (Isaac, "obs/datagen_info/eef_pose")])
+@pytest.mark.parametrize(
+    ("kind", "first"), [("--mimicgen", "datagen_info/eef_pose"), ("--isaac", "obs/datagen_info/eef_pose")]
+)
 def test_a_file_that_is_not_prepared_is_refused(planted, kind, first):
     with pytest.raises(BadInput) as refused:
         planted.write(kind, "copy.hdf5")
     said = str(refused.value)
-    assert f"demo_0: has no {first}, so the file is not prepared for" in said
+    assert f"demo_0: has no {PREPARED[kind][0]}/eef_pose, so the file is not prepared for" in said
     assert said.count("\n") == 0
 
 
@@ -242,7 +241,7 @@ def test_damaged_annotations_are_one_line(dataset, text):
 
 def test_the_stages_of_sarm(tmp_path):
     planted = Planted(tmp_path, OF_DATASET)
-    out = planted.write(SARM, "dataset", demos=LEROBOT)
+    out = planted.write("--sarm", "dataset", demos=LEROBOT)
     rows = parquet.read_table(next((out / "meta" / "episodes").rglob("*.parquet"))).to_pylist()
     for number, row in enumerate(rows):
         stages = zip(*(row[f"dense_subtask_{key}"] for key in ("names", "start_frames", "end_frames")), strict=True)
@@ -256,26 +255,24 @@ def test_the_stages_of_sarm(tmp_path):
 def test_a_copy_of_a_dataset_gets_stages_beside_its_subtasks(tmp_path):
     """And existing stages are replaced."""
     planted = Planted(tmp_path, OF_DATASET)
-    first = planted.write(Annotated, "first", demos=LEROBOT)
-    second = planted.write(SARM, "second", demos=first)
-    third = planted.write(SARM, "third", demos=second)
+    first = planted.write("--lerobot", "first", demos=LEROBOT)
+    second = planted.write("--sarm", "second", demos=first)
+    third = planted.write("--sarm", "third", demos=second)
     assert (second / "meta" / "lerobot_annotations.json").read_text() == (
         first / "meta" / "lerobot_annotations.json"
     ).read_text()
     names = [parquet.read_schema(next((one / "meta" / "episodes").rglob("*.parquet"))).names for one in (second, third)]
     assert names[0] == names[1]
-    with pytest.raises(BadInput, match="lies in the dataset; choose another --option"):
-        planted.write(SARM, "first/inside", demos=first)
     (tmp_path / "taken").mkdir()
-    with pytest.raises(BadInput, match="taken: exists; choose another --option"):
-        planted.write(SARM, "taken", demos=first)
+    with pytest.raises(BadInput, match="taken: exists; remove it, or choose another --sarm"):
+        planted.write("--sarm", "taken", demos=first)
 
 
 # --- annotation tools -------------------------------------------------------------------------------------------------
 
 
 def test_predictions_for_label_studio(planted):
-    out = planted.write(LabelStudio, "studio")
+    out = planted.write("--label-studio", "studio")
     for number, task in enumerate(json.loads((out / "tasks.json").read_text())):
         (prediction,) = task["predictions"]
         values = [region["value"] for region in prediction["result"]]
@@ -292,7 +289,7 @@ def test_predictions_for_label_studio(planted):
 
 
 def test_annotations_for_elan(planted):
-    out = planted.write(ELAN, "elan")
+    out = planted.write("--elan", "elan")
     for number in range(3):
         document = ElementTree.parse(out / f"demo_{number}.eaf")
         times = {slot.get("TIME_SLOT_ID"): int(slot.get("TIME_VALUE")) for slot in document.iter("TIME_SLOT")}
@@ -314,28 +311,25 @@ TOOLS = Path(os.environ.get("DDCO_PYRO_TOOLS", HERE.parent / ".venv-tools")) / "
 @pytest.mark.slow
 @pytest.mark.skipif(not TOOLS.exists(), reason="the tools are not installed: make tools")
 @pytest.mark.parametrize(
-    ("form", "kind", "plan"),
+    ("form", "plan"),
     [
-        ("lerobot", "lerobot:Annotated", OF_DATASET),
-        ("sarm", "lerobot:SARM", OF_DATASET),
-        ("mimicgen", "mimicgen:MimicGen", ORDERED),
-        ("isaac", "mimicgen:Isaac", ORDERED),
-        ("label_studio", "annotations:LabelStudio", OTHER),
-        ("elan", "annotations:ELAN", OTHER),
-        ("rerun", "annotations:Rerun", OTHER),
+        ("lerobot", OF_DATASET),
+        ("sarm", OF_DATASET),
+        ("mimicgen", ORDERED),
+        ("isaac", ORDERED),
+        ("label-studio", OTHER),
+        ("elan", OTHER),
+        ("rerun", OTHER),
     ],
 )
-def test_the_tool_reads_what_was_planted(tmp_path, form, kind, plan):
+def test_the_tool_reads_what_was_planted(tmp_path, form, plan):
     if form == "rerun":
         pytest.importorskip("rerun")
-    planted = Planted(tmp_path, plan)
-    module, _, name = kind.partition(":")
-    writer = getattr(import_module(f"ddco_pyro.segmenting.formats.{module}"), name)
-    if writer in PREPARED:
-        prepare(planted, writer)
-    out = planted.write(writer, "out", demos=LEROBOT if plan is OF_DATASET else None)
-    table = planted.write(CSV, "table.csv")
-    in_tools("read_formats.py", form, out, table, "skill")
+    planted, option = Planted(tmp_path, plan), f"--{form}"
+    if option in PREPARED:
+        prepare(planted, option)
+    out = planted.write(option, "out", demos=LEROBOT if plan is OF_DATASET else None)
+    in_tools("read_formats.py", form.replace("-", "_"), out, planted.write("--csv", "table.csv"), "skill")
 
 
 def in_tools(script, *arguments):

@@ -1,8 +1,11 @@
-"""Writers of segments: a class for each, in modules of their own; ``FORMATS`` of ``cli/runs.py`` lists them."""
+"""Writers of segments: functions in modules of their own; ``FORMATS`` of ``cli/runs.py`` lists them.
+
+``write(asked, segmented)`` writes a file or folder, whole or not at all, and returns in words what was written.
+``check(asked)`` of some formats refuses demonstrations or an existing place before anything is segmented.
+"""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -21,71 +24,53 @@ Run = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class Asked:
-    """The arguments of ``segment`` that writers use.
+    """The arguments of ``segment`` that a format uses.
 
+    :param option: the option of ``segment`` that asks for the format, such as ``--csv``.
+    :param out: the file or folder to write.
     :param demos: the path of the demonstrations; ``source`` is the same, open.
     :param level: the level whose options are subtasks.
     :param baselines: names of further labels, ``<level>_<baseline>``.
-    :param overwrite: replace a file that is no labelled copy of the demonstrations.
     :param same_order: leave out demonstrations whose options follow another order than most, rather than refuse.
     """
 
+    option: str
+    out: Path
     fit: Fit
     run: Path
     demos: Path
     source: Source
     level: str
     baselines: tuple[str, ...] = ()
-    overwrite: bool = False
     same_order: bool = False
 
     @cached_property
     def names(self) -> list[str]:
         """The subtask of each choice of the level, control (0) first."""
-        names = self.fit.names[self.level]
-        return [name_in_level(option, self.level, names) for option in range(len(names))]
+        return self.names_of(self.level)
 
-
-class Writer(ABC):
-    """Writes segments in one format.
-
-    :param option: the option of ``segment`` that asks for it, such as ``--csv``.
-    """
-
-    def __init__(self, option: str, out: Path, asked: Asked) -> None:
-        self.option, self.out, self.asked = option, out, asked
-
-    def check(self) -> None:  # noqa: B027  (most formats refuse nothing)
-        """Refuse, before any demonstration is segmented, a file or folder that cannot be written.
-
-        :raises BadInput: the demonstrations or the existing ``out`` do not fit the format.
-        """
-
-    @abstractmethod
-    def write(self, segmented: Segmented) -> str:
-        """Write the file or folder, whole or not at all.
-
-        :return: what was written, for the console.
-        :raises BadInput: the segments cannot be written in this format.
-        """
+    def names_of(self, level: str) -> list[str]:
+        """The name of each choice of a level, control (0) first."""
+        names = self.fit.names[level]
+        return [name_in_level(option, level, names) for option in range(len(names))]
 
     def runs(self, demo: Segments) -> list[Run]:
         """The subtasks of a demonstration: its level's options, where the same option chosen anew stays one run.
 
         There is none where a person left steps open.
         """
-        return [run for run in demo.levels[self.asked.level].runs(anew=False) if run[0] != UNKNOWN]
+        return [run for run in demo.levels[self.level].runs(anew=False) if run[0] != UNKNOWN]
 
-    def source(self, demo: Segments, start: int, stop: int) -> str | None:
+    def said_by(self, demo: Segments, start: int, stop: int) -> str | None:
         """Who says what steps of the level are, one of :data:`~ddco_pyro.segmenting.SOURCES`; None without a person."""
-        known = demo.baselines.get(self.asked.level + SOURCE)
+        known = demo.baselines.get(self.level + SOURCE)
         return None if known is None else SOURCES[known[start:stop].min()]
 
     def order(self, segmented: Segmented) -> list[int]:
         """The options that are active at all, by how far through a demonstration they are active on average."""
         places: dict[int, list[float]] = {}
         for demo in segmented.segments:
-            options = demo.levels[self.asked.level].options
+            options = demo.levels[self.level].options
             for option in np.unique(options[options != UNKNOWN]).tolist():
                 places.setdefault(option, []).append(float(np.flatnonzero(options == option).mean()) / len(options))
         return sorted(places, key=lambda option: float(np.mean(places[option])))

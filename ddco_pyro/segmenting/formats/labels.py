@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from ddco_pyro.data.labels import BOUNDARY, LABEL_NAMES, SOURCE, label_names
 from ddco_pyro.errors import BadInput
 from ddco_pyro.names import choice_names
 from ddco_pyro.segmenting import Segmented, Segments, chosen_names
-from ddco_pyro.segmenting.formats import Writer
+from ddco_pyro.segmenting.formats import Asked
 
 OURS = "segmented_by"
 """Attribute of labels written by this library; other labels are never replaced."""
@@ -26,7 +27,7 @@ OURS = "segmented_by"
 SIGNATURE = "ddco-pyro"
 
 COPIED = "segmented_from"
-"""Attribute of a labelled copy: digests of the file that was copied."""
+"""Attribute of a labelled copy: a digest of the path that was copied."""
 
 
 def labels_of(demo: Segments) -> dict[str, np.ndarray]:
@@ -43,18 +44,20 @@ def labels_of(demo: Segments) -> dict[str, np.ndarray]:
     return labels
 
 
-class Labels(Writer):
+def check(asked: Asked) -> None:
+    """Check that the labels can be written into the file, or into a copy of it.
+
+    :raises BadInput: the copy's place is taken, or a demonstration has labels of that name from another source.
+    """
+    if not _same(asked.out, asked.demos):
+        check_copy(asked.demos, asked.out)
+    check_labels(asked.demos, [*asked.fit.names, *asked.baselines], chosen_names(asked.source, asked.fit))
+
+
+def write(asked: Asked, segmented: Segmented) -> str:
     """``labels/<level>`` and ``labels/<level>_boundary`` of every level, in a copy or in the file itself."""
-
-    def check(self) -> None:
-        fit, demos = self.asked.fit, self.asked.demos
-        if not (self.asked.overwrite or _same(self.out, demos)):
-            check_copy(demos, self.out)
-        check_labels(demos, [*fit.names, *self.asked.baselines], chosen_names(self.asked.source, fit))
-
-    def write(self, segmented: Segmented) -> str:
-        write_labels(self.asked.demos, self.out, segmented)
-        return f"{self.out}: labels/{', labels/'.join([*segmented.counts, *segmented.segments[0].baselines])}"
+    write_labels(asked.demos, asked.out, segmented)
+    return f"{asked.out}: labels/{', labels/'.join([*segmented.counts, *segmented.segments[0].baselines])}"
 
 
 def check_labels(path: Path, given: Iterable[str], names: Iterable[str]) -> None:
@@ -80,22 +83,16 @@ def check_copy(path: Path, out: Path) -> None:
 
     :raises BadInput: ``out`` is something else.
     """
-    if out.exists() and _copied_from(out)[:1] != _version(path)[:1]:
-        raise BadInput(
-            f"--out {out}: exists and is not a labelled copy of {path}; choose another --out, or replace the file with "
-            "--overwrite"
-        )
+    if out.exists() and _copied_from(out) != _digest(path):
+        raise BadInput(f"--out {out}: exists and is not a labelled copy of {path}; choose another --out, or remove it")
 
 
 def write_labels(path: Path, out: Path, segmented: Segmented) -> None:
     """Write the labels into ``out``, which is ``path`` itself or becomes a copy of it, whole or not at all.
 
-    Labels of the same name are replaced. The names of options become names of their labels. A file that has these very
-    labels and names is not written again. For a copy, ``path`` must also be unchanged since it was copied.
+    Labels of the same name are replaced. The names of options become names of their labels.
     """
     in_place = _same(out, path)
-    if (in_place or _copied_from(out) == _version(path)) and has_labels(out, segmented):
-        return
     with whole_file(out) as temporary:
         shutil.copyfile(path, temporary)
         with written(temporary, "r+") as file:
@@ -112,7 +109,7 @@ def write_labels(path: Path, out: Path, segmented: Segmented) -> None:
                 holder = file if LABEL_NAMES in file.attrs else file["data"]
                 holder.attrs[LABEL_NAMES] = json.dumps(names)
             if not in_place:
-                file.attrs[COPIED] = _version(path)
+                file.attrs[COPIED] = _digest(path)
 
 
 def _names(segmented: Segmented) -> dict[str, list[str]]:
@@ -126,20 +123,15 @@ def _same(out: Path, path: Path) -> bool:
     return out.exists() and out.samefile(path)
 
 
-def _version(path: Path) -> list[str]:
-    """Digests of a file's path, and of its size and time."""
-    stat = path.stat()
-    facts = (str(path.resolve()), f"{stat.st_size} {stat.st_mtime_ns}")
-    return [hashlib.sha256(os.fsencode(fact)).hexdigest() for fact in facts]
+def _digest(path: Path) -> str:
+    return hashlib.sha256(os.fsencode(path.resolve())).hexdigest()
 
 
-def _copied_from(copy: Path) -> list[str]:
-    """The :func:`_version` of the file that a labelled copy was made of; empty for other files."""
-    try:
-        with opened(copy) as file:
-            return [str(digest) for digest in np.ravel(file.attrs.get(COPIED, []))]
-    except DemonstrationsError:
-        return []
+def _copied_from(copy: Path) -> str | None:
+    """The :func:`_digest` of the file that a labelled copy was made of; None for other files."""
+    with suppress(DemonstrationsError), opened(copy) as file:
+        return str(file.attrs.get(COPIED))
+    return None
 
 
 def has_labels(path: Path, segmented: Segmented) -> bool:

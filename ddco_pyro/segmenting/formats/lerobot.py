@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import filecmp
 import json
 import os
 import shutil
-from abc import abstractmethod
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, ClassVar
 
 import numpy as np
 import pyarrow
@@ -23,11 +20,10 @@ from ddco_pyro.data.sources.lerobot import ANNOTATIONS, SUBTASK, LeRobot
 from ddco_pyro.data.sources.metadata import inside
 from ddco_pyro.errors import BadInput
 from ddco_pyro.segmenting import Segmented
-from ddco_pyro.segmenting.formats import Run, Writer
+from ddco_pyro.segmenting.formats import Asked, Run
 
 PERSISTENT, EVENTS = "language_persistent", "language_events"
 ATOM = ("role", "content", "style", "timestamp", "tool_calls")
-INFO = Path("meta") / "info.json"
 
 
 @dataclass(frozen=True)
@@ -36,7 +32,7 @@ class Subtasks:
 
     :param names: the subtask of each choice, control (0) first.
     :param runs: the subtasks of each episode, by its index.
-    :param order: the choices that occur, in the order of :meth:`Writer.order`.
+    :param order: the choices that occur, in the order of :meth:`Asked.order`.
     """
 
     names: list[str]
@@ -48,63 +44,48 @@ class Subtasks:
         return np.concatenate([np.full(stop - start, option) for option, start, stop in self.runs[episode]])
 
 
-class Copy(Writer):
-    """A copy of a LeRobot dataset with subtasks.
+FEATURES = {name: {"dtype": "language", "shape": [1], "names": None} for name in (PERSISTENT, EVENTS)}
+"""The entries of the columns of :func:`write_subtasks` in ``meta/info.json``."""
 
-    Videos are hard links where the file system has them, else copies. A folder that has these very subtasks is not
-    written again.
+
+def check(asked: Asked) -> None:
+    """Check that nothing is where the copy is to be.
+
+    :raises BadInput: something is.
     """
-
-    features: ClassVar[Mapping[str, Any]] = {}
-    """The entries of new columns of frames in ``meta/info.json``."""
-
-    def check(self) -> None:
-        source = LeRobot(self.asked.demos)
-        if self.features and {SUBTASK, PERSISTENT} & source.features.keys():
-            raise BadInput(f"{source.folder}: has subtasks already; name a dataset without them")
-        if self.out.resolve().is_relative_to(source.folder.resolve()):
-            raise BadInput(f"{self.out}: lies in the dataset; choose another {self.option}")
-        info = self.out / INFO
-        if self.out.exists() and not (info.is_file() and info.read_text(encoding="utf-8") == self._info(source)):
-            raise self._taken()
-
-    def write(self, segmented: Segmented) -> str:
-        source = LeRobot(self.asked.demos)
-        with suppress(_SameFolder), whole_folder(self.out) as temporary:
-            shutil.copytree(
-                source.folder, temporary, dirs_exist_ok=True, copy_function=_link, ignore_dangling_symlinks=True
-            )
-            write_text(temporary / INFO, self._info(source))
-            runs = {int(demo.name.removeprefix("demo_")): self.runs(demo) for demo in segmented.segments}
-            self.add(LeRobot(temporary), Subtasks(self.asked.names, runs, self.order(segmented)))
-            if self.out.exists():
-                raise _SameFolder if _same(self.out, temporary) else self._taken()
-        return str(self.out)
-
-    @abstractmethod
-    def add(self, dataset: LeRobot, subtasks: Subtasks) -> None:
-        """Write the subtasks into the copy."""
-
-    def _info(self, dataset: LeRobot) -> str:
-        """``meta/info.json`` with the subtasks."""
-        return json.dumps({**dataset.info, "features": {**dataset.features, **self.features}}, indent=4) + "\n"
-
-    def _taken(self) -> BadInput:
-        return BadInput(f"{self.out}: exists; choose another {self.option}")
+    if asked.out.exists():
+        raise BadInput(f"{asked.out}: exists; remove it, or choose another {asked.option}")
 
 
-class Annotated(Copy):
+def check_subtasks(asked: Asked) -> None:
+    """The same for a dataset that has no subtasks.
+
+    :raises BadInput: it has.
+    """
+    if {SUBTASK, PERSISTENT} & LeRobot(asked.demos).features.keys():
+        raise BadInput(f"{asked.demos}: has subtasks already; name a dataset without them")
+    check(asked)
+
+
+@contextmanager
+def _copied(asked: Asked, segmented: Segmented) -> Iterator[tuple[LeRobot, Subtasks]]:
+    """A copy that the block adds subtasks to. Videos are hard links where the file system has them, else copies."""
+    with whole_folder(asked.out) as temporary:
+        folder = LeRobot(asked.demos).folder
+        shutil.copytree(folder, temporary, dirs_exist_ok=True, copy_function=_link, ignore_dangling_symlinks=True)
+        runs = {int(demo.name.removeprefix("demo_")): asked.runs(demo) for demo in segmented.segments}
+        yield LeRobot(temporary), Subtasks(asked.names, runs, asked.order(segmented))
+
+
+def write_subtasks(asked: Asked, segmented: Segmented) -> str:
     """Each row holds all subtasks of its episode in ``language_persistent``, as LeRobot 0.6 and newer read them.
 
     A subtask lasts from its ``timestamp``, the time of its first frame, to the next subtask. The page on which
-    LeRobot's users label datasets keeps the same in ``meta/lerobot_annotations.json``.
+    LeRobot's users label datasets keeps the same in ``meta/lerobot_annotations.json``. Each episode has a row group of
+    its own, as in LeRobot's files.
     """
-
-    features: ClassVar = {name: {"dtype": "language", "shape": [1], "names": None} for name in (PERSISTENT, EVENTS)}
-
-    def add(self, dataset: LeRobot, subtasks: Subtasks) -> None:
-        """Add the columns to the data files, one row group for each episode, as LeRobot does; and the annotations."""
-        episodes = {}
+    episodes = {}
+    with _copied(asked, segmented) as (dataset, subtasks):
         for path in dataset.data_files:
             file = inside(dataset.folder, path)
             table = parquet.read_table(file)
@@ -120,6 +101,9 @@ class Annotated(Copy):
             assert writer is not None  # a file of a dataset holds an episode
             writer.close()
         write_text(dataset.folder / ANNOTATIONS, json.dumps({"version": 2, "episodes": episodes}, indent=1) + "\n")
+        info = {**dataset.info, "features": {**dataset.features, **FEATURES}}
+        write_text(dataset.folder / "meta" / "info.json", json.dumps(info, indent=4) + "\n")
+    return str(asked.out)
 
 
 def _episodes(table: pyarrow.Table, subtasks: Subtasks) -> Iterator[tuple[int, pyarrow.Table]]:
@@ -165,11 +149,12 @@ def _columns(times: pyarrow.ChunkedArray, options: np.ndarray, names: list[str])
     }
 
 
-class SARM(Copy):
-    """The stages of SARM, LeRobot's reward model: subtasks of each episode in ``meta/episodes``, ends inclusive."""
+def write_stages(asked: Asked, segmented: Segmented) -> str:
+    """The stages of SARM, LeRobot's reward model: ``dense_subtask_...`` in ``meta/episodes``, ends inclusive.
 
-    def add(self, dataset: LeRobot, subtasks: Subtasks) -> None:
-        """Write the columns ``dense_subtask_...`` of episodes, and each subtask's mean share of an episode in order."""
+    Beside them stands each subtask's mean share of an episode, in order.
+    """
+    with _copied(asked, segmented) as (dataset, subtasks):
         for file in sorted((dataset.folder / "meta" / "episodes").rglob("*.parquet")):
             table = parquet.read_table(file)
             runs = [subtasks.runs[episode] for episode in table["episode_index"].to_pylist()]
@@ -185,28 +170,12 @@ class SARM(Copy):
             known = {key: value for key, value in (table.schema.metadata or {}).items() if key != b"huggingface"}
             file.unlink()  # it may be a link
             parquet.write_table(table.replace_schema_metadata(known), file)
-        shares = np.mean(
-            [
-                np.bincount(options, minlength=len(subtasks.names)) / len(options)
-                for options in map(subtasks.options, subtasks.runs)
-            ],
-            axis=0,
-        )
-        proportions = {subtasks.names[option]: float(shares[option]) for option in subtasks.order}
+        each = [subtasks.options(episode) for episode in subtasks.runs]
+        shares = {option: np.mean([np.mean(options == option) for options in each]) for option in subtasks.order}
+        proportions = {subtasks.names[option]: float(share) for option, share in shares.items()}
         path = dataset.folder / "meta" / "temporal_proportions_dense.json"
         write_text(path, json.dumps(proportions, indent=2, ensure_ascii=False) + "\n")
-
-
-class _SameFolder(Exception):
-    """The folder exists with the same contents."""
-
-
-def _same(one: Path, other: Path) -> bool:
-    """Whether two folders have the same files."""
-    names = [{path.relative_to(folder) for path in folder.rglob("*") if path.is_file()} for folder in (one, other)]
-    return names[0] == names[1] and all(
-        (one / name).samefile(other / name) or filecmp.cmp(one / name, other / name, shallow=False) for name in names[0]
-    )
+    return str(asked.out)
 
 
 def _link(source: str, target: str) -> None:

@@ -11,10 +11,9 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import whole_file
 from ddco_pyro.data.labels import BOUNDARY, SOURCE, UNKNOWN
 from ddco_pyro.drawing.shown import paths_of, stored_pictures
-from ddco_pyro.errors import BadInput
 from ddco_pyro.names import option_name
 from ddco_pyro.segmenting import SOURCES, Segmented, recorded
-from ddco_pyro.segmenting.formats import Writer
+from ddco_pyro.segmenting.formats import Asked
 from ddco_pyro.segmenting.page import followed, write_page
 
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
@@ -27,7 +26,7 @@ def cell(value: Any) -> Any:
 
 
 def columns(segmented: Segmented) -> list[str]:
-    """Names of the columns: of each level the option, whether it is a new choice, probability, name; of baselines, and
+    """Names of the columns: for each level the option, whether it is a new choice, probability, name; of baselines, and
     who says so.
     """
     levels = [f"{name}{suffix}" for name in segmented.counts for suffix in ("", BOUNDARY, "_probability", "_name")]
@@ -54,52 +53,37 @@ def rows(segmented: Segmented) -> Iterator[list[Any]]:
             yield row
 
 
-class CSV(Writer):
+def write_csv(asked: Asked, segmented: Segmented) -> str:
     """The table as CSV."""
-
-    def write(self, segmented: Segmented) -> str:
-        with whole_file(self.out) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            for row in chain([columns(segmented)], rows(segmented)):
-                writer.writerow(map(cell, row))
-        return str(self.out)
+    with whole_file(asked.out) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        for row in chain([columns(segmented)], rows(segmented)):
+            writer.writerow(map(cell, row))
+    return str(asked.out)
 
 
-class Parquet(Writer):
+def write_parquet(asked: Asked, segmented: Segmented) -> str:
     """The table as Parquet, with pyarrow."""
+    import pyarrow
+    from pyarrow import parquet
 
-    def check(self) -> None:
-        try:
-            import pyarrow  # noqa: F401
-        except ImportError:
-            raise BadInput(f"{self.option} needs pyarrow; install it with: pip install 'ddco-pyro[lerobot]'") from None
+    values = zip(*rows(segmented), strict=True)
+    table = pyarrow.table({name: list(column) for name, column in zip(columns(segmented), values, strict=True)})
+    with whole_file(asked.out) as temporary:
+        parquet.write_table(table, temporary)
+    return str(asked.out)
 
-    def write(self, segmented: Segmented) -> str:
-        import pyarrow
-        from pyarrow import parquet
-
-        values = zip(*rows(segmented), strict=True)
-        table = pyarrow.table({name: list(column) for name, column in zip(columns(segmented), values, strict=True)})
-        with whole_file(self.out) as temporary:
-            parquet.write_table(table, temporary)
-        return str(self.out)
-
-
-# --- page -------------------------------------------------------------------------------------------------------------
 
 FIRST = 10
 """Demonstrations among which an observation that moves like a position is sought."""
 
 
-class Page(Writer):
+def write_html(asked: Asked, segmented: Segmented) -> str:
     """The page of :mod:`ddco_pyro.segmenting.page`."""
-
-    def write(self, segmented: Segmented) -> str:
-        asked = self.asked
-        pictures = stored_pictures(asked.source, {demo.name: len(demo) for demo in segmented.segments})
-        demos = recorded(segmented, asked.fit, asked.source)
-        first = list(islice(demos, FIRST))
-        paths = paths_of(asked.fit.spec.report.trajectory, Demonstrations(tuple(first)))
-        follows = followed(chain(first, demos), pictures, segmented, paths)
-        write_page(self.out, segmented, str(asked.run), str(asked.demos), follows)
-        return str(self.out)
+    pictures = stored_pictures(asked.source, {demo.name: len(demo) for demo in segmented.segments})
+    demos = recorded(segmented, asked.fit, asked.source)
+    first = list(islice(demos, FIRST))
+    paths = paths_of(asked.fit.spec.report.trajectory, Demonstrations(tuple(first)))
+    follows = followed(chain(first, demos), pictures, segmented, paths)
+    write_page(asked.out, segmented, str(asked.run), str(asked.demos), follows)
+    return str(asked.out)
