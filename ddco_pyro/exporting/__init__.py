@@ -58,30 +58,20 @@ def export(fit: Fit, folder: str | Path, onnx: bool = False) -> Exported:
     ['numpy']
     """
     folder = Path(folder)
-    if folder.exists() and not folder.is_dir():
-        raise BadInput(f"{folder}: is a file; choose another --out")
-    refuse_others(folder, FILES, "--out")
+    _refuse_others(folder, FILES, "--out")
     with whole_folder(folder) as temporary:
-        return write_verified(fit, temporary, onnx)
+        return _write_verified(fit, temporary, onnx)
 
 
-def refuse_others(folder: Path, names: set[str], option: str) -> None:
-    """Refuse to replace a folder.
+def _refuse_others(folder: Path, names: set[str], option: str) -> None:
+    """Refuse to replace what is no export.
 
     :param names: of the files that an export writes.
-    :raises BadInput: the folder holds other files.
     """
+    if folder.is_file():
+        raise BadInput(f"{folder}: is a file; choose another {option}")
     if folder.exists() and (others := sorted({path.name for path in folder.iterdir()} - names)):
         raise BadInput(f"{folder}: holds what was not exported, such as {others[0]}; choose another {option}")
-
-
-def write_verified(fit: Fit, folder: Path, onnx: bool = False) -> Exported:
-    """Write every file into an empty folder, and verify every form.
-
-    :raises ExportError: a form acts differently, or cannot be made.
-    :raises BadInput: numpy cannot evaluate the networks, and no ONNX is asked for.
-    """
-    return _compare(folder, _write(fit, folder, onnx))
 
 
 def write_numpy(fit: Fit, folder: Path) -> bool:
@@ -109,27 +99,21 @@ def runner_source() -> str:
     return whole.replace("# kinds of control\n", "\n\n".join(sources))
 
 
-def _write(fit: Fit, folder: Path, onnx: bool) -> list[str]:
-    """Write every file; returns the forms that can run."""
+def _write_verified(fit: Fit, folder: Path, onnx: bool = False) -> Exported:
+    """Write every file into an empty folder, and replay recorded episodes with each form that can run."""
     forms = [*(["numpy"] if write_numpy(fit, folder) else []), *(["onnx"] if onnx else [])]
     if not forms:
         raise BadInput(f"{fit.place}: has networks that numpy cannot evaluate; export it with --out and --onnx")
     if onnx:
         (folder / "controller.onnx").write_bytes(_onnx(StepProgram(fit.hierarchy.eval()).eval()))
     episodes = record(fit.controller(), fit.hierarchy)
-    episodes["tolerance"] = np.array(tolerance(fit.hierarchy, episodes))
+    allowed = tolerance(fit.hierarchy, episodes)
+    episodes["tolerance"] = np.array(allowed)
     np.savez_compressed(folder / "check.npz", **episodes)  # type: ignore[arg-type]
-    return forms
-
-
-def _compare(folder: Path, forms: list[str]) -> Exported:
-    """Replay the recorded episodes with each form in the folder."""
-    episodes = runner.read_arrays(folder / "check.npz")
-    allowed = float(episodes["tolerance"])
     replayed = {}
     for form in forms:
         with _one_line_errors(f"as {form} it cannot be run"):
-            replayed[form] = runner.replay(runner.Runner(folder, form), episodes)
+            replayed[form] = runner.replay(runner.Runner(folder, form), runner.read_arrays(folder / "check.npz"))
         difference = replayed[form][0]
         if not difference < allowed:
             cause = "the weights are so large that float32 is too coarse for them" if allowed == MOST else DEFECT
@@ -177,9 +161,9 @@ def export_policy(fit: Fit, folder: Path) -> Exported:
     :raises BadInput: numpy cannot evaluate the networks, or the folder holds other files.
     :raises ExportError: the controller acts differently.
     """
-    refuse_others(folder, FILES | OWN, "--lerobot")
+    _refuse_others(folder, FILES | OWN, "--lerobot")
     with whole_folder(folder) as temporary:
-        exported = write_verified(fit, temporary)
+        exported = _write_verified(fit, temporary)
         about = json.loads((temporary / "controller.json").read_text(encoding="utf-8"))
         step = about["step"] and about["step"]["key"]
         inputs = {
