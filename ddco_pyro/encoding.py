@@ -12,7 +12,6 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any
 
-import h5py
 import numpy as np
 import torch
 from pydantic import ValidationError
@@ -82,8 +81,6 @@ class Backbone:
             timm = "; check the name, the connection, and: pip install 'ddco-pyro[timm]' (torchvision has to fit torch)"
             remedy = timm if module == TIMM else ""
             raise BadInput(f"encoder {name!r} cannot be loaded: {_message(error)}{remedy}") from error
-        if not callable(self._call):
-            raise BadInput(f"encoder {name!r}: cannot be called; it has to be a function of pictures")
 
     @property
     def code(self) -> bytes:
@@ -94,13 +91,12 @@ class Backbone:
     def __call__(self, pictures: np.ndarray) -> np.ndarray:
         """Features of each picture, float32 [N, F]."""
         try:
-            values, count = np.asarray(self._call(pictures)), len(pictures)
+            values = np.asarray(self._call(pictures))
         except Exception as error:
             raise BadInput(f"encoder {self.name!r} fails on pictures {[*pictures.shape]}: {_message(error)}") from error
-        if values.dtype.kind != "f":
-            raise BadInput(f"encoder {self.name!r} gives {values.dtype}; it has to give floats")
-        if values.ndim != 2 or len(values) != count or not values.shape[1]:
-            had = f"shape {values.shape} for {count} pictures; it has to be ({count}, features)"
+        count = len(pictures)
+        if values.dtype.kind != "f" or values.ndim != 2 or len(values) != count or not values.shape[1]:
+            had = f"{values.dtype} {[*values.shape]} for {count} pictures; it has to be floats [{count}, features]"
             raise BadInput(f"encoder {self.name!r} gives {had}")
         values = values.astype(np.float32)
         if not np.isfinite(values).all():
@@ -221,12 +217,6 @@ class Encoder:
         """The backbone's features [T, F] as float32 [T, size]."""
         return features if self.projection is None else self.projection(features)
 
-    def write(self, group: h5py.Group) -> None:
-        """Write the encoder into an empty group; of the backbone the name alone."""
-        group.attrs["about"] = self.about.model_dump_json()
-        if self.projection is not None:
-            group["mean"], group["components"] = self.projection.mean, self.projection.components
-
     @property
     def digest(self) -> str:
         """SHA-256 of what decides the features: facts, the code of a user's module, and the projection."""
@@ -298,18 +288,12 @@ def encode(
         backbone = Backbone(encoder, allow_code)
         number = backbone.try_out(next(_batches(pictures[training[0]])))
         steps = sum(pictures[own].shape[0] for own in training)
-        if size is not None and size > number:
-            raise BadInput(f"--size {size}: encoder {encoder!r} gives {number} features; take at most as many")
-        if size is not None and size > steps:
-            raise BadInput(f"--size {size}: there are {steps} training pictures; take at most as many")
+        if size is not None and size > min(number, steps):
+            there = f"encoder {encoder!r} gives {number} features of {steps} training pictures"
+            raise BadInput(f"--size {size}: {there}; take at most {min(number, steps)}")
         features = dict[str, np.ndarray]()
         for own, array in pictures.items():
             features[own] = np.concatenate([backbone(batch) for batch in _batches(array)])
-            if (there := features[own].shape[1]) != number:
-                raise BadInput(
-                    f"encoder {encoder!r} gives {there} features in {own}, and {number} in {training[0]}; it has to "
-                    "give as many of every picture"
-                )
             on_event(DemonstrationsDone(len(features), len(pictures)))
         projection = None
         if size is not None or number > min(SIZE, steps):
@@ -332,7 +316,10 @@ def encode(
                 write_demonstration(data, Demonstration.stored(**{**vars(demo), "observations": seen}))
             if ENCODERS in before:
                 before.copy(ENCODERS, data.file)
-            made.write(data.file.create_group(f"{ENCODERS}/{key}"))
+            group = data.file.create_group(f"{ENCODERS}/{key}")
+            group.attrs["about"] = about.model_dump_json()
+            if projection is not None:
+                group["mean"], group["components"] = projection.mean, projection.components
     return made
 
 

@@ -174,8 +174,8 @@ OWN = "user_encoders:"
     ("options", "message"),
     [
         (["--observation", "camra"], "there is no observation 'camra' (did you mean 'camera'?); pictures are: camera"),
-        (["--size", "129"], "--size 129: encoder 'user_encoders:means' gives 4 features; take at most as many"),
-        (["--size", "60", "--encoder", PLACES], "--size 60: there are 35 training pictures; take at most as many"),
+        (["--size", "129"], "--size 129: encoder 'user_encoders:means' gives 4 features of 35 training pictures; take"),
+        (["--size", "60", "--encoder", PLACES], "gives 80 features of 35 training pictures; take at most 35"),
         (["--as", "place"], "obs/place is there already; choose another name with --as"),
         (["--encoder", "resnet18"], "there is no encoder 'resnet18'; take timm:NAME, such as timm:resnet18.a1_in1k"),
         (["--encoder", "no_such_module:encoder"], "cannot be loaded: No module named 'no_such_module'"),
