@@ -22,7 +22,7 @@ from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs, States
 from ddco_pyro.model.tables import Step, complete
 from ddco_pyro.names import option_name
-from ddco_pyro.spec import OptionExecution, RolloutSpec
+from ddco_pyro.spec import OptionExecution
 
 ControlExecution = Literal["mean", "sample"]
 
@@ -72,17 +72,6 @@ class Controller:
                 raise BadInput(f"{name}={given!r}: has to be one of {', '.join(get_args(known))}")
         self.control, self.options = control, options
         self.reset(seed)
-
-    @classmethod
-    def from_spec(
-        cls,
-        hierarchy: Hierarchy,
-        spec: RolloutSpec,
-        seed: int = 0,
-        names: Mapping[str, Sequence[str]] = MappingProxyType({}),
-    ) -> Controller:
-        """The controller of a spec's ``rollout`` settings."""
-        return cls(hierarchy, spec.control, spec.options, seed, names)
 
     def reset(self, seed: int = 0) -> None:
         """Begin an episode. Equal seeds and observations give equal controls."""
@@ -147,7 +136,11 @@ class Controller:
             self._choices = self._chosen(now, generators)
             steps = (None if emission is None else emission.steps()[0] for emission in outputs.emissions)
             acting = Acting(tuple(steps), self._choices)
-            control = acting.mode if self.control == "mean" else acting.draw(_noise(generators, acting.noise))
+            if self.control == "mean":
+                control = acting.mode
+            else:
+                noise = [generator.standard_normal(acting.noise) for generator in generators]
+                control = acting.draw(torch.from_numpy(np.stack(noise)))
         rows = torch.arange(len(self.seeds))
         ended = [table[rows, choice, 1].exp() for table, choice in zip(now.termination, self._choices, strict=True)]
         self.all_terminations = _columns(ended, len(self.seeds))
@@ -157,15 +150,11 @@ class Controller:
     def _chosen(self, now: Step, generators: Sequence[np.random.Generator]) -> tuple[Tensor, ...]:
         if self.options == "marginal":
             self._log_marginal = arrive(self._log_marginal, now).message
-            return _largest(self._log_marginal)
-        with MostLikely() if self.options == "most_likely" else Drawn(generators):
+            joint = self._log_marginal.flatten(1).argmax(-1)  # of [N, C_D, ..., C_1]
+            sizes = self._log_marginal.shape[1:]
+            return tuple(reversed(torch.unravel_index(joint, sizes))) if sizes else ()
+        with Chosen(None if self.options == "most_likely" else generators):
             return choose(self.time, now, self._choices)
-
-
-def _largest(joint: Tensor) -> tuple[Tensor, ...]:
-    """The joint choice of the largest of values [N, C_D, ..., C_1], each [N], lowest level first."""
-    sizes = joint.shape[1:]
-    return tuple(reversed(torch.unravel_index(joint.flatten(1).argmax(-1), sizes))) if sizes else ()
 
 
 def _columns(levels: Sequence[Tensor], number: int) -> np.ndarray:
@@ -173,32 +162,24 @@ def _columns(levels: Sequence[Tensor], number: int) -> np.ndarray:
     return np.stack([level.numpy() for level in levels], axis=1) if levels else np.zeros((number, 0))
 
 
-def _noise(generators: Sequence[np.random.Generator], size: int) -> Tensor:
-    """Standard normal numbers for each episode, float64 [N, size]."""
-    return torch.from_numpy(np.stack([generator.standard_normal(size) for generator in generators]))
+class Chosen(Messenger):
+    """Make every sampled choice as exported controllers do.
 
+    :param generators: numpy's, one for each episode; None for the most likely values.
+    """
 
-class MostLikely(Messenger):
-    """Replace every sampled choice by its most likely value."""
-
-    def _pyro_sample(self, message: dict[str, Any]) -> None:
-        distribution: Tabulated = message["fn"]
-        message["value"] = distribution.logits.argmax(-1)
-        message["done"] = True
-
-
-class Drawn(Messenger):
-    """Draw every choice with numpy's generators, one for each episode, as exported controllers do."""
-
-    def __init__(self, generators: Sequence[np.random.Generator]) -> None:
+    def __init__(self, generators: Sequence[np.random.Generator] | None) -> None:
         super().__init__()
         self.generators = generators
 
     def _pyro_sample(self, message: dict[str, Any]) -> None:
         distribution: Tabulated = message["fn"]
-        total = distribution.logits.exp().cumsum(-1)
-        uniform = torch.tensor([[generator.random()] for generator in self.generators], dtype=total.dtype)
-        message["value"] = (total <= uniform * total[..., -1:]).sum(-1)
+        if self.generators is None:
+            message["value"] = distribution.logits.argmax(-1)
+        else:
+            total = distribution.logits.exp().cumsum(-1)
+            uniform = torch.tensor([[generator.random()] for generator in self.generators], dtype=total.dtype)
+            message["value"] = (total <= uniform * total[..., -1:]).sum(-1)
         message["done"] = True
 
 

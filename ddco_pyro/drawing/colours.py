@@ -9,7 +9,6 @@ from ddco_pyro.names import option_name
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-    from matplotlib.patches import Patch
 
 CONTROL = "#9a9a9a"
 
@@ -34,21 +33,16 @@ def option_rgb(choice: int) -> tuple[int, int, int]:
     return red, green, blue
 
 
-def legend(choices: Iterable[int], names: Sequence[str] = ()) -> list[Patch]:
-    """Legend handles that name the colours of choices.
+def add_legend(
+    figure: Figure, choices: Iterable[int], names: Sequence[str] = (), place: str = "outside lower center"
+) -> None:
+    """Name the colours of these choices below a figure, in rows that it has room for.
 
     :param names: of each choice, control first.
     """
     from matplotlib.patches import Patch
 
-    return [Patch(color=option_colour(choice), label=option_name(choice, names)) for choice in choices]
-
-
-def add_legend(
-    figure: Figure, choices: Iterable[int], names: Sequence[str] = (), place: str = "outside lower center"
-) -> None:
-    """Name the colours of these choices below a figure, in rows that it has room for."""
-    handles = legend(sorted(set(choices)), names)
+    handles = [Patch(color=option_colour(choice), label=option_name(choice, names)) for choice in sorted(set(choices))]
     longest = max((len(handle.get_label()) for handle in handles), default=0)  # type: ignore[arg-type]
     columns = max(1, min(len(handles), ROW // (longest + 4)))
     figure.legend(handles=handles, loc=place, ncols=columns, handlelength=1)  # type: ignore[call-overload]

@@ -197,16 +197,9 @@ def _picture(picture: np.ndarray, spec: Mapping[str, Any]) -> np.ndarray:
 
 
 def _resized(picture: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Scaled by the mean over areas.
+    """Scaled by the mean over areas, with opencv-python-headless."""
+    import cv2
 
-    :raises ImportError: there is no cv2.
-    """
-    try:
-        import cv2
-    except ImportError as error:
-        raise ImportError(
-            "pictures are scaled with cv2, which is missing: pip install opencv-python-headless"
-        ) from error
     scaled = cv2.resize(np.ascontiguousarray(picture), (width, height), interpolation=cv2.INTER_AREA)
     return np.asarray(scaled, np.uint8).reshape(height, width, -1)
 

@@ -267,7 +267,7 @@ class Fit:
 
     def controller(self, seed: int = 0) -> Controller:
         """The model as a policy that acts, as the spec's ``rollout`` says."""
-        return Controller.from_spec(self.hierarchy, self.spec.rollout, seed, self.names)
+        return Controller(self.hierarchy, self.spec.rollout.control, self.spec.rollout.options, seed, self.names)
 
     def monitor(self, demos: Iterable[Demonstration] | None = None) -> Monitor:
         """A live monitor of the active options while another policy, or a person, acts.

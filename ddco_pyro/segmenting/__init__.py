@@ -26,18 +26,6 @@ from ddco_pyro.metrics import Scores
 from ddco_pyro.segmenting import baselines
 from ddco_pyro.training.data import train_and_valid
 
-__all__ = [
-    "SOURCES",
-    "LevelLabels",
-    "Segmented",
-    "Segments",
-    "baseline_labels",
-    "beside_baselines",
-    "recorded",
-    "segments",
-]
-
-
 SOURCES = ("open", "proposed", "accepted", "given")
 """Who says what a step is: none, as a person left it open; the model; a person who accepts that; a person."""
 

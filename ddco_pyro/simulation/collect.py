@@ -5,14 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection
 from pathlib import Path
-from typing import Any
 
 from ddco_pyro.data.demonstration import Attribute
 from ddco_pyro.data.demonstrations import DemonstrationsError
 from ddco_pyro.data.files import only_one
-from ddco_pyro.data.hdf5 import attributes_of, opened
+from ddco_pyro.data.hdf5 import opened
 from ddco_pyro.data.sources.robomimic import robomimic_file, write_demonstration
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
@@ -95,12 +94,14 @@ def _record(
     at_once = EPISODES_WITH_PICTURES if task.seen_by_cameras(observed) else spec.count
     seeds = range(spec.seed, spec.seed + spec.count)
     attributes: dict[str, Attribute] = {"task": task.name, "policy": spec.supervisor}
+    outcomes = []
     with robomimic_file(path, attributes, {}) as data:
         for first in range(0, len(seeds), at_once):
             for episode in run_episodes(task_name, spec.supervisor, seeds[first : first + at_once], observed=observed):
                 write_demonstration(data, episode.record)
+                outcomes.append(episode.outcome)
                 on_event(DemonstrationsDone(len(data), spec.count))
-        attributes["supervisor"] = json.dumps(_summary(task, [attributes_of(group) for group in data.values()]))
+        attributes["supervisor"] = json.dumps(summarize(task, outcomes))
 
 
 def _refuse_others(path: Path, task: Task, spec: DemonstrationsSpec) -> None:
@@ -115,14 +116,3 @@ def _refuse_others(path: Path, task: Task, spec: DemonstrationsSpec) -> None:
             raise BadInput(
                 f"{path}: is there already and does not hold these demonstrations; choose another --out or remove it"
             )
-
-
-def _summary(task: Task, demonstrations: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The supervisor's own measures over the recorded episodes, from their attributes."""
-    return summarize(
-        task,
-        [
-            {name: float(value) for name, value in demo.items() if name not in ("seed", "num_samples")}
-            for demo in demonstrations
-        ],
-    )

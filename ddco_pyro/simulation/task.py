@@ -61,7 +61,7 @@ class Task:
         number. By default ``success`` is a rate and every other measure a mean.
     :param cameras: cameras, and encoders of their pictures, by the name of their observation. A camera is drawn only
         where a spec observes it, because a picture takes longer than a step of simulation.
-    :raises OutcomeError: ``measures`` has another kind, or calls ``success`` a mean.
+    :raises BadInput: ``measures`` has another kind, or calls ``success`` a mean.
     """
 
     name: str
@@ -140,7 +140,7 @@ class Task:
     def measured(self, environment: dm_env.Environment) -> dict[str, float]:
         """The ``outcome`` of the episode that just ended.
 
-        :raises OutcomeError: other measures than the declared ones, or a rate that is not 0, 1 or NaN.
+        :raises BadInput: other measures than the declared ones, or a rate that is not 0, 1 or NaN.
         """
         outcome = {name: float(value) for name, value in self.outcome(environment).items()}
         if self.measures and outcome.keys() != self.measures.keys():
@@ -152,16 +152,8 @@ class Task:
                 raise self._wrong(f"{name} is {value:g}, and {why}; make it a mean, which {SUCCESS} cannot be")
         return outcome
 
-    def _wrong(self, what: str) -> OutcomeError:
-        return OutcomeError(f"task {self.name!r}: {what}")
-
-
-class OutcomeError(BadInput):
-    """A task's measures differ from its declaration."""
-
-
-class UnknownTask(BadInput):
-    """A task's name that is not registered, cannot be imported, or does not lead to a :class:`Task`."""
+    def _wrong(self, what: str) -> BadInput:
+        return BadInput(f"task {self.name!r}: {what}")
 
 
 def package_of(name: str) -> str | None:
@@ -181,22 +173,22 @@ def version_of(package: str | None) -> str | None:
 def find_task(name: str) -> Task:
     """The task registered under ``name``, or the one that ``module:name`` holds.
 
-    :raises UnknownTask: the name is not registered, or the task cannot be imported; names a missing package.
+    :raises BadInput: the name is not registered, or the task cannot be imported; names a missing package.
     """
     registered = {point.name: point for point in entry_points(group=TASKS)}
     if name not in registered and ":" not in name:
         names = ", ".join(sorted(registered)) or "none"
-        raise UnknownTask(f"no task is registered as {name!r} (registered: {names}); module:name works too")
+        raise BadInput(f"no task is registered as {name!r} (registered: {names}); module:name works too")
     try:
         task: Any = registered[name].load() if name in registered else resolve_name(name)
     except Failed:  # such as missing OpenGL
         raise
     except ModuleNotFoundError as error:
         if str(error.name) in name.partition(":")[0]:
-            raise UnknownTask(f"task {name!r} cannot be loaded: {error}") from error
-        raise UnknownTask(f"task {name!r} needs the package {error.name!r}, which is not installed here") from error
+            raise BadInput(f"task {name!r} cannot be loaded: {error}") from error
+        raise BadInput(f"task {name!r} needs the package {error.name!r}, which is not installed here") from error
     except Exception as error:  # whatever the task's code raises
-        raise UnknownTask(f"task {name!r} cannot be loaded: {' '.join(str(error).split())}") from error
+        raise BadInput(f"task {name!r} cannot be loaded: {' '.join(str(error).split())}") from error
     if not isinstance(task, Task):
-        raise UnknownTask(f"task {name!r} leads to a {type(task).__name__}, not to a ddco_pyro.simulation.task.Task")
+        raise BadInput(f"task {name!r} leads to a {type(task).__name__}, not to a ddco_pyro.simulation.task.Task")
     return task

@@ -76,7 +76,7 @@ def fitted(name, observed):
     starts, task = range(1000, 1000 + spec.rollout.episodes), getattr(memory_tasks, name)
     played = []
     for hierarchy in (fit.hierarchy, fit.baselines["mixture"].hierarchy):
-        controller = Controller.from_spec(hierarchy, spec.rollout)
+        controller = Controller(hierarchy, spec.rollout.control, spec.rollout.options)
         played.append([run_episode(task, controller, seed).outcome for seed in starts])
     return fit, *played
 

@@ -237,8 +237,8 @@ def test_together_as_alone(name, weights, actors, spec):
     ragged, acted, changes = replace(task, load=lambda seed: toy_task.Point(seed, steps=seed)), set(), 0
     for seed in weights:
         hierarchy = make(MODELS[name], seed, gain=3.0)
-        alone = [run_episode(ragged, Controller.from_spec(hierarchy, spec), seed) for seed in SEEDS]
-        controller = Controller.from_spec(hierarchy, spec)
+        alone = [run_episode(ragged, Controller(hierarchy, spec.control, spec.options), seed) for seed in SEEDS]
+        controller = Controller(hierarchy, spec.control, spec.options)
         controller.reset_all(SEEDS)
         for step in range(max(len(one.record) for one in alone)):
             controls = controller.act_all([at(one.record, step) for one in alone])

@@ -21,7 +21,7 @@ from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.simulation import collect as collecting
 from ddco_pyro.simulation.cameras import Encoded
 from ddco_pyro.simulation.episodes import run_episode
-from ddco_pyro.spec import DemonstrationsSpec, RolloutSpec, parse_spec
+from ddco_pyro.spec import DemonstrationsSpec, parse_spec
 from ddco_pyro.training.data import dimensions
 from ddco_pyro.training.networks import Dimensions, build_hierarchy
 
@@ -86,7 +86,7 @@ def test_an_encoder_stands_in_for_the_pictures():
     policy = spec_of("colour")
     size = Dimensions({"colour": (3,)}, seen.actions.shape[1], len(seen))
     hierarchy = build_hierarchy(policy, size)
-    controller = Controller.from_spec(hierarchy, policy.rollout)
+    controller = Controller(hierarchy, policy.rollout.control, policy.rollout.options)
     played = run_episode(coded, controller, 3, observed=hierarchy.encoder.shapes, keep=["colour"])
     np.testing.assert_array_equal(played.record.observations["colour"][0], brightness(seen.observations["camera"][0]))
 
@@ -135,6 +135,6 @@ def test_a_spec_with_a_camera_is_checked_fitted_and_rolled_out(tmp_path):
     measured = roll_out(fit, 2, film=1, jobs=1).methods["flat"].measures["success"]
     assert DRAWN
     assert list(frames(fit.folder / "videos" / "flat-1000.mp4"))
-    controller, seen = Controller.from_spec(fit.hierarchy, RolloutSpec()), fit.hierarchy.encoder.shapes
+    controller, seen = fit.controller(), fit.hierarchy.encoder.shapes
     alone = [run_episode(watched, controller, seed, observed=seen, keep=()) for seed in range(1000, 1002)]
     assert [one.outcome["success"] for one in alone].count(1.0) == measured.successes

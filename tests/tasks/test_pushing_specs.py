@@ -46,7 +46,7 @@ def test_specs_fit_and_act(path: Path, demonstrations: Path, tmp_path: Path) -> 
     found = fit(short, out=tmp_path / "run")
     assert found.metrics.engine_check.value < 1e-6
     brief = replace(pushing.limited, load=lambda seed: pushing.load_single(seed), cameras=CAMERAS)
-    controller = Controller.from_spec(found.hierarchy, found.spec.rollout)
+    controller = Controller(found.hierarchy, found.spec.rollout.control, found.spec.rollout.options)
     episode = run_episode(brief, controller, 0, observed=found.spec.observed, keep=("tip",))
     levels = LEVELS[path.stem.removeprefix("pushing_")]
     assert episode.choices.shape == (len(episode.record.observations["tip"]), levels)
