@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Iterator
 from itertools import chain, islice
 from typing import Any
+
+import numpy as np
+import pandas
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import whole_file
@@ -14,63 +15,49 @@ from ddco_pyro.drawing.shown import paths_of, stored_pictures
 from ddco_pyro.names import option_name
 from ddco_pyro.segmenting import SOURCES, Segmented, recorded
 from ddco_pyro.segmenting.formats import Asked
-from ddco_pyro.segmenting.page import followed, write_page
+from ddco_pyro.segmenting.page import timelines, write_page
 
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
 """First characters of a text that a spreadsheet may execute as a formula."""
 
 
-def cell(value: Any) -> Any:
-    """A value for CSV: an apostrophe goes before a text that a spreadsheet would execute."""
-    return f"'{value}" if isinstance(value, str) and value.startswith(FORMULA) else value
+def table(segmented: Segmented) -> pandas.DataFrame:
+    """A row for each step: of each level the option, whether it is a new choice, its probability and its name.
 
-
-def columns(segmented: Segmented) -> list[str]:
-    """Names of the columns: for each level the option, whether it is a new choice, probability, name; of baselines, and
-    who says so.
+    Then come the kinds of baselines, and who says so where a person labelled.
     """
-    levels = [f"{name}{suffix}" for name in segmented.counts for suffix in ("", BOUNDARY, "_probability", "_name")]
-    return [
-        "demonstration",
-        "step",
-        *(["seconds"] if segmented.frequency else []),
-        *levels,
-        *segmented.segments[0].baselines,
-    ]
-
-
-def rows(segmented: Segmented) -> Iterator[list[Any]]:
-    """A row for each step of each demonstration."""
+    parts = []
     for demo in segmented.segments:
-        for step in range(len(demo)):
-            row: list[Any] = [demo.name, step, *([step / segmented.frequency] if segmented.frequency else [])]
-            for name, level in demo.levels.items():
-                option = int(level.options[step])
-                row += [option, int(level.boundaries[step]), float(level.probability[step])]
-                row.append("" if option == UNKNOWN else option_name(option, segmented.names.get(name, ())))
-            for name, kinds in demo.baselines.items():
-                row.append(SOURCES[kinds[step]] if name.endswith(SOURCE) else int(kinds[step]))
-            yield row
+        columns: dict[str, Any] = {"demonstration": demo.name, "step": np.arange(len(demo))}
+        if segmented.frequency:
+            columns["seconds"] = columns["step"] / segmented.frequency
+        for name, level in demo.levels.items():
+            names = segmented.names.get(name, ())
+            columns[name] = level.options
+            columns[name + BOUNDARY] = level.boundaries.astype(int)
+            columns[f"{name}_probability"] = level.probability.astype(float)
+            named = {option: option_name(option, names) for option in level.options.tolist()} | {UNKNOWN: ""}
+            columns[f"{name}_name"] = [named[option] for option in level.options.tolist()]
+        for name, kinds in demo.baselines.items():
+            columns[name] = [SOURCES[kind] for kind in kinds] if name.endswith(SOURCE) else kinds
+        parts.append(pandas.DataFrame(columns))
+    return pandas.concat(parts, ignore_index=True)
 
 
 def write_csv(asked: Asked, segmented: Segmented) -> str:
-    """The table as CSV."""
-    with whole_file(asked.out) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        for row in chain([columns(segmented)], rows(segmented)):
-            writer.writerow(map(cell, row))
+    """The table as CSV; an apostrophe goes before a text that a spreadsheet would execute."""
+    rows = table(segmented)
+    for name in ("demonstration", *(f"{level}_name" for level in segmented.counts)):
+        rows[name] = [f"'{text}" if text.startswith(FORMULA) else text for text in rows[name]]
+    with whole_file(asked.out) as temporary:
+        rows.to_csv(temporary, index=False)
     return str(asked.out)
 
 
 def write_parquet(asked: Asked, segmented: Segmented) -> str:
-    """The table as Parquet, with pyarrow."""
-    import pyarrow
-    from pyarrow import parquet
-
-    values = zip(*rows(segmented), strict=True)
-    table = pyarrow.table({name: list(column) for name, column in zip(columns(segmented), values, strict=True)})
+    """The table as Parquet."""
     with whole_file(asked.out) as temporary:
-        parquet.write_table(table, temporary)
+        table(segmented).to_parquet(temporary, engine="pyarrow", index=False)
     return str(asked.out)
 
 
@@ -84,6 +71,6 @@ def write_html(asked: Asked, segmented: Segmented) -> str:
     demos = recorded(segmented, asked.fit, asked.source)
     first = list(islice(demos, FIRST))
     paths = paths_of(asked.fit.spec.report.trajectory, Demonstrations(tuple(first)))
-    follows = followed(chain(first, demos), pictures, segmented, paths)
-    write_page(asked.out, segmented, str(asked.run), str(asked.demos), follows)
+    drawn = timelines(segmented, chain(first, demos), pictures, paths)
+    write_page(asked.out, segmented, str(asked.run), str(asked.demos), drawn)
     return str(asked.out)
