@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from itertools import takewhile
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -169,11 +168,10 @@ def projection(points: np.ndarray) -> np.ndarray:
 
 def pictures(demos: Sequence[Demonstration]) -> list[Observed]:
     """The first observation of each demonstration that is a picture; empty where one has none."""
-    first = (
-        next((array for array in demo.observations.values() if len(array.shape) == 1 + PICTURE_DIMENSIONS), None)
-        for demo in demos
-    )
-    return _all_or_none(first, len(demos))
+    each = [
+        [array for array in demo.observations.values() if len(array.shape) == 1 + PICTURE_DIMENSIONS] for demo in demos
+    ]
+    return [arrays[0] for arrays in each] if all(each) else []
 
 
 def stored_pictures(source: Source, lengths: Mapping[str, int]) -> list[Observed]:
@@ -182,20 +180,14 @@ def stored_pictures(source: Source, lengths: Mapping[str, int]) -> list[Observed
     :param lengths: steps of each demonstration by name.
     :returns: pictures in this order; empty where a demonstration has none or has other steps.
     """
-    if not set(lengths) <= set(source.names):
-        return []
-
-    def first(name: str) -> Observed | None:
-        arrays = source.read(name).observations.values()
-        return next((array for array in arrays if in_file(array) and len(array) == lengths[name]), None)
-
-    return _all_or_none(map(first, lengths), len(lengths))
-
-
-def _all_or_none(arrays: Iterable[Observed | None], count: int) -> list[Observed]:
-    """The arrays up to the first that is missing, where these are all."""
-    there = list(takewhile(lambda array: array is not None, arrays))
-    return [array for array in there if array is not None] if len(there) == count else []
+    found: list[Observed] = []
+    for name, steps in lengths.items():
+        arrays = source.read(name).observations.values() if name in source.names else ()
+        first = next((array for array in arrays if in_file(array) and len(array) == steps), None)
+        if first is None:
+            return []
+        found.append(first)
+    return found
 
 
 def frames(observed: Observed, steps: Sequence[int] | np.ndarray, height: int) -> np.ndarray:

@@ -18,7 +18,7 @@ from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.names import method
 from ddco_pyro.report import agreement, inputs, likelihood, options, rollouts, skills, training
 from ddco_pyro.report.trajectories import activity
-from ddco_pyro.segmenting.page import followed, timelines
+from ddco_pyro.segmenting.page import timelines
 
 
 def write_report(fit: Fit, demos: Demonstrations) -> Path:
@@ -34,8 +34,7 @@ def write_report(fit: Fit, demos: Demonstrations) -> Path:
     if segmented:
         ordered = demos.select([demo.name for demo in segmented.segments])
         shown = pictures(ordered) or _stored(fit, ordered)
-        follows = followed(ordered, shown, segmented, paths, options.MOST_STEPS)
-        drawn = timelines(segmented, follows, options.MOST_STEPS)
+        drawn = timelines(segmented, ordered, shown, paths, options.MOST_STEPS)
         drawings = skills.Shown(ordered, shown, paths)
         every = skills.skills(fit, segmented)
     with style():

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import accumulate, islice, zip_longest
+from collections.abc import Iterable, Sequence
+from itertools import accumulate, islice
 from pathlib import Path
-from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -33,22 +32,16 @@ HOW = (
 )
 
 
-def write_page(
-    path: Path,
-    segmented: Segmented,
-    run: str,
-    file: str,
-    follows: Iterable[Mapping[str, Any]] = (),
-) -> None:
+def write_page(path: Path, segmented: Segmented, run: str, file: str, drawn: Timelines) -> None:
     """Write the page, whole or not at all.
 
-    :param follows: of :func:`followed`.
+    :param drawn: of :func:`timelines`.
     """
     count, held_out = len(segmented), sum(demo.held_out for demo in segmented.segments)
     intro = f"{held_out} of {count} demonstrations were held out when the run was fitted. They are marked “held out”."
     sections = [_level(name, segmented) for name in segmented.counts]
-    drawn = note(f"{HOW} Nats per step: the log-likelihood of the demonstration's controls under the model; {NAT}.")
-    sections.append(Section("segments", "Every demonstration", [drawn, timelines(segmented, follows)]))
+    how = note(f"{HOW} Nats per step: the log-likelihood of the demonstration's controls under the model; {NAT}.")
+    sections.append(Section("segments", "Every demonstration", [how, drawn]))
     page = Page(file, [Text(intro)] if held_out else [], sections, subtitle=f"segmented by {run}")
     write_text(path, page.html())
 
@@ -77,11 +70,16 @@ def anchor(name: str) -> str:
 
 
 def timelines(
-    segmented: Segmented, follows: Iterable[Mapping[str, Any]] = (), most_steps: float = math.inf
+    segmented: Segmented,
+    demos: Iterable[Demonstration],
+    pictures: Sequence[Observed],
+    paths: Sequence[PathSpec],
+    most_steps: float = math.inf,
 ) -> Timelines:
     """Time lines of the first demonstrations: about ``most_steps`` steps of all levels, at least one of them.
 
-    :param follows: what follows the cursor, of :func:`~ddco_pyro.drawing.timeline.following`.
+    :param demos: in the order of their segments; their numbers, paths and pictures follow the cursor.
+    :param pictures: of each demonstration; empty for none.
     """
     lanes = {}
     for name, count in reversed(segmented.counts.items()):
@@ -91,6 +89,8 @@ def timelines(
     lanes |= {name: Lane(name, names, segmented.label_colours(name)) for name, names in _values(segmented).items()}
     before = accumulate((len(demo) * len(segmented.counts) for demo in segmented.segments), initial=0)
     shown = [demo for demo, steps in zip(segmented.segments, before, strict=False) if steps < most_steps]
+    steps = min(sum(map(len, segmented.segments)), most_steps / len(segmented.counts))
+    follows = following(islice(demos, len(shown)), pictures[: len(shown)], int(steps), paths)
     tracks = [
         Track(
             demo.name,
@@ -99,28 +99,11 @@ def timelines(
             demo.held_out,
             len(demo),
             [_runs(demo, name) for name in lanes],
-            followed or {},
+            follow,
         )
-        for demo, followed in zip_longest(shown, islice(follows, len(shown)))
+        for demo, follow in zip(shown, follows, strict=True)
     ]
     return Timelines(list(lanes.values()), tracks, segmented.frequency)
-
-
-def followed(
-    demos: Iterable[Demonstration],
-    pictures: Sequence[Observed],
-    segmented: Segmented,
-    paths: Sequence[PathSpec],
-    most_steps: float = math.inf,
-) -> Iterator[Mapping[str, Any]]:
-    """What follows the cursor along demonstrations in the order of their segments.
-
-    :param pictures: of each demonstration; empty for none.
-    :param paths: in space that are drawn.
-    :param most_steps: as in :func:`timelines`.
-    """
-    steps = min(sum(map(len, segmented.segments)), most_steps / len(segmented.counts))
-    return following(demos, pictures, int(steps), paths)
 
 
 def _values(segmented: Segmented) -> dict[str, dict[int, str]]:
