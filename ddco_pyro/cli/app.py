@@ -11,7 +11,6 @@ import io
 import os
 import signal
 import sys
-import threading
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -81,30 +80,16 @@ def main() -> None:
 
 @contextmanager
 def _interruptible() -> Iterator[None]:
-    """While the context lasts, SIGTERM (preemption by a scheduler) interrupts like Ctrl-C, even in finalizers."""
-    before, hook = signal.signal(signal.SIGTERM, signal.default_int_handler), sys.unraisablehook
-
-    def again(ignored: Any) -> None:
-        """Interrupt again a moment later: Python ignores exceptions in finalizers."""
-        if isinstance(ignored.exc_value, KeyboardInterrupt):
-            threading.Timer(0.01, signal.pthread_kill, [threading.main_thread().ident, signal.SIGTERM]).start()
-        else:
-            hook(ignored)
-
-    sys.unraisablehook = again
+    """While the context lasts, SIGTERM (preemption by a scheduler) interrupts like Ctrl-C."""
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
     finally:
-        sys.unraisablehook = hook
         signal.signal(signal.SIGTERM, before)
 
 
 def _run() -> int:
     """The exit status of the command line."""
-    for number, name in ((1, "stdout"), (2, "stderr")):
-        if getattr(sys, name) is None:  # closed, such as by >&-; the next file would get its number
-            os.dup2(os.open(os.devnull, os.O_RDWR), number)
-            setattr(sys, name, os.fdopen(number, "w", encoding="utf-8"))
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # for characters that the terminal's encoding lacks

@@ -10,7 +10,6 @@ import shlex
 import signal
 import subprocess
 import sys
-import time
 import tomllib
 from pathlib import Path
 from unittest import mock
@@ -159,17 +158,6 @@ def test_help_cuts_no_option_however_narrow_it_is(columns):
     assert "\\[" not in ended.stdout
 
 
-@pytest.mark.parametrize(("closed", "status"), [(">&-", 0), (">&- 2>&- <&-", 0), (">&-", 2)])
-def test_a_stream_that_is_closed_from_the_beginning_is_no_error(closed, status, tmp_path):
-    """Nor does a file that is written get its number, and what is printed."""
-    command = Path(sys.executable).with_name("ddco-pyro")
-    example = ROOT / "specs" / ("nowhere.yaml" if status else "mine.yaml")
-    line = f"exec {command} check {'' if status else '--schema'} {example} {closed}"
-    ended = subprocess.run(["sh", "-c", line], capture_output=True, text=True, cwd=tmp_path)
-    assert ended.returncode == status
-    assert "unexpected" not in ended.stderr
-
-
 def test_version_is_the_packages():
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
     ended = call("--version")
@@ -262,26 +250,6 @@ def test_a_scheduler_that_preempts_means_ctrl_c(monkeypatch, spec):
     monkeypatch.setattr("ddco_pyro.training.data.dimensions", lambda *_: signal.raise_signal(signal.SIGTERM))
     assert call("check", spec) == (1, "", "ddco-pyro: interrupted\n")
     assert signal.getsignal(signal.SIGTERM) is before
-
-
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_an_interrupt_within_a_finalizer_is_not_lost(monkeypatch, spec, number):
-    """Python prints what is raised there and goes on."""
-
-    class Interrupted:
-        def __del__(self):
-            signal.raise_signal(number)
-
-    def work(*_):
-        Interrupted()
-        time.sleep(HANGS)
-
-    monkeypatch.setattr("ddco_pyro.training.data.dimensions", work)
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # workers of pytest-xdist ignore it
-    try:
-        assert call("check", spec) == (1, "", "ddco-pyro: interrupted\n")
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def test_debug_shows_the_traceback():
