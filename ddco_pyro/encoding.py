@@ -324,10 +324,7 @@ def encode(
 
 
 def _checked(source: Source, demos: Mapping[str, Demonstration], key: str) -> tuple[str, ...]:
-    """The names of the training demonstrations.
-
-    :raises DemonstrationsError: the observation is missing or no picture, or the demonstrations are refused or differ.
-    """
+    """The names of the training demonstrations, of which every one is checked."""
     first = demos[source.names[0]]
     if key not in first.observations:
         known = [name for name, array in first.observations.items() if is_picture(array)]

@@ -150,9 +150,10 @@ class Controller:
     def _chosen(self, now: Step, generators: Sequence[np.random.Generator]) -> tuple[Tensor, ...]:
         if self.options == "marginal":
             self._log_marginal = arrive(self._log_marginal, now).message
-            joint = self._log_marginal.flatten(1).argmax(-1)  # of [N, C_D, ..., C_1]
-            sizes = self._log_marginal.shape[1:]
-            return tuple(reversed(torch.unravel_index(joint, sizes))) if sizes else ()
+            sizes = self._log_marginal.shape[1:]  # C_D, ..., C_1
+            if not sizes:
+                return ()
+            return tuple(reversed(torch.unravel_index(self._log_marginal.flatten(1).argmax(-1), sizes)))
         with Chosen(None if self.options == "most_likely" else generators):
             return choose(self.time, now, self._choices)
 

@@ -29,8 +29,6 @@ FormatOption = Annotated[
     str | None, typer.Option("--format", metavar="NAME", help=f"One of {', '.join(FORMATS)}; recognised unless given.")
 ]
 
-TimeUnit = Literal["seconds", "milliseconds", "steps"]
-
 
 def collect(
     spec: SpecPath,
@@ -211,7 +209,10 @@ def import_(
         str | None,
         typer.Option(metavar="ROLE=NAME,...", help="The columns of TABLE: demonstration=A,label=B,start=C,stop=D."),
     ] = None,
-    unit: Annotated[TimeUnit | None, typer.Option(help="The unit of TABLE's times, unless its columns say it.")] = None,
+    unit: Annotated[
+        Literal["seconds", "milliseconds", "steps"] | None,
+        typer.Option(help="The unit of TABLE's times, unless its columns say it."),
+    ] = None,
     fps: Annotated[
         float | None, typer.Option(min=0.001, help="Steps per second, for --labels; by default what FILE says.")
     ] = None,

@@ -77,20 +77,20 @@ def tolerance(hierarchy: Hierarchy, episodes: Mapping[str, np.ndarray]) -> float
     return float(np.clip(ROUNDINGS * largest, runner.TOLERANCE, MOST))
 
 
+@torch.no_grad()
 def _at_once(hierarchy: Hierarchy, inputs: Inputs) -> runner.Outputs:
     """The outputs at every step, [T, ...], from one pass over the episode, as in training."""
-    with torch.no_grad():
-        return _arrays(hierarchy(inputs))
+    return _arrays(hierarchy(inputs))
 
 
+@torch.no_grad()
 def _stepwise(hierarchy: Hierarchy, inputs: Inputs) -> runner.Outputs:
     """The outputs at every step, [T, ...], from one call for each step, as in a controller."""
     steps: list[runner.Outputs] = []
     states: States | None = None
-    with torch.no_grad():
-        for step in inputs.chunks(1):
-            outputs, states = hierarchy.advance(step, states)
-            steps.append(_arrays(outputs))
+    for step in inputs.chunks(1):
+        outputs, states = hierarchy.advance(step, states)
+        steps.append(_arrays(outputs))
     return {name: np.concatenate([step[name] for step in steps]) for name in steps[0]}
 
 

@@ -244,10 +244,7 @@ FOUND = 40
 def _demonstrations(
     source: Source, names: Sequence[str], fit: Fit, labels: dict[str, dict[str, np.ndarray]]
 ) -> Iterator[Demonstration]:
-    """Each demonstration as the run's networks observe it. Ground-truth labels go into ``labels``.
-
-    :raises DemonstrationsError: a demonstration cannot be used, or needs more memory than is allowed.
-    """
+    """Each demonstration as the run's networks observe it. Ground-truth labels go into ``labels``."""
     before = 0  # steps whose labels are in memory
     for name in names:
         found = source.read(name)
@@ -268,10 +265,7 @@ def _refuse_too_long(demo: Demonstration, fit: Fit, before: int) -> None:
 
 
 def _demonstration(found: Demonstration, fit: Fit) -> Demonstration:
-    """A demonstration of a source with the observations of the run's networks.
-
-    :raises DemonstrationsError: an observation is missing, or it or the control has another shape than in the fit.
-    """
+    """A demonstration of a source with the observations of the run's networks."""
     shapes = fit.hierarchy.encoder.shapes
     check_fitted(found, shapes, fit.hierarchy.scaling.size)
     return Demonstration(found.name, {key: found.observations[key] for key in shapes}, found.actions)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import importlib.metadata
 import json
 import os
 from collections.abc import Collection
+from importlib.metadata import entry_points
 from pathlib import Path
 
 from ddco_pyro.data.demonstration import Attribute
@@ -16,8 +18,9 @@ from ddco_pyro.data.sources.robomimic import robomimic_file, write_demonstration
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
 from ddco_pyro.simulation.episodes import run_episodes, summarize
-from ddco_pyro.simulation.task import Task, find_task, package_of, version_of
+from ddco_pyro.simulation.task import Task, find_task
 from ddco_pyro.spec import DemonstrationsSpec
+from ddco_pyro.spec.base import TASKS
 
 
 def cache_folder() -> Path:
@@ -45,7 +48,8 @@ def cache_path(task: Task, name: str, spec: DemonstrationsSpec, observed: Collec
 def _identity(task: Task, name: str, spec: DemonstrationsSpec, observed: Collection[str]) -> str:
     """A digest of everything that the recorded data depends on."""
     cameras = [[camera, task.cameras[camera].digest] for camera in task.seen_by_cameras(observed)]
-    versions = [version_of(package) for package in (*SIMULATORS, package_of(name))]
+    package = next((point.dist for point in entry_points(group=TASKS, name=name) if point.dist), None)
+    versions = [*map(importlib.metadata.version, SIMULATORS), package and importlib.metadata.version(package.name)]
     facts = [name, spec.supervisor, spec.count, spec.seed, cameras, versions]
     digest = hashlib.sha256(json.dumps(facts).encode())
     for source in sorted(task.sources):
@@ -105,10 +109,7 @@ def _record(
 
 
 def _refuse_others(path: Path, task: Task, spec: DemonstrationsSpec) -> None:
-    """Check that a file holds these demonstrations.
-
-    :raises BadInput: the file holds others.
-    """
+    """Check that a file holds these demonstrations."""
     names = {f"demo_{seed}" for seed in range(spec.seed, spec.seed + spec.count)}
     with opened(path) as file:
         about = (file.attrs.get("task"), file.attrs.get("policy"))

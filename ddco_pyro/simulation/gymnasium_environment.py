@@ -88,10 +88,7 @@ class GymnasiumEnvironment(dm_env.Environment):
 
 
 def _spec(name: str, space: spaces.Space[Any]) -> specs.BoundedArray:
-    """The dm_env spec of a Box, or of a Discrete space as one number.
-
-    :raises BadInput: the space has another type.
-    """
+    """The dm_env spec of a Box, or of a Discrete space as one number."""
     if isinstance(space, spaces.Discrete):
         return specs.BoundedArray((1,), np.int64, [space.start], [space.start + space.n - 1])
     if isinstance(space, spaces.Box):

@@ -6,7 +6,6 @@ The library never imports a task. :func:`find_task` resolves an entry point of t
 
 from __future__ import annotations
 
-import importlib.metadata
 import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
@@ -154,20 +153,6 @@ class Task:
 
     def _wrong(self, what: str) -> BadInput:
         return BadInput(f"task {self.name!r}: {what}")
-
-
-def package_of(name: str) -> str | None:
-    """The package that registers a task under ``name``; None where ``module:name`` leads to it."""
-    points = entry_points(group=TASKS, name=name)
-    return next((point.dist.name for point in points if point.dist is not None), None)
-
-
-def version_of(package: str | None) -> str | None:
-    """The version of a package; None where there is none."""
-    try:
-        return None if package is None else importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None
 
 
 def find_task(name: str) -> Task:

@@ -153,15 +153,15 @@ def damage_numpy(folder, tensor="caller_0.0.bias", by=1e-3):
 @pytest.fixture
 def damaged(monkeypatch):
     """Damage what was written, on the disk, before it is compared."""
-    write = module._write
+    write = module.write_numpy
 
     def damaging(damage):
-        def writing(fit, folder, onnx):
-            forms = write(fit, folder, onnx)
+        def writing(fit, folder):
+            written = write(fit, folder)
             damage(folder)
-            return forms
+            return written
 
-        monkeypatch.setattr(module, "_write", writing)
+        monkeypatch.setattr(module, "write_numpy", writing)
 
     return damaging
 

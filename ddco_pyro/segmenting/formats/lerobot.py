@@ -107,10 +107,7 @@ def write_subtasks(asked: Asked, segmented: Segmented) -> str:
 
 
 def _episodes(table: pyarrow.Table, subtasks: Subtasks) -> Iterator[tuple[int, pyarrow.Table]]:
-    """The rows of each episode in a data file.
-
-    :raises BadInput: the file has no times, or rows of an episode that the dataset does not name.
-    """
+    """The rows of each episode in a data file."""
     if "timestamp" not in table.column_names:
         raise BadInput("the data files have no column timestamp; subtasks begin at times of frames")
     index = table["episode_index"].to_numpy()

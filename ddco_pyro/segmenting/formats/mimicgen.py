@@ -91,8 +91,6 @@ def _one_order(asked: Asked, segmented: Segmented) -> tuple[list[str], dict[str,
 
     A subtask that occurs twice has a number the second time, such as ``grasp_2``. The first one lasts at least two
     steps: MimicGen looks for the step where its signal rises.
-
-    :raises BadInput: a demonstration has other subtasks than most, and none may be left out.
     """
     runs = {demo.name: asked.runs(demo) for demo in segmented.segments}
     subtasks = {name: [asked.names[option] for option, _, _ in each] for name, each in runs.items()}
