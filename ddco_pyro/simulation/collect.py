@@ -22,14 +22,6 @@ from ddco_pyro.simulation.task import Task, find_task
 from ddco_pyro.spec import DemonstrationsSpec
 from ddco_pyro.spec.base import TASKS
 
-
-def cache_folder() -> Path:
-    """``$DDCO_PYRO_CACHE``, or ``ddco-pyro`` in the user's cache folder."""
-    if folder := os.environ.get("DDCO_PYRO_CACHE"):
-        return Path(folder)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ddco-pyro"
-
-
 SIMULATORS = ("mujoco", "dm-control")
 """Packages whose version can change a task's episodes."""
 
@@ -40,13 +32,9 @@ EPISODES_WITH_PICTURES = 8
 def cache_path(task: Task, name: str, spec: DemonstrationsSpec, observed: Collection[str] = ()) -> Path:
     """The cached file of demonstrations of this task, policy, number, seeds and cameras.
 
-    Its name changes with the task's code, encoders and package version, and with the simulators' versions.
+    Its name changes with the task's code, encoders and package version, and with the simulators' versions. The folder
+    is ``$DDCO_PYRO_CACHE``, or ``ddco-pyro`` in the user's cache folder.
     """
-    return cache_folder() / "demonstrations" / f"{task.name}-{_identity(task, name, spec, observed)[:16]}.hdf5"
-
-
-def _identity(task: Task, name: str, spec: DemonstrationsSpec, observed: Collection[str]) -> str:
-    """A digest of everything that the recorded data depends on."""
     cameras = [[camera, task.cameras[camera].digest] for camera in task.seen_by_cameras(observed)]
     package = next((point.dist for point in entry_points(group=TASKS, name=name) if point.dist), None)
     versions = [*map(importlib.metadata.version, SIMULATORS), package and importlib.metadata.version(package.name)]
@@ -54,7 +42,9 @@ def _identity(task: Task, name: str, spec: DemonstrationsSpec, observed: Collect
     digest = hashlib.sha256(json.dumps(facts).encode())
     for source in sorted(task.sources):
         digest.update(hashlib.sha256(source.read_bytes()).digest())
-    return digest.hexdigest()
+    user = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    folder = Path(os.environ.get("DDCO_PYRO_CACHE") or user / "ddco-pyro")
+    return folder / "demonstrations" / f"{task.name}-{digest.hexdigest()[:16]}.hdf5"
 
 
 def collect(
