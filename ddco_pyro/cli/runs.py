@@ -136,16 +136,10 @@ FORMATS = {
         "lerobot:write_subtasks",
         "A copy of a LeRobot dataset with subtasks.",
         "lerobot",
-        "lerobot:check_subtasks",
-        "lerobot",
+        "lerobot:check_bare",
     ),
     "--sarm": Format(
-        "folder",
-        "lerobot:write_stages",
-        "The same with the stages of SARM's reward model.",
-        "lerobot",
-        "lerobot:check",
-        "lerobot",
+        "folder", "lerobot:write_stages", "The same with the stages of SARM's reward model.", "lerobot", "lerobot:check"
     ),
     "--mimicgen": Format(
         "file", "mimicgen:write", "A copy of a prepared file with MimicGen's signals.", "robomimic", "mimicgen:check"

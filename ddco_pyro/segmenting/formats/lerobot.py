@@ -57,7 +57,7 @@ def check(asked: Asked) -> None:
         raise BadInput(f"{asked.out}: exists; remove it, or choose another {asked.option}")
 
 
-def check_subtasks(asked: Asked) -> None:
+def check_bare(asked: Asked) -> None:
     """The same for a dataset that has no subtasks.
 
     :raises BadInput: it has.
