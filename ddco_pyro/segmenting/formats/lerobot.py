@@ -7,7 +7,6 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
@@ -24,24 +23,6 @@ from ddco_pyro.segmenting.formats import Asked, Run
 
 PERSISTENT, EVENTS = "language_persistent", "language_events"
 ATOM = ("role", "content", "style", "timestamp", "tool_calls")
-
-
-@dataclass(frozen=True)
-class Subtasks:
-    """What is written.
-
-    :param names: the subtask of each choice, control (0) first.
-    :param runs: the subtasks of each episode, by its index.
-    :param order: the choices that occur, in the order of :meth:`Asked.order`.
-    """
-
-    names: list[str]
-    runs: Mapping[int, list[Run]]
-    order: list[int]
-
-    def options(self, episode: int) -> np.ndarray:
-        """The option of each frame of an episode [T]."""
-        return np.concatenate([np.full(stop - start, option) for option, start, stop in self.runs[episode]])
 
 
 FEATURES = {name: {"dtype": "language", "shape": [1], "names": None} for name in (PERSISTENT, EVENTS)}
@@ -68,13 +49,16 @@ def check_bare(asked: Asked) -> None:
 
 
 @contextmanager
-def _copied(asked: Asked, segmented: Segmented) -> Iterator[tuple[LeRobot, Subtasks]]:
-    """A copy that the block adds subtasks to. Videos are hard links where the file system has them, else copies."""
+def _copied(asked: Asked, segmented: Segmented) -> Iterator[tuple[LeRobot, dict[int, list[Run]]]]:
+    """A copy that the block adds to, and the subtasks of each episode by its index.
+
+    Videos are hard links where the file system has them, else copies.
+    """
     with whole_folder(asked.out) as temporary:
         folder = LeRobot(asked.demos).folder
         shutil.copytree(folder, temporary, dirs_exist_ok=True, copy_function=_link, ignore_dangling_symlinks=True)
         runs = {int(demo.name.removeprefix("demo_")): asked.runs(demo) for demo in segmented.segments}
-        yield LeRobot(temporary), Subtasks(asked.names, runs, asked.order(segmented))
+        yield LeRobot(temporary), runs
 
 
 def write_subtasks(asked: Asked, segmented: Segmented) -> str:
@@ -92,7 +76,7 @@ def write_subtasks(asked: Asked, segmented: Segmented) -> str:
             file.unlink()  # it may be a link
             writer = None
             for episode, rows in _episodes(table, subtasks):
-                for name, values in _columns(rows["timestamp"], subtasks.options(episode), subtasks.names).items():
+                for name, values in _columns(rows["timestamp"], _options(subtasks[episode]), asked.names).items():
                     rows = rows.append_column(name, values)
                 writer = writer or parquet.ParquetWriter(file, rows.schema)
                 writer.write_table(rows)
@@ -106,7 +90,7 @@ def write_subtasks(asked: Asked, segmented: Segmented) -> str:
     return str(asked.out)
 
 
-def _episodes(table: pyarrow.Table, subtasks: Subtasks) -> Iterator[tuple[int, pyarrow.Table]]:
+def _episodes(table: pyarrow.Table, subtasks: Mapping[int, list[Run]]) -> Iterator[tuple[int, pyarrow.Table]]:
     """The rows of each episode in a data file."""
     if "timestamp" not in table.column_names:
         raise BadInput("the data files have no column timestamp; subtasks begin at times of frames")
@@ -114,9 +98,14 @@ def _episodes(table: pyarrow.Table, subtasks: Subtasks) -> Iterator[tuple[int, p
     bounds = [0, *(np.flatnonzero(np.diff(index)) + 1).tolist(), len(index)]
     for start, stop in pairwise(bounds):
         rows, episode = table.slice(start, stop - start), int(index[start])
-        if episode not in subtasks.runs or subtasks.runs[episode][-1][2] != len(rows):
+        if episode not in subtasks or subtasks[episode][-1][2] != len(rows):
             raise BadInput(f"the data files have rows of episode {episode} that meta/episodes does not name")
         yield episode, rows
+
+
+def _options(runs: list[Run]) -> np.ndarray:
+    """The option of each frame of an episode [T]."""
+    return np.concatenate([np.full(stop - start, option) for option, start, stop in runs])
 
 
 def _columns(times: pyarrow.ChunkedArray, options: np.ndarray, names: list[str]) -> dict[str, pyarrow.Array]:
@@ -154,9 +143,9 @@ def write_stages(asked: Asked, segmented: Segmented) -> str:
     with _copied(asked, segmented) as (dataset, subtasks):
         for file in sorted((dataset.folder / "meta" / "episodes").rglob("*.parquet")):
             table = parquet.read_table(file)
-            runs = [subtasks.runs[episode] for episode in table["episode_index"].to_pylist()]
+            runs = [subtasks[episode] for episode in table["episode_index"].to_pylist()]
             columns = {
-                "names": pyarrow.array([[subtasks.names[option] for option, _, _ in each] for each in runs]),
+                "names": pyarrow.array([[asked.names[option] for option, _, _ in each] for each in runs]),
                 "start_frames": pyarrow.array([[start for _, start, _ in each] for each in runs]),
                 "end_frames": pyarrow.array([[stop - 1 for _, _, stop in each] for each in runs]),
             }
@@ -167,9 +156,9 @@ def write_stages(asked: Asked, segmented: Segmented) -> str:
             known = {key: value for key, value in (table.schema.metadata or {}).items() if key != b"huggingface"}
             file.unlink()  # it may be a link
             parquet.write_table(table.replace_schema_metadata(known), file)
-        each = [subtasks.options(episode) for episode in subtasks.runs]
-        shares = {option: np.mean([np.mean(options == option) for options in each]) for option in subtasks.order}
-        proportions = {subtasks.names[option]: float(share) for option, share in shares.items()}
+        every = list(map(_options, subtasks.values()))
+        shares = {option: np.mean([np.mean(each == option) for each in every]) for option in asked.order(segmented)}
+        proportions = {asked.names[option]: float(share) for option, share in shares.items()}
         path = dataset.folder / "meta" / "temporal_proportions_dense.json"
         write_text(path, json.dumps(proportions, indent=2, ensure_ascii=False) + "\n")
     return str(asked.out)
