@@ -119,17 +119,16 @@ class Monitor:
             for name, known in ((level, self.names), *((name, self.names.get(level, ())) for name in ordered)):
                 if name not in known:
                     raise BadInput(f"order: there is no {name!r}{nearest(name, known)}; there is: {', '.join(known)}")
-        return {level: self._progress(level, order.get(level, ())) for level in self._active}
-
-    def _progress(self, level: str, order: Sequence[str]) -> Progress:
-        option, steps = self._active[level]
-        name, fraction, whole = self.names[level][option], None, None
-        if level in self.lengths and len(lengths := self.lengths[level][option]):
-            not_shorter = lengths[lengths >= steps]
-            fraction = steps / float(not_shorter.mean()) if len(not_shorter) else 1.0
-            if name in order:
-                whole = (order.index(name) + fraction) / len(order)
-        return Progress(option, name, steps, fraction, whole)
+        found = {}
+        for level, (option, steps) in self._active.items():
+            name, fraction, whole = self.names[level][option], None, None
+            if level in self.lengths and len(lengths := self.lengths[level][option]):
+                not_shorter = lengths[lengths >= steps]
+                fraction = steps / float(not_shorter.mean()) if len(not_shorter) else 1.0
+                if name in (ordered := order.get(level, ())):
+                    whole = (ordered.index(name) + fraction) / len(ordered)
+            found[level] = Progress(option, name, steps, fraction, whole)
+        return found
 
     def step(
         self, observation: Mapping[str, np.ndarray], control: np.ndarray | None = None

@@ -113,11 +113,9 @@ class Interval:
     @classmethod
     def of(cls, difference: Difference | None, points: Sequence[float] = (), **looks: Any) -> Interval | None:
         """A difference ± its standard error."""
-        return (
-            None
-            if difference is None
-            else cls.around(difference.nats_per_step, difference.standard_error, points, **looks)
-        )
+        if difference is None:
+            return None
+        return cls.around(difference.nats_per_step, difference.standard_error, points, **looks)
 
 
 @dataclass(frozen=True)

@@ -248,20 +248,16 @@ def _demonstrations(
     before = 0  # steps whose labels are in memory
     for name in names:
         found = source.read(name)
-        _refuse_too_long(found, fit, before)
+        seen = {key: array for key, array in found.observations.items() if key in fit.hierarchy.encoder.shapes}
+        inferred = INFERENCE * len(found) + FOUND * fit.hierarchy.depth * (before + len(found))
+        whole = needed([Demonstration.stored(name, seen, found.actions)]) + inferred
+        refuse_too_much(whole, f"{name}: segmenting its {len(found)} steps", "divide it, or the file")
         labels[name] = {
             key: values for key, values in found.labels.items() if values.dtype.kind in "iub" and values.ndim == 1
         }
         demo = _demonstration(found, fit)
         before += len(demo)
         yield demo
-
-
-def _refuse_too_long(demo: Demonstration, fit: Fit, before: int) -> None:
-    seen = {key: array for key, array in demo.observations.items() if key in fit.hierarchy.encoder.shapes}
-    inferred = INFERENCE * len(demo) + FOUND * fit.hierarchy.depth * (before + len(demo))
-    whole = needed([Demonstration.stored(demo.name, seen, demo.actions)]) + inferred
-    refuse_too_much(whole, f"{demo.name}: segmenting its {len(demo)} steps", "divide it, or the file")
 
 
 def _demonstration(found: Demonstration, fit: Fit) -> Demonstration:
