@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, get_args
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import BeforeValidator, Field, InstanceOf, PlainSerializer
 
@@ -173,13 +173,6 @@ class LearnedStd(Model):
 
 Std = Annotated[Positive | LearnedStd, nested((Mapping,), LearnedStd, "a positive number or {learn: true}")]
 
-ScaleName = Literal["standardize", "none"]
-Scales = Annotated[Items[Positive], Field(min_length=1)]
-Scale = Annotated[
-    ScaleName | Scales,
-    nested((list, tuple), Scales, "standardize, none, or a list of positive numbers", get_args(ScaleName)),
-]
-
 Kind = Literal["auto", "gaussian", "student", "clipped", "hurdle", "binary", "categorical"]
 """The kinds of distribution. Each has a class of its name in a module of its name in ``model/emissions``."""
 DISCRETE = ("binary", "categorical")
@@ -197,9 +190,6 @@ class DistributionSpec(Model):
     ``student``."""
     std: Std | None = None
     """Standard deviation σ in scaled units, or ``{learn: true, floor: ...}``; null in a part: as in ``control.std``."""
-    scale: Scale | None = None
-    """``standardize`` (by the training demonstrations), ``none``, or a list with a positive divisor for each dimension;
-    null in a part: as in ``control.scale``."""
 
 
 class PartSpec(DistributionSpec):
@@ -211,11 +201,8 @@ class PartSpec(DistributionSpec):
     """Control dimensions, counted from 0."""
 
     def problems(self) -> Problems:
-        if isinstance(self.scale, tuple) and len(self.scale) != len(self.dims):
-            yield "scale", f"has {len(self.scale)} numbers, but the part has {len(self.dims)} dimensions"
-        for setting in ("scale", "std"):
-            if self.kind in DISCRETE and getattr(self, setting) is not None:
-                yield setting, f"does not apply to kind: {self.kind}; leave it out"
+        if self.kind in DISCRETE and self.std is not None:
+            yield "std", f"does not apply to kind: {self.kind}; leave it out"
 
 
 class ControlSpec(DistributionSpec):
@@ -223,9 +210,8 @@ class ControlSpec(DistributionSpec):
 
     std: Std = 0.1
     """Standard deviation σ in scaled units, or ``{learn: true, floor: ...}``."""
-    scale: Scale = "standardize"
-    """``standardize`` (by the training demonstrations), ``none``, or a list with a positive divisor for each control
-    dimension."""
+    scale: Literal["standardize", "none"] = "standardize"
+    """``standardize``: continuous dimensions are scaled by their mean and spread in the training demonstrations."""
     power: float = Field(default=1.0, gt=0, le=1)
     """β: how many times the log-density of the control counts in training and in posteriors of the options (a power, or
     coarsened, likelihood). The less it counts, the longer segments are. Reported log-likelihoods are of densities."""

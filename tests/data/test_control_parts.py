@@ -149,8 +149,7 @@ def test_what_does_not_fit_the_demonstrations_is_refused(control, message):
     "parts",
     [
         [{"name": "a", "dims": [0]}, {"name": "b", "dims": [1, 0]}],
-        [{"name": "a", "dims": [0, 1], "scale": [1.0]}],
-        [{"name": "a", "dims": [2], "kind": "binary", "scale": [1.0]}],
+        [{"name": "a", "dims": [2], "kind": "binary", "std": 1.0}],
     ],
 )
 def test_contradictions_in_parts_are_refused(parts):
