@@ -167,7 +167,6 @@ class ControlDimension:
         return "; ".join(filter(None, (self.atom, ends and f"exactly at its {ends}", self.made)))
 
     def as_data(self) -> dict[str, Any]:
-        """The main statistics as plain data."""
         left_out = ("distinct", "together", "integer", "made_by", "exceptions")
         return {key: value for key, value in asdict(self).items() if key not in left_out}
 
@@ -338,7 +337,6 @@ class ControlPart:
         return self.continuous and any(map(math.isfinite, (*self.low, *self.high)))
 
     def as_data(self) -> dict[str, Any]:
-        """The part as plain data."""
         return asdict(self)
 
     @classmethod

@@ -54,7 +54,6 @@ class _Disk(io.FileIO):
     error: OSError | None = None
 
     def write(self, data: Any) -> int:
-        """Write all data."""
         rest = memoryview(data).cast("B")
         size = len(rest)
         while rest and self.error is None:
@@ -72,7 +71,6 @@ class _Disk(io.FileIO):
         return len(view)
 
     def truncate(self, size: int | None = None) -> int:
-        """Change the size of the file."""
         try:
             return super().truncate(size) if self.error is None else 0
         except OSError as error:

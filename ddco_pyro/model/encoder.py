@@ -79,7 +79,6 @@ class ObservationEncoder(nn.Module):
 
     @property
     def keys(self) -> list[str]:
-        """The vectors, in the spec's order."""
         return [spec.key for spec in self.specs]
 
     def shape(self, steps: int) -> InputShape:
@@ -102,7 +101,6 @@ class ObservationEncoder(nn.Module):
 
     @property
     def has_bins(self) -> bool:
-        """Whether any observation has bins."""
         return any(spec.bins for spec in self.specs)
 
     def _places(self) -> np.ndarray:

@@ -188,7 +188,6 @@ class Hierarchy(nn.Module):
         return [*(level.policy for level in self.option_levels()), self.meta_policy]
 
     def option_levels(self) -> list[Level]:
-        """The levels of options, lowest first."""
         return [level for level in self.levels if isinstance(level, Level)]
 
     def networks(self) -> dict[str, Network]:

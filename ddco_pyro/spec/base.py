@@ -173,7 +173,6 @@ def in_words(error: ErrorDetails) -> str:
 
 
 def show(value: Any) -> str:
-    """A value as YAML has it, cut to 60 characters."""
     words = {None: "null", True: "true", False: "false"}
     text = words[value] if value is None or isinstance(value, bool) else repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."

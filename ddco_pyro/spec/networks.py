@@ -110,7 +110,6 @@ class LayeredSpec(Network):
 
     @property
     def hidden_sizes(self) -> tuple[int, ...]:
-        """Sizes of the hidden layers."""
         return self.hidden
 
 
@@ -172,7 +171,6 @@ class LstmSpec(LayeredSpec):
 
     @property
     def reads(self) -> tuple[str, ...]:
-        """Names of the observations that the LSTM or the network below it reads."""
         return self.inputs or (self.over.reads if self.over else ())
 
 
@@ -186,7 +184,6 @@ class BranchesSpec(MlpSpec):
 
     @property
     def reads(self) -> tuple[str, ...]:
-        """Names of the observations that the branches read."""
         names = (name for key, branch in self.of.items() for name in branch.inputs or (key,))
         return self.inputs or tuple(dict.fromkeys(names))
 
@@ -203,7 +200,6 @@ class UserNetworkSpec(Network):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Keyword arguments of the class."""
         return self.options
 
     @field_validator("network")

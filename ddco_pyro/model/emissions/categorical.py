@@ -43,12 +43,10 @@ class Categorical(Emission):
     def of(
         cls, part: ControlPart, numbers: Tensor, parameters: Tensor, log_scale: Tensor, ends: tuple[Tensor, Tensor]
     ) -> Emission:
-        """The numbers are the logits."""
         return Categorical(numbers, torch.tensor(not part.values))
 
     @classmethod
     def size(cls, part: ControlPart) -> int:
-        """C."""
         return len(part.values) or len(part.dims)
 
     @classmethod
@@ -60,12 +58,10 @@ class Categorical(Emission):
         return rows
 
     def information(self, acting: Tensor, actions: Tensor) -> Iterator[Information]:
-        """That of the logits."""
         yield Information.of_logits(slice(0, self.numbers), acting, self.logits.softmax(-1))
 
     @property
     def shape(self) -> torch.Size:
-        """[..., K, A]."""
         return torch.Size([*self.logits.shape[:-1], self.logits.shape[-1] if bool(self.rows) else 1])
 
     def by_dimension(self, actions: Tensor) -> Tensor:
@@ -87,12 +83,10 @@ class Categorical(Emission):
         return index, (actions == meant).all(-1, keepdim=True)
 
     def log_density(self, actions: Tensor) -> Tensor:
-        """log π(a | s), [..., K]."""
         return self.by_dimension(actions)[..., 0]
 
     @property
     def mode(self) -> Tensor:
-        """The most likely action."""
         return self._action(self.logits.argmax(-1))
 
     def draw(self, noise: Tensor) -> Tensor:

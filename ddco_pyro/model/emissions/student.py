@@ -70,7 +70,6 @@ class Student(Gaussian):
     def of(
         cls, part: ControlPart, numbers: Tensor, parameters: Tensor, log_scale: Tensor, ends: tuple[Tensor, Tensor]
     ) -> Emission:
-        """The Student t with these means."""
         return Student(numbers, parameters[..., : len(part.dims)], log_scale)
 
     def log_density(self, actions: Tensor) -> Tensor:

@@ -71,13 +71,11 @@ class Conv(Network):
         self.layers = Perceptrons(copies, shape.vector + maps, hidden, dropout, activation)
 
     def forward(self, inputs: Inputs, state: State = ()) -> tuple[Tensor, State]:
-        """[N, T, K, features], and the state."""
         vector = inputs.vector.flatten(0, 1).expand(self.copies, -1, -1)
         maps = [self._maps(layers, inputs.images[key].flatten(0, 1)) for key, layers in self._layers().items()]
         return options_last(self.layers(torch.cat([vector, *maps], dim=-1)), inputs.batch), state
 
     def numpy_form(self) -> NumpyForm:
-        """Perceptrons over the vectors and the pooled maps of each picture."""
         pictures = [self._picture_form(key, layers) for key, layers in self._layers().items()]
         return self.layers.numpy_form(joined([vectors(self.reads, self.copies), *pictures]))
 

@@ -46,10 +46,6 @@ class Frames(Mapping[str, Tensor]):
         return len(next(iter(self.arrays.values()))), self.steps.stop - self.steps.start
 
     def loaded(self) -> dict[str, Tensor]:
-        """All pictures, in memory.
-
-        :raises DemonstrationsError: a file cannot be read.
-        """
         return {key: self[key] for key in self}
 
     def part(self, rows: Tensor | slice, steps: slice) -> Frames:

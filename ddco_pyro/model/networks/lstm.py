@@ -43,12 +43,10 @@ class Lstm(Network):
         self.layers = Perceptrons(copies, hidden[-1], ())
 
     def initial_state(self, trajectories: int) -> State:
-        """Zeros, after the state of ``over``."""
         own = [layer.recurrent.new_zeros(trajectories, *layer.size) for layer in self._memory() for _ in "hc"]
         return (*self.over.initial_state(trajectories), *own)
 
     def forward(self, inputs: Inputs, state: State) -> tuple[Tensor, State]:
-        """[N, T, K, features], and the state after the last step."""
         within = len(state) - 2 * len(self.memory)
         features, after = self.over(inputs, state[:within])
         values = options_first(features)
@@ -62,7 +60,6 @@ class Lstm(Network):
         return options_last(self.layers(values), inputs.batch), after
 
     def numpy_form(self) -> NumpyForm | None:
-        """Layers that remember, over the form of ``over``; None where that has none."""
         of = self.over.numpy_form()
         if of is None:
             return None
