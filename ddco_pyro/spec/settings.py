@@ -185,9 +185,8 @@ class DistributionSpec(Model):
     kind: Kind = "auto"
     """``gaussian``: unbounded; ``student``: heavy tails, those of Student's t with four degrees of freedom, which all
     dimensions of a step share; ``clipped``: a Gaussian censored at bounds; ``hurdle``: one exact value with some
-    probability, else Gaussian or clipped; ``binary``: two values; ``categorical``: discrete actions, as integers or
-    one-hot rows; ``auto``: chosen for each dimension from the demonstrations and shown by ``check``, never
-    ``student``."""
+    probability, else Gaussian or clipped; ``binary``: two values; ``categorical``: discrete actions, as integers;
+    ``auto``: chosen for each dimension from the demonstrations and shown by ``check``, never ``student``."""
     std: Std | None = None
     """Standard deviation σ in scaled units, or ``{learn: true, floor: ...}``; null in a part: as in ``control.std``."""
 
