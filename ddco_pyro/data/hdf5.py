@@ -98,10 +98,6 @@ def natural(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
-PACKED, SMALL = 5_000, 10**9
-"""Most bytes that a filtered dataset claims for each stored byte (deflate reaches 1032), or in all."""
-
-
 def lazy(dataset: h5py.Dataset, where: str, steps: int | None = None) -> LazyArray:
     """A dataset as a lazy array; pictures have their channels last.
 
@@ -172,8 +168,7 @@ def dataset_at(group: h5py.Group, key: str, where: str) -> h5py.Dataset:
     if dataset.is_virtual or dataset.external:
         raise _elsewhere(f"{where} is {'virtual' if dataset.is_virtual else 'stored in another file'}", dataset.file)
     stored = dataset.id.get_storage_size()
-    filtered = stored and dataset.id.get_create_plist().get_nfilters()
-    if dataset.nbytes > (max(PACKED * stored, SMALL) if filtered else stored):
+    if not dataset.chunks and dataset.nbytes > stored:
         raise DemonstrationsError(f"{where} claims {dataset.nbytes} bytes, but the file holds {stored}; write it again")
     if dataset.chunks:
         needed = math.prod(-(-size // chunk) for size, chunk in zip(dataset.shape, dataset.chunks, strict=True))

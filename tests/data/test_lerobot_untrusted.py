@@ -106,9 +106,9 @@ def test_a_video_without_all_frames(times, message: str, tmp_path: Path) -> None
 
 
 def test_rows_of_an_episode_that_is_not_named_are_not_annotated(tmp_path: Path, run: Path) -> None:
-    dataset = odd.changed(
-        odd.rewritten(odd.EPISODES, lambda table: table.slice(0, 3)), odd.info(total_episodes=3, total_frames=18)
-    )(tmp_path)
+    dataset = odd.changed(odd.rewritten(odd.EPISODES, lambda table: table.slice(0, 3)), odd.info(total_episodes=3))(
+        tmp_path
+    )
     ended = call("segment", run, dataset, "--lerobot", tmp_path / "annotated")
     refused(ended, "rows of episode 3 that meta/episodes does not name")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["dataset"]
