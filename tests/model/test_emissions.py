@@ -252,7 +252,7 @@ def test_a_student_is_that_of_scipy(kind):
 def test_draws_of_a_student_have_its_radius_and_its_controller():
     """(a - μ)² / σ² over A dimensions is A times an F variate; the export's numpy draws the same."""
     emission = Student(numbers(1, 2), STD, SCALE.log())
-    noise = torch.randn(4000, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    noise = torch.randn(4000, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     drawn = emission.draw(noise)[:, 0]
     radius = ((drawn - emission.mean) / STD).square().sum(-1) / 2
     assert stats.kstest(radius, stats.f(2, 4).cdf).pvalue > 0.01
@@ -263,7 +263,7 @@ def test_draws_of_a_student_have_its_radius_and_its_controller():
 
 def test_the_divergence_of_students_is_at_least_that_of_draws():
     emission = student(torch.stack([STD, 2 * STD]))
-    noise = torch.randn(4000, 2, 3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    noise = torch.randn(4000, 2, 3, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     total = 0.0
     for i in range(2):
         drawn = torch.stack([emission.draw(one)[..., i, :] for one in noise])
