@@ -12,7 +12,7 @@ from torch.nn.functional import softplus
 
 from ddco_pyro.data.controls import ControlPart, same
 from ddco_pyro.data.demonstration import number
-from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
+from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.model.emissions import KINDS, Emission, Product
 from ddco_pyro.spec import ControlSpec, LearnedStd
 
@@ -238,15 +238,3 @@ def _with_columns(table: Tensor, places: Sequence[int], values: Tensor) -> Tenso
 def _std_of(spec: ControlSpec, dimension: int) -> float | LearnedStd:
     named = next((part for part in spec.parts if dimension in part.dims), None)
     return spec.std if named is None or named.std is None else named.std
-
-
-def refuse_impossible(demonstrations: Demonstrations, scaling: ControlScaling, fitted: bool = False) -> None:
-    """Check that every control of these demonstrations has a probability above 0.
-
-    :param fitted: whether the model is fitted, so that its kinds of controls stand.
-    :raises DemonstrationsError: a switch or a discrete action has a value that the model does not know.
-    """
-    for demonstration in demonstrations:
-        if problem := scaling.impossible(demonstration.name, demonstration.actions):
-            declare, repair = "declare another kind in control.parts", f"repair it, or leave {demonstration.name} out"
-            raise DemonstrationsError(f"{problem}; {repair if fitted else declare}")

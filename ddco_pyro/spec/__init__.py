@@ -11,19 +11,15 @@ from ddco_pyro.spec.settings import (
     STEP,
     ControlSpec,
     DemonstrationsSpec,
-    InferenceSpec,
     Kind,
     LearnedStd,
     ObservationSpec,
     OptionExecution,
-    PartSpec,
     PathSpec,
-    ReportSpec,
     RolloutSpec,
-    SelectionSpec,
 )
 from ddco_pyro.spec.spec import Spec, parse_spec, with_overrides
-from ddco_pyro.spec.training import LabelsSpec, OptimizerSpec, RidgeSpec, Start, TrainingSpec
+from ddco_pyro.spec.training import OptimizerSpec, RidgeSpec, Start, TrainingSpec
 from ddco_pyro.spec.yaml import dump_spec, load_spec, spec_schema, user_code
 
 __all__ = [
@@ -35,23 +31,18 @@ __all__ = [
     "ConvolutionLayer",
     "DemonstrationsSpec",
     "HierarchySpec",
-    "InferenceSpec",
     "Kind",
-    "LabelsSpec",
     "LearnedStd",
     "LevelSpec",
     "NetworkSpec",
     "ObservationSpec",
     "OptimizerSpec",
     "OptionExecution",
-    "PartSpec",
     "PathSpec",
     "PolicySpec",
     "Pool",
-    "ReportSpec",
     "RidgeSpec",
     "RolloutSpec",
-    "SelectionSpec",
     "Spec",
     "SpecError",
     "Start",

@@ -135,7 +135,7 @@ def lines(error: ValidationError, model: type[BaseModel]) -> Iterator[str]:
     for detail in errors:
         depth = len(detail["loc"])
         below = any(other["loc"][:depth] == detail["loc"] and len(other["loc"]) > depth for other in errors)
-        if detail["type"] == "default_factory_not_called" or (detail["type"] == "too_short" and below):
+        if detail["type"] == "too_short" and below:
             continue  # follows from another problem: invalid items also make a list too short
         path = _path(detail["loc"])
         if detail["type"] == "spec":

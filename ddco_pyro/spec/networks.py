@@ -63,7 +63,7 @@ class Network(Model):
     @property
     def hidden_sizes(self) -> tuple[int, ...]:
         """Sizes of the hidden layers; empty for networks without."""
-        return ()
+        return getattr(self, "hidden", ())
 
     @model_validator(mode="before")
     @classmethod
@@ -107,10 +107,6 @@ class LayeredSpec(Network):
 
     hidden: Sizes = (64,)
     """Sizes of the hidden or recurrent layers, first layer first; a bare number is a single layer."""
-
-    @property
-    def hidden_sizes(self) -> tuple[int, ...]:
-        return self.hidden
 
 
 class MlpSpec(LayeredSpec):

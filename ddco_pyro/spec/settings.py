@@ -122,17 +122,13 @@ class ObservationSpec(Model):
     def problems(self) -> Problems:
         if self.crop is not None and 0 in self.crop[2:]:
             yield "crop", "is top, left, height, width; height and width must be at least 1"
-        if self.key == STEP and self.differences:
-            yield "differences", f"{STEP} grows by the same at each step; leave it out"
+        for key in ("differences", "angles", "quaternions", "shift"):
+            if self.key == STEP and getattr(self, key):
+                yield key, f"does not apply to {STEP}; leave it out"
         turned = [*self.angles, *(first + place for first in self.quaternions for place in range(4))]
-        for key in ("angles", "quaternions"):
-            if getattr(self, key) and self.key == STEP:
-                yield key, f"{STEP} is no angle; leave it out"
-            elif getattr(self, key) and len(set(turned)) < len(turned):
-                yield key, "name a number twice; each is part of one angle or quaternion"
-                break
-        if self.key == STEP and self.shift:
-            yield "shift", f"{STEP} is computed and is no picture; leave it out"
+        if len(set(turned)) < len(turned):
+            where = "angles" if self.angles else "quaternions"
+            yield where, "name a number twice; each is part of one angle or quaternion"
 
     def turned(self, size: int) -> int:
         """For vectors: numbers of a step of ``size`` numbers, with angles and quaternions in their place."""

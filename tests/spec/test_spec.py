@@ -302,7 +302,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"hierarchy.meta_policy": {"network": "linear", "hidden": [8]}}, "hierarchy.meta_policy.hidden: does not apply"),
     ({"control.parts": [{"name": "jaw", "dims": [0], "kind": "binary", "std": 1}]}, "control.parts.0.std: does"),
     ({"observations": ["step"]}, "observations: step alone says nothing about the state"),
-    ({"observations": ["state", {"key": "step", "differences": True}]}, "observations.1.differences: step grows by"),
+    ({"observations": ["state", {"key": "step", "differences": True}]}, "observations.1.differences: does not apply"),
     ({"hierarchy.meta_policy": {"network": "conv", "layers": []}}, "hierarchy.meta_policy.layers: must have at least"),
     ({"hierarchy.meta_policy": {"network": "branches"}}, "hierarchy.meta_policy.of: missing; it has to be given"),
     (
