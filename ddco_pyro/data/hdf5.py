@@ -214,11 +214,10 @@ def member(group: h5py.Group, key: str, kind: type, where: str) -> Any:
 def attributes_of(owner: h5py.HLObject) -> dict[str, Attribute]:
     """The attributes that hold one number or text. Other attributes are not read, because they can claim any size."""
     kinds = {name: owner.attrs.get_id(name) for name in owner.attrs}
-    single = [name for name, kind in kinds.items() if kind.shape == () and _is_number_or_text(kind.dtype)]
+    single = [
+        name for name, kind in kinds.items()
+        if kind.shape == () and (kind.dtype.kind in "iufb" or h5py.check_string_dtype(kind.dtype) is not None)
+    ]  # fmt: skip
     values = {name: owner.attrs[name] for name in single}
     plain = {name: value.item() if isinstance(value, np.generic) else value for name, value in values.items()}
     return {name: value for name, value in plain.items() if isinstance(value, Attribute)}
-
-
-def _is_number_or_text(dtype: np.dtype) -> bool:
-    return dtype.kind in "iufb" or h5py.check_string_dtype(dtype) is not None

@@ -88,10 +88,7 @@ class Acting(TorchDistribution):
     support = constraints.real_vector
 
     def __init__(
-        self,
-        emissions: tuple[Any, ...],
-        choices: tuple[Tensor, ...],
-        validate_args: bool | None = None,
+        self, emissions: tuple[Any, ...], choices: tuple[Tensor, ...], validate_args: bool | None = None
     ) -> None:
         self.emissions, self.choices = emissions, choices
         *batch, _, size = emissions[0].shape

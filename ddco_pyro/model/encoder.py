@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ddco_pyro.data.arrays import PICTURE_DIMENSIONS, LazyArray, Observed, network_input
+from ddco_pyro.data.arrays import PICTURE_DIMENSIONS, Observed, network_input
 from ddco_pyro.data.controls import rounding
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.pictures import Transform, TransformError
@@ -151,11 +151,7 @@ class ObservationEncoder(nn.Module):
             first += size
         return np.concatenate(moves)
 
-    def features(
-        self,
-        observations: Mapping[str, Observed],
-        times: np.ndarray | None = None,
-    ) -> np.ndarray:
+    def features(self, observations: Mapping[str, Observed], times: np.ndarray | None = None) -> np.ndarray:
         """Observations [T, ...] by name to features [T, F], not yet standardised.
 
         :param times: the number of each step [T]; by default 0 to T - 1.
@@ -177,11 +173,7 @@ class ObservationEncoder(nn.Module):
         # A split into nothing cannot be read again from an exported program.
         return dict(zip(self.keys, vector.split(self.sizes, -1), strict=True)) if self.sizes else {}
 
-    def inputs(
-        self,
-        observations: Iterable[Mapping[str, Observed]],
-        times: np.ndarray | None = None,
-    ) -> Inputs:
+    def inputs(self, observations: Iterable[Mapping[str, Observed]], times: np.ndarray | None = None) -> Inputs:
         """Sequences of observations, each [T_n, ...] by name, to padded network inputs.
 
         Pictures are read when a network asks for them.
@@ -192,7 +184,7 @@ class ObservationEncoder(nn.Module):
         vectors = [self.scaled(self.features(sequence, times)) for sequence in sequences]
         vector = padded(vectors).float()
         by_key, steps = dict(zip(self.keys, vector.split(self.sizes, -1), strict=True)), vector.shape[1]
-        pictures = {key: tuple(_as_pictures(sequence[key]) for sequence in sequences) for key in self.images}
+        pictures = {key: tuple(sequence[key] for sequence in sequences) for key in self.images}
         images = Frames(pictures, self.transforms, slice(0, steps)) if pictures else {}
         return Inputs(by_key, images, torch.arange(steps))
 
@@ -238,10 +230,6 @@ def _seen_shape(spec: ObservationSpec, shapes: Shapes) -> tuple[int, ...]:
         return _transform(spec).shape(stored)
     except TransformError as error:
         raise ShapeError(f"observations: {spec.key!r} {error}") from error
-
-
-def _as_pictures(values: Observed) -> Observed:
-    return values if isinstance(values, LazyArray) else np.asarray(values)
 
 
 def padded(sequences: Sequence[np.ndarray]) -> Tensor:

@@ -306,8 +306,11 @@ class Hierarchy(nn.Module):
         for level in levels:
             callers.append(level.policy(next(each), self.scaling))
             endings.append(None if level.termination is None else next(each).squeeze(-1))
-        top = raw[-1]
-        last = _uniform(top, levels[-1].count) if discovering else self.meta_policy(top, self.scaling)
+        if discovering:  # under a meta-policy that selects each option with the same probability
+            count = levels[-1].count
+            last = CallerOutputs(count, torch.zeros(*raw[-1].shape[:2], 1, count), None)
+        else:
+            last = self.meta_policy(raw[-1], self.scaling)
         return Outputs((*callers, last), tuple(endings), self.power)
 
 
@@ -326,8 +329,3 @@ def _meta_policy(spec: Spec) -> tuple[NetworkSpec, tuple[Emits, ...]]:
         kept = {"hidden": ()} | policy.model_dump(exclude={"network"})  # a linear policy has no hidden layers
         policy = PerTimestepSpec(network="per_timestep", **kept)
     return policy, ("control",)
-
-
-def _uniform(like: Tensor, options: int) -> CallerOutputs:
-    """A meta-policy that selects each of k options with probability 1/k, at the steps of ``like`` [N, T, ...]."""
-    return CallerOutputs(options, torch.zeros(*like.shape[:2], 1, options), None)

@@ -19,7 +19,6 @@ from pydantic import (
     TypeAdapter,
     field_validator,
     model_serializer,
-    model_validator,
 )
 
 from ddco_pyro.errors import nearest
@@ -64,15 +63,6 @@ class Network(Model):
     def hidden_sizes(self) -> tuple[int, ...]:
         """Sizes of the hidden layers; empty for networks without."""
         return getattr(self, "hidden", ())
-
-    @model_validator(mode="before")
-    @classmethod
-    def _settings_apply(cls, data: Any) -> Any:
-        if isinstance(data, dict) and (name := data.get("network", "mlp")) and isinstance(name, str):
-            foreign = [key for key in foreign_keys(name) if key in data]
-            if foreign:
-                raise invalid(*((key, f"does not apply to network {name!r}; leave it out") for key in foreign))
-        return data
 
     def problems(self) -> Problems:
         for name in get_args(Emission):

@@ -9,20 +9,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import BeforeValidator, Field, InstanceOf, PlainSerializer
 
-from ddco_pyro.spec.base import (
-    Count,
-    Items,
-    Model,
-    Positive,
-    Problems,
-    Seed,
-    Share,
-    Text,
-    bare,
-    invalid,
-    nested,
-    show,
-)
+from ddco_pyro.spec.base import Count, Items, Model, Positive, Problems, Seed, Share, Text, bare, invalid, nested, show
 
 LabelNames = Annotated[Items[Text], Field(min_length=1)]
 Labels = Annotated[Text | LabelNames, nested((list, tuple), LabelNames, "a name, or a list with a name for each level")]

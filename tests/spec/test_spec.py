@@ -105,8 +105,8 @@ DEEP = "not valid YAML: nested too deeply"
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "the file is empty; it has to hold a spec"),
-        ("- a\n- b\n", "the file holds ['a', 'b'], not a mapping (key: value)"),
+        ("", "holds null, not a mapping (key: value), as a spec is"),
+        ("- a\n- b\n", "holds ['a', 'b'], not a mapping (key: value), as a spec is"),
         ("seed: 1\ntask: [a\n", "line 3, column 1: not valid YAML: expected ',' or ']', but got '<stream end>'"),
         ("seed: 1\ntask: a\nseed: 2\n", "line 3, column 1: not valid YAML: key 'seed' is given twice"),
         ("a: *b\n", "line 1, column 4: not valid YAML: found undefined alias 'b'"),
@@ -181,7 +181,7 @@ def test_another_network_drops_the_settings_of_the_old_one() -> None:
     linear = with_overrides(parse_spec(data), {f"{path}.network": "linear"})
     assert linear.hierarchy is not None
     assert linear.hierarchy.levels[0].policy.hidden_sizes == ()
-    with pytest.raises(SpecError, match="hidden: does not apply to network 'linear'"):
+    with pytest.raises(SpecError, match="hidden: unknown key; valid here: network, inputs, emits"):
         with_overrides(parse_spec(data), {f"{path}.hidden": [3], f"{path}.network": "linear"})
 
 
@@ -299,7 +299,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         {"hierarchy.meta_policy": {"network": "constant", "inputs": ["a"]}},
         "hierarchy.meta_policy.inputs: a constant re",
     ),
-    ({"hierarchy.meta_policy": {"network": "linear", "hidden": [8]}}, "hierarchy.meta_policy.hidden: does not apply"),
+    ({"hierarchy.meta_policy": {"network": "linear", "hidden": [8]}}, "hierarchy.meta_policy.hidden: unknown key"),
     ({"control.parts": [{"name": "jaw", "dims": [0], "kind": "binary", "std": 1}]}, "control.parts.0.std: does"),
     ({"observations": ["step"]}, "observations: step alone says nothing about the state"),
     ({"observations": ["state", {"key": "step", "differences": True}]}, "observations.1.differences: does not apply"),

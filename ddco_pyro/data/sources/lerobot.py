@@ -47,8 +47,6 @@ ANNOTATIONS = Path("meta") / "lerobot_annotations.json"
 IMAGES_AT_ONCE = 32
 _NO_CONTROL = {"timestamp", "frame_index", "episode_index", "index", "task_index", "image", "video", "string"}
 """Names and types of features that are never the control."""
-_LONGEST = 1e9
-"""Longest video, seconds."""
 _DAMAGE = (pyarrow.ArrowException, OSError, KeyError, ValueError, TypeError, IndexError)
 
 
@@ -213,8 +211,6 @@ class LeRobot:
             begin = float(self._episodes[index][f"videos/{key}/from_timestamp"])
         except _DAMAGE as error:
             raise damaged(self.folder, f"{rows.name}: {key}", error) from error
-        if not 0 <= begin < _LONGEST:
-            raise DemonstrationsError(f"{rows.name}: {key} begins at second {begin:g} of its video")
         rate = self._frequency or 1.0
         shown = frames_of_steps(path, rows.name, begin + start / rate, stop - start, rate, size)
         while block := list(islice(shown, IMAGES_AT_ONCE)):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
 
 import torch
 from torch import Tensor, nn
@@ -87,7 +86,7 @@ class StackedLstm(nn.Module):
         if batch[1] == 1:
             return self._step(values, h.transpose(0, 1), c.transpose(0, 1))
         sequences = values.unflatten(1, batch).expand(self.size[0], -1, -1, -1)
-        with _without_warning():
+        with warnings.catch_warnings(action="ignore", category=UserWarning):  # of scattered weights, on GPUs
             each = [
                 torch.lstm(sequence, own, weights, True, 1, 0.0, self.training, False, True)
                 for sequence, own, weights in zip(sequences, self._states(h, c), self._weights(), strict=True)
@@ -141,11 +140,3 @@ def _in_windows(
             h, c = (state.unflatten(0, (trajectories, windows))[:, -1] for state in (h, c))
             parts.append(said.unflatten(1, (trajectories, size)))
     return torch.cat(parts, dim=2).flatten(1, 2), h, c
-
-
-@contextmanager
-def _without_warning() -> Iterator[None]:
-    """Suppresses torch's warning about scattered weights on GPUs."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "RNN module weights are not part of single contiguous chunk", UserWarning)
-        yield
