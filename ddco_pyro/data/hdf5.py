@@ -167,14 +167,16 @@ def dataset_at(group: h5py.Group, key: str, where: str) -> h5py.Dataset:
         raise DemonstrationsError(f"{where} has no steps; it has to be an array")
     if dataset.is_virtual or dataset.external:
         raise _elsewhere(f"{where} is {'virtual' if dataset.is_virtual else 'stored in another file'}", dataset.file)
-    stored = dataset.id.get_storage_size()
-    if not dataset.chunks and dataset.nbytes > stored:
-        raise DemonstrationsError(f"{where} claims {dataset.nbytes} bytes, but the file holds {stored}; write it again")
+    what, claimed, there = "bytes", dataset.nbytes, dataset.id.get_storage_size()
     if dataset.chunks:
-        needed = math.prod(-(-size // chunk) for size, chunk in zip(dataset.shape, dataset.chunks, strict=True))
-        there = dataset.id.get_num_chunks()
-        if there < needed:
-            raise DemonstrationsError(f"{where} claims {needed} chunks, but the file holds {there}; write it again")
+        each = zip(dataset.shape, dataset.chunks, strict=True)
+        what, claimed, there = (
+            "chunks",
+            math.prod(-(-size // chunk) for size, chunk in each),
+            dataset.id.get_num_chunks(),
+        )
+    if there < claimed:
+        raise DemonstrationsError(f"{where} claims {claimed} {what}, but the file holds {there}; write it again")
     return dataset
 
 

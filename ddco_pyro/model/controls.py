@@ -145,10 +145,6 @@ class ControlScaling(nn.Module):
                 values = torch.where(torch.arange(values.shape[-1]) == dims[0], actions.unsqueeze(-1), values)
         return torch.cat([values, self.constant.expand(*values.shape[:-1], -1)], dim=-1)[..., self.order]
 
-    def unscaled(self, scaled: Tensor) -> np.ndarray:
-        controls: np.ndarray = self.emitted(scaled).numpy()
-        return controls
-
     def ends(self) -> tuple[Tensor, Tensor]:
         """Lower and upper bounds in scaled units, float32 [A'], infinite where there are none."""
         return ((self.low - self.shift) / self.scale).float(), ((self.high - self.shift) / self.scale).float()

@@ -61,7 +61,7 @@ class ObservationEncoder(nn.Module):
                 raise ShapeError(f"observations: {spec.key!r} {why}")
         self.specs = tuple(spec for spec in specs if kinds[spec.key] == "vector")
         pictures = [spec for spec in specs if kinds[spec.key] == "picture"]
-        self.transforms = {spec.key: _transform(spec) for spec in pictures}
+        self.transforms = {spec.key: Transform(spec.crop, spec.resize) for spec in pictures}
         self.shifts = {spec.key: spec.shift for spec in pictures if spec.shift}
         seen = {spec.key: _seen_shape(spec, shapes) for spec in specs}
         self.images = {spec.key: seen[spec.key] for spec in pictures}
@@ -206,10 +206,6 @@ def _ends(values: np.ndarray, bins: int) -> np.ndarray:
     return np.asarray(np.quantile(np.unique(values), np.linspace(0, 1, bins + 1), method="nearest"))
 
 
-def _transform(spec: ObservationSpec) -> Transform:
-    return Transform(spec.crop, spec.resize)
-
-
 def _seen_shape(spec: ObservationSpec, shapes: Shapes) -> tuple[int, ...]:
     """The shape of a step of an observation as networks see it.
 
@@ -227,7 +223,7 @@ def _seen_shape(spec: ObservationSpec, shapes: Shapes) -> tuple[int, ...]:
     if spec.shift and len(stored) != PICTURE_DIMENSIONS:
         raise ShapeError(f"observations: {spec.key!r} has shape {list(stored)} at each step: shift is for pictures")
     try:
-        return _transform(spec).shape(stored)
+        return Transform(spec.crop, spec.resize).shape(stored)
     except TransformError as error:
         raise ShapeError(f"observations: {spec.key!r} {error}") from error
 

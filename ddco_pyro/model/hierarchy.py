@@ -248,7 +248,7 @@ class Hierarchy(nn.Module):
 
         :param discovering: as in :meth:`tabulate`.
         """
-        chunks = self.chunks(inputs)
+        chunks = list(inputs.chunks(self.steps_in_memory // inputs.batch[0]))
         if len(chunks) == 1:
             return self._outputs(self._run_networks(inputs, None, discovering)[0], discovering)
         each: list[RawOutputs] = []
@@ -270,10 +270,6 @@ class Hierarchy(nn.Module):
     def initial_states(self, trajectories: int) -> dict[str, State]:
         """The states of all networks before the first step, by :meth:`networks`' names."""
         return {place: network.initial_state(trajectories) for place, network in self.networks().items()}
-
-    def chunks(self, inputs: Inputs) -> list[Inputs]:
-        """The chunks of time in which these observations go through the networks; a single one where they fit."""
-        return list(inputs.chunks(self.steps_in_memory // inputs.batch[0]))
 
     def _run_networks(
         self, inputs: Inputs, before: States | None, discovering: int | None = None, _: Tensor | None = None

@@ -342,7 +342,7 @@ def test_scaling_keeps_exactly_the_value_apart(rested):
     scaled = np.float32(scaling.scaled(rows))
     assert ((scaled[:, 1] == 0) == [True, True, True, False, False]).all()
     assert (scaled[:, [0, 2]] == 0).all()
-    np.testing.assert_array_equal(scaling.unscaled(torch.from_numpy(scaled))[0], rows[0])
+    np.testing.assert_array_equal(scaling.emitted(torch.from_numpy(scaled))[0], rows[0])
 
 
 @pytest.mark.parametrize("row", ROWS)

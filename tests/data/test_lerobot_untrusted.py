@@ -54,11 +54,6 @@ def test_what_leads_out_is_refused_and_nothing_is_touched(name: str, tmp_path: P
         assert snapshot(tmp_path) == before
 
 
-def test_videos_that_lead_out_are_refused(tmp_path: Path) -> None:
-    dataset = odd.changed(odd.info(video_path="videos/../../{video_key}.mp4"))(tmp_path)
-    refused(call("import", dataset, "--out", tmp_path / "demos.hdf5"), odd.OUT)
-
-
 def test_the_hubs_cache_is_read_and_copied(tmp_path: Path, run: Path) -> None:
     """There the files of a dataset are links into the folder ``blobs``."""
     hub = tmp_path / "datasets--ddco--fixture"

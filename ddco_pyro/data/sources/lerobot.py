@@ -78,9 +78,6 @@ class LeRobot:
         self.keys = dict(zip(observed, keys, strict=True))
         self._actions = tuple(actions) or (ACTION,)
         self._check_actions()
-        if isinstance(template := self.info.get("video_path"), str):  # before anything is read
-            numbers = dict.fromkeys(("chunk_index", "file_index", "episode_index"), 0)
-            inside(folder, filled(folder, template, {**numbers, "video_key": "video"}))
         self._episodes, self._twice = _episodes(folder)
         if not self._episodes:
             raise DemonstrationsError(f"{folder}: meta/episodes holds no episodes; at least one is needed")

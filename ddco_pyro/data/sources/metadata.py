@@ -124,11 +124,7 @@ def joined(parts: Mapping[str, np.ndarray], where: str) -> np.ndarray:
 
 def _storable(key: str) -> bool:
     """Whether a key is a valid path in HDF5."""
-    try:
-        length = len(key.encode())
-    except UnicodeEncodeError:
-        return False
-    return length <= 1000 and "\0" not in key and all(part not in ("", ".") for part in key.split("/"))
+    return len(key) <= 250 and "\0" not in key and all(part not in ("", ".") for part in key.split("/"))
 
 
 def stored_keys(folder: Path, names: Sequence[str], preferred: Sequence[str]) -> list[str]:
