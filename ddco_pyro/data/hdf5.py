@@ -169,12 +169,8 @@ def dataset_at(group: h5py.Group, key: str, where: str) -> h5py.Dataset:
         raise _elsewhere(f"{where} is {'virtual' if dataset.is_virtual else 'stored in another file'}", dataset.file)
     what, claimed, there = "bytes", dataset.nbytes, dataset.id.get_storage_size()
     if dataset.chunks:
-        each = zip(dataset.shape, dataset.chunks, strict=True)
-        what, claimed, there = (
-            "chunks",
-            math.prod(-(-size // chunk) for size, chunk in each),
-            dataset.id.get_num_chunks(),
-        )
+        what, there = "chunks", dataset.id.get_num_chunks()
+        claimed = math.prod(-(-size // chunk) for size, chunk in zip(dataset.shape, dataset.chunks, strict=True))
     if there < claimed:
         raise DemonstrationsError(f"{where} claims {claimed} {what}, but the file holds {there}; write it again")
     return dataset

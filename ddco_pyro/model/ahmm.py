@@ -118,7 +118,6 @@ class Acting(TorchDistribution):
 
     @property
     def noise(self) -> int:
-        """How many standard normal numbers a control is drawn from."""
         number: int = self.emissions[0].noise
         return number
 

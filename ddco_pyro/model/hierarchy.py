@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from types import MappingProxyType
-from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -26,6 +25,7 @@ from ddco_pyro.model.recogniser import Recogniser
 from ddco_pyro.model.seeding import HOST
 from ddco_pyro.model.tables import Tables
 from ddco_pyro.spec import ControlSpec, LevelSpec, NetworkSpec, Spec
+from ddco_pyro.spec.base import Emission
 from ddco_pyro.spec.networks import Network as AnyNetworkSpec
 from ddco_pyro.spec.networks import PerTimestepSpec
 
@@ -34,8 +34,6 @@ BYTES_AT_ONCE = 256 * 10**6
 
 PART_OF_A_GPU = 0.1
 """Share of a GPU's whole memory that networks take in place of that, so that GPUs of one kind cut alike."""
-
-Emits = Literal["options", "control"]
 
 RawOutputs = Sequence[Tensor]
 """The outputs of networks [N, T, K, F]: policy and, where it has one, termination of each level, lowest first, and the
@@ -52,7 +50,7 @@ class Caller(nn.Module):
     def __init__(
         self,
         network: NetworkSpec,
-        emits: tuple[Emits, ...],
+        emits: tuple[Emission, ...],
         options: int,
         shape: InputShape | Network,
         control: ControlSpec,
@@ -316,7 +314,7 @@ def _bytes_at_once(device: torch.device) -> float:
     return BYTES_AT_ONCE
 
 
-def _meta_policy(spec: Spec) -> tuple[NetworkSpec, tuple[Emits, ...]]:
+def _meta_policy(spec: Spec) -> tuple[NetworkSpec, tuple[Emission, ...]]:
     if spec.hierarchy is not None:
         return spec.hierarchy.meta_policy, spec.hierarchy.meta_policy.emits
     assert spec.baseline is not None  # a spec has one or the other

@@ -16,9 +16,6 @@ PERCEPTRONS = ("linear", "mlp")
 HEADS = (*PERCEPTRONS, "constant")
 """The networks that can stand above a trunk."""
 
-ALWAYS: Literal["always"] = "always"
-"""The termination of options that end after every step, ψ = 1."""
-
 Termination = Annotated[
     NetworkSpec | Literal["always"],
     nested((Mapping, Network), NetworkSpec, "a network, such as {network: linear}, or always"),
@@ -44,7 +41,7 @@ class LevelSpec(Model):
     @property
     def lasts(self) -> bool:
         """Whether options can be active for more than one step."""
-        return self.termination != ALWAYS
+        return self.termination != "always"
 
     @property
     def networks(self) -> dict[str, Network]:

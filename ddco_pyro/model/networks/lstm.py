@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from ddco_pyro.model.networks.inputs import Inputs, InputShape
 from ddco_pyro.model.networks.perceptrons import (
-    Linear,
+    Mlp,
     Network,
     NumpyForm,
     Perceptrons,
@@ -36,7 +36,7 @@ class Lstm(Network):
     ) -> None:
         super().__init__()
         self.copies, self.horizon = copies, horizon
-        self.over = over or Linear(shape, copies)
+        self.over = over or Mlp(shape, copies)
         sizes = zip([self.over.features, *hidden], hidden, strict=False)
         self.memory = nn.ModuleList(StackedLstm(copies, *pair) for pair in sizes)
         self.layers = Perceptrons(copies, hidden[-1], ())

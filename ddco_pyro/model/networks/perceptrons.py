@@ -163,6 +163,8 @@ class Network(nn.Module):
 class Mlp(Network):
     """K perceptrons over all vectors side by side, or over the features of a trunk (SM 1.1, SM 1.3).
 
+    Without hidden layers the head is K linear maps.
+
     :raises ShapeError: there are images, which only a convolution can read.
     """
 
@@ -192,13 +194,6 @@ class Mlp(Network):
 
     def numpy_form(self) -> NumpyForm:
         return self.layers.numpy_form(({"kind": "trunk"}, {}) if self.trunk_size else vectors(self.reads, self.copies))
-
-
-class Linear(Mlp):
-    """The vectors, or a trunk's features, themselves; with a head K linear maps of them."""
-
-    def __init__(self, shape: InputShape | Network, copies: int) -> None:
-        super().__init__(shape, copies)
 
 
 class Constant(Mlp):
