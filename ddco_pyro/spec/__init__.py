@@ -5,7 +5,7 @@ An unknown key, a wrong type or a value out of range is a :class:`SpecError` wit
 
 from ddco_pyro.spec.base import SpecError
 from ddco_pyro.spec.model import BaselineSpec, HierarchySpec, LevelSpec
-from ddco_pyro.spec.networks import Activation, ConvolutionLayer, NetworkSpec, PolicySpec, Pool, network_spec
+from ddco_pyro.spec.networks import Activation, ConvolutionLayer, NetworkSpec, PolicySpec, Pool
 from ddco_pyro.spec.settings import (
     DISCRETE,
     STEP,
@@ -49,7 +49,6 @@ __all__ = [
     "TrainingSpec",
     "dump_spec",
     "load_spec",
-    "network_spec",
     "parse_spec",
     "spec_schema",
     "user_code",

@@ -16,7 +16,6 @@ from pydantic import (
     Field,
     SerializerFunctionWrapHandler,
     Tag,
-    TypeAdapter,
     field_validator,
     model_serializer,
 )
@@ -254,16 +253,3 @@ TrunkSpec: TypeAlias = Annotated[NetworkSpec, AfterValidator(_has_features)]
 
 LstmSpec.model_rebuild()
 BranchesSpec.model_rebuild()
-
-_ANY: TypeAdapter[NetworkSpec] = TypeAdapter(NetworkSpec)
-
-
-def network_spec(**settings: Any) -> NetworkSpec:
-    """The validated settings of a network.
-
-    >>> network_spec(network="mlp", hidden=32).hidden
-    (32,)
-
-    :raises pydantic.ValidationError: a setting is invalid or does not apply to the network.
-    """
-    return _ANY.validate_python(settings)
