@@ -483,10 +483,7 @@ def _kind(dim: ControlDimension, declared: str, alone: bool) -> tuple[str, str]:
 
 
 def _resting_together(dimensions: Sequence[ControlDimension], place: str) -> list[list[ControlDimension]]:
-    """Groups of dimensions that equal their commonest inside values in the same steps.
-
-    :raises SpecError: a dimension has no such value.
-    """
+    """Groups of dimensions that equal their commonest inside values in the same steps."""
     groups: list[list[ControlDimension]] = []
     for dim in dimensions:
         if dim.inside is None:
@@ -502,10 +499,7 @@ def _resting_together(dimensions: Sequence[ControlDimension], place: str) -> lis
 
 
 def _ends(dim: ControlDimension, kind: str, place: str, alone: bool) -> tuple[float, float]:
-    """The bounds of a dimension, or its extreme values where it is discrete.
-
-    :raises SpecError: it takes other values than the kind has.
-    """
+    """The bounds of a dimension, or its extreme values where it is discrete."""
     if kind == "categorical" and not dim.distinct:
         raise SpecError(f"{place}.kind: control dimension {dim.number} takes more than {MOST_DISTINCT} values")
     if kind == "categorical" and not alone and not all(value.is_integer() for value in dim.distinct):

@@ -207,10 +207,7 @@ def _ends(values: np.ndarray, bins: int) -> np.ndarray:
 
 
 def _seen_shape(spec: ObservationSpec, shapes: Shapes) -> tuple[int, ...]:
-    """The shape of a step of an observation as networks see it.
-
-    :raises ShapeError: it cannot be cropped, scaled, binned or shifted as the spec says.
-    """
+    """The shape of a step of an observation as networks see it."""
     stored = shapes[spec.key]
     if spec.bins and len(stored) == PICTURE_DIMENSIONS:
         raise ShapeError(f"observations: {spec.key!r} has pictures: bins are for vectors")

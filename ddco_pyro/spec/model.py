@@ -45,7 +45,6 @@ class LevelSpec(Model):
 
     @property
     def networks(self) -> dict[str, Network]:
-        """The networks of the level by their key."""
         networks = {"trunk": self.trunk, "policy": self.policy, "termination": self.termination}
         return {key: network for key, network in networks.items() if isinstance(network, Network)}
 

@@ -274,7 +274,6 @@ class PathSpec(NamedTuple):
 
 
 def _paths(value: Any) -> Any:
-    """One path or several."""
     return tuple(_path(one) for one in (value if isinstance(value, list | tuple) and not _is_pair(value) else (value,)))
 
 

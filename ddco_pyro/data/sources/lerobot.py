@@ -88,7 +88,6 @@ class LeRobot:
         self.data_files = tuple(sorted(path.relative_to(folder) for path in files))
 
     def source(self) -> Source:
-        """The episodes as demonstrations."""
         folder, robot = self.folder, self.info.get("robot_type")
         about: dict[str, Attribute] = {"robot_type": robot} if isinstance(robot, str) else {}
         if self._names:
@@ -100,7 +99,6 @@ class LeRobot:
         return Source(names, self._read, files, {}, self._frequency, about, self.keys)
 
     def _check_actions(self) -> None:
-        """Refuse features that do not exist as the control."""
         types = {name: about.get("dtype") if isinstance(about, dict) else None for name, about in self.features.items()}
         there = [name for name, dtype in types.items() if not {name, str(dtype)} & _NO_CONTROL]
         for feature in self._actions:
@@ -140,10 +138,7 @@ class LeRobot:
         return inside(self.folder, path)
 
     def _read(self, name: str) -> Demonstration:
-        """One episode.
-
-        :raises DemonstrationsError: rows are missing, out of order or damaged, or their number is wrong.
-        """
+        """One episode."""
         index = int(name.removeprefix("demo_"))
         if index in self._missing:
             raise DemonstrationsError(f"{name} {self._missing[index]}")

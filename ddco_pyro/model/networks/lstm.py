@@ -112,7 +112,6 @@ class StackedLstm(nn.Module):
             yield h[None, :, copy].contiguous(), c[None, :, copy].contiguous()
 
     def _weights(self) -> Iterator[list[Tensor]]:
-        """Weights and biases of each copy, as torch has them."""
         for weight, bias, recurrent in zip(self.inputs.weight, self.inputs.bias, self.recurrent, strict=True):
             yield [weight.mT.contiguous(), recurrent.mT.contiguous(), bias[0], torch.zeros_like(bias[0])]  # for GPUs
 

@@ -298,10 +298,7 @@ class Branches(Network):
 
 
 def _vectors_of(shape: InputShape) -> list[str]:
-    """The names of the vectors.
-
-    :raises ShapeError: there are images.
-    """
+    """The names of the vectors."""
     if shape.images:
         names = ", ".join(sorted(shape.images))
         remedy = "use network: conv, or name the vectors that it is to read in inputs"
