@@ -153,7 +153,7 @@ ROWS = {
     "act": Row(act, None),
     "act encoded": Row(partial(act, encoded=True), None),
     "act link": Row(act_linked, "episode_1.hdf5 leads out of the dataset"),
-    "act twice": Row(act_twice, r"episode_01?\.hdf5: has the number of episode_01?\.hdf5"),
+    "act twice": Row(act_twice, r"episode_0?1\.hdf5: has the number of episode_0?1\.hdf5"),
     "robosuite": Row(
         partial(robosuite, attribute="env_info"),
         r"conversion\.convert_robosuite --dataset .* && .*dataset_states_to_obs --dataset",
