@@ -145,7 +145,7 @@ class Controller:
         ended = [table[rows, choice, 1].exp() for table, choice in zip(now.termination, self._choices, strict=True)]
         self.all_terminations = _columns(ended, len(self.seeds))
         self.time += 1
-        return self.hierarchy.scaling.unscaled(control)
+        return self.hierarchy.scaling.emitted(control).numpy()
 
     def _chosen(self, now: Step, generators: Sequence[np.random.Generator]) -> tuple[Tensor, ...]:
         if self.options == "marginal":

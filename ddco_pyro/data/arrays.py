@@ -69,7 +69,6 @@ class LazyArray:
         return whole[::stride]
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        """All values, in memory."""
         refuse_too_much(self.dtype.itemsize * math.prod(self.shape), self.where or "an array", "divide the episode")
         return self[:].astype(dtype or self.dtype, copy=False)
 

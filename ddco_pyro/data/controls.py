@@ -167,7 +167,6 @@ class ControlDimension:
         return "; ".join(filter(None, (self.atom, ends and f"exactly at its {ends}", self.made)))
 
     def as_data(self) -> dict[str, Any]:
-        """The main statistics as plain data."""
         left_out = ("distinct", "together", "integer", "made_by", "exceptions")
         return {key: value for key, value in asdict(self).items() if key not in left_out}
 
@@ -313,7 +312,7 @@ class ControlPart:
     :param kind: one of :data:`KINDS`.
     :param low: for each dimension, in the control's units: the lower bound (-inf for none) of a ``clipped`` or
         ``hurdle`` part, the lower value of a ``binary`` part; ``high`` likewise. Empty for other kinds.
-    :param values: the actions of a one-dimensional ``categorical`` part; empty for one-hot rows.
+    :param values: the actions of a one-dimensional ``categorical`` part.
     :param exact: the value of each ``hurdle`` dimension that has a probability; empty for other kinds.
     :param why: the reason for the kind, in words.
     """
@@ -338,7 +337,6 @@ class ControlPart:
         return self.continuous and any(map(math.isfinite, (*self.low, *self.high)))
 
     def as_data(self) -> dict[str, Any]:
-        """The part as plain data."""
         return asdict(self)
 
     @classmethod
@@ -439,10 +437,6 @@ def _parts(declared: str, dimensions: Sequence[ControlDimension], place: str, na
     :param place: key path of the spec, for errors.
     :param name: of the part in the spec; empty for all other dimensions.
     """
-    if declared == "categorical" and len(dimensions) > 1 and all(dim.values == (0.0, 1.0) for dim in dimensions):
-        dims = tuple(dim.number for dim in dimensions)
-        yield ControlPart(name or declared, dims, declared, why=f"{len(dims)} discrete actions, as rows")
-        return
     decided = {dim.number: _kind(dim, declared, len(dimensions) == 1) for dim in dimensions}
     kinds = [kind for kind in KINDS if kind in {kind for kind, _ in decided.values()}]
     for kind in kinds:
@@ -489,10 +483,7 @@ def _kind(dim: ControlDimension, declared: str, alone: bool) -> tuple[str, str]:
 
 
 def _resting_together(dimensions: Sequence[ControlDimension], place: str) -> list[list[ControlDimension]]:
-    """Groups of dimensions that equal their commonest inside values in the same steps.
-
-    :raises SpecError: a dimension has no such value.
-    """
+    """Groups of dimensions that equal their commonest inside values in the same steps."""
     groups: list[list[ControlDimension]] = []
     for dim in dimensions:
         if dim.inside is None:
@@ -508,17 +499,11 @@ def _resting_together(dimensions: Sequence[ControlDimension], place: str) -> lis
 
 
 def _ends(dim: ControlDimension, kind: str, place: str, alone: bool) -> tuple[float, float]:
-    """The bounds of a dimension, or its extreme values where it is discrete.
-
-    :raises SpecError: it takes other values than the kind has.
-    """
+    """The bounds of a dimension, or its extreme values where it is discrete."""
     if kind == "categorical" and not dim.distinct:
         raise SpecError(f"{place}.kind: control dimension {dim.number} takes more than {MOST_DISTINCT} values")
     if kind == "categorical" and not alone and not all(value.is_integer() for value in dim.distinct):
-        raise SpecError(
-            f"{place}.kind: control dimension {dim.number} is not of whole numbers: discrete actions are such "
-            "dimensions, or rows with a single 1"
-        )
+        raise SpecError(f"{place}.kind: control dimension {dim.number} is not of whole numbers: no discrete action")
     if kind == "binary" and len(dim.values) != 2:
         raise SpecError(f"{place}.kind: control dimension {dim.number} takes more than two values; it is no switch")
     if kind in DISCRETE:

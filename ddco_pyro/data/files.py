@@ -69,7 +69,6 @@ class Output:
         return Path(os.path.realpath(self.path))
 
     def refused(self, why: str, remedy: str = "choose another place") -> NotWritable:
-        """The error that refuses the place."""
         return NotWritable(f"{self.option} {self.path}: {why}; {remedy}")
 
 

@@ -54,7 +54,6 @@ class _Disk(io.FileIO):
     error: OSError | None = None
 
     def write(self, data: Any) -> int:
-        """Write all data."""
         rest = memoryview(data).cast("B")
         size = len(rest)
         while rest and self.error is None:
@@ -72,7 +71,6 @@ class _Disk(io.FileIO):
         return len(view)
 
     def truncate(self, size: int | None = None) -> int:
-        """Change the size of the file."""
         try:
             return super().truncate(size) if self.error is None else 0
         except OSError as error:
@@ -98,10 +96,6 @@ def written(path: Path, mode: Literal["w", "r+"] = "w") -> Iterator[h5py.File]:
 def natural(name: str) -> list[tuple[int, str]]:
     """A sort key that puts ``demo_2`` before ``demo_10``."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
-
-
-PACKED, SMALL = 5_000, 10**9
-"""Most bytes that a filtered dataset claims for each stored byte (deflate reaches 1032), or in all."""
 
 
 def lazy(dataset: h5py.Dataset, where: str, steps: int | None = None) -> LazyArray:
@@ -173,15 +167,12 @@ def dataset_at(group: h5py.Group, key: str, where: str) -> h5py.Dataset:
         raise DemonstrationsError(f"{where} has no steps; it has to be an array")
     if dataset.is_virtual or dataset.external:
         raise _elsewhere(f"{where} is {'virtual' if dataset.is_virtual else 'stored in another file'}", dataset.file)
-    stored = dataset.id.get_storage_size()
-    filtered = stored and dataset.id.get_create_plist().get_nfilters()
-    if dataset.nbytes > (max(PACKED * stored, SMALL) if filtered else stored):
-        raise DemonstrationsError(f"{where} claims {dataset.nbytes} bytes, but the file holds {stored}; write it again")
+    what, claimed, there = "bytes", dataset.nbytes, dataset.id.get_storage_size()
     if dataset.chunks:
-        needed = math.prod(-(-size // chunk) for size, chunk in zip(dataset.shape, dataset.chunks, strict=True))
-        there = dataset.id.get_num_chunks()
-        if there < needed:
-            raise DemonstrationsError(f"{where} claims {needed} chunks, but the file holds {there}; write it again")
+        what, there = "chunks", dataset.id.get_num_chunks()
+        claimed = math.prod(-(-size // chunk) for size, chunk in zip(dataset.shape, dataset.chunks, strict=True))
+    if there < claimed:
+        raise DemonstrationsError(f"{where} claims {claimed} {what}, but the file holds {there}; write it again")
     return dataset
 
 
@@ -221,11 +212,10 @@ def member(group: h5py.Group, key: str, kind: type, where: str) -> Any:
 def attributes_of(owner: h5py.HLObject) -> dict[str, Attribute]:
     """The attributes that hold one number or text. Other attributes are not read, because they can claim any size."""
     kinds = {name: owner.attrs.get_id(name) for name in owner.attrs}
-    single = [name for name, kind in kinds.items() if kind.shape == () and _is_number_or_text(kind.dtype)]
+    single = [
+        name for name, kind in kinds.items()
+        if kind.shape == () and (kind.dtype.kind in "iufb" or h5py.check_string_dtype(kind.dtype) is not None)
+    ]  # fmt: skip
     values = {name: owner.attrs[name] for name in single}
     plain = {name: value.item() if isinstance(value, np.generic) else value for name, value in values.items()}
     return {name: value for name, value in plain.items() if isinstance(value, Attribute)}
-
-
-def _is_number_or_text(dtype: np.dtype) -> bool:
-    return dtype.kind in "iufb" or h5py.check_string_dtype(dtype) is not None

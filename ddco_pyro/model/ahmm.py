@@ -39,25 +39,20 @@ class Tabulated(TorchDistribution):
 
     @property
     def support(self) -> constraints.Constraint:
-        """The choices 0 to C - 1."""
         return constraints.integer_interval(0, self.logits.shape[-1] - 1)
 
     def expand(self, batch_shape: Sequence[int], _instance: Any = None) -> Tabulated:
-        """The same choice for a larger batch."""
         return Tabulated(self.logits.expand(*batch_shape, -1), validate_args=False)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """The table's entries at ``value``."""
         return Vindex(self.logits)[..., value.long()]
 
     def enumerate_support(self, expand: bool = True) -> Tensor:
-        """Every choice, along a new first dimension."""
         values = torch.arange(self.logits.shape[-1], device=self.logits.device)
         values = values.reshape((-1,) + (1,) * len(self.batch_shape))
         return values.expand((-1, *self.batch_shape)) if expand else values
 
     def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:
-        """A draw from the choices."""
         return torch.distributions.Categorical(logits=self.logits, validate_args=False).sample(torch.Size(sample_shape))
 
 
@@ -72,15 +67,12 @@ class Scored:
 
     @property
     def shape(self) -> torch.Size:
-        """[..., K, 0]."""
         return torch.Size([*self.table.shape, 0])
 
     def log_density(self, actions: Tensor) -> Tensor:
-        """The known log-densities, whatever the controls."""
         return self.table
 
     def steps(self) -> list[Scored]:
-        """One for each step."""
         return [Scored(table) for table in self.table.unbind(1)]
 
 
@@ -96,10 +88,7 @@ class Acting(TorchDistribution):
     support = constraints.real_vector
 
     def __init__(
-        self,
-        emissions: tuple[Any, ...],
-        choices: tuple[Tensor, ...],
-        validate_args: bool | None = None,
+        self, emissions: tuple[Any, ...], choices: tuple[Tensor, ...], validate_args: bool | None = None
     ) -> None:
         self.emissions, self.choices = emissions, choices
         *batch, _, size = emissions[0].shape
@@ -107,7 +96,6 @@ class Acting(TorchDistribution):
         super().__init__(torch.Size(shape), torch.Size([size]), validate_args=validate_args)
 
     def expand(self, batch_shape: Sequence[int], _instance: Any = None) -> Acting:
-        """The control for choices of a larger batch."""
         return Acting(self.emissions, tuple(choice.expand(batch_shape) for choice in self.choices), validate_args=False)
 
     def log_prob(self, value: Tensor) -> Tensor:
@@ -130,7 +118,6 @@ class Acting(TorchDistribution):
 
     @property
     def noise(self) -> int:
-        """How many standard normal numbers a control is drawn from."""
         number: int = self.emissions[0].noise
         return number
 

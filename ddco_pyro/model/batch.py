@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
-from ddco_pyro.model.controls import ControlScaling, refuse_impossible
+from ddco_pyro.model.controls import ControlScaling
 from ddco_pyro.model.encoder import ObservationEncoder, padded
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.networks.inputs import Frames
@@ -84,8 +84,7 @@ def encode(
 ) -> Batch:
     """All demonstrations as one padded batch.
 
-    :param fitted: whether the model is fitted, so that its kinds of controls stand.
-    :raises DemonstrationsError: as :func:`refuse_unusable`.
+    :param fitted: as in :func:`refuse_unusable`, which this calls.
     """
     refuse_unusable(demonstrations, encoder, scaling, fitted)
     inputs = encoder.inputs(demo.observations for demo in demonstrations)
@@ -98,12 +97,15 @@ def refuse_unusable(
 ) -> None:
     """Check that networks can take every feature, and the emissions every control.
 
-    :raises DemonstrationsError: a number in scaled units is larger than :data:`LARGEST_SCALED`, or a control has a
-        value of probability 0.
+    :param fitted: whether the model is fitted, so that its kinds of controls stand.
+    :raises DemonstrationsError: a number in scaled units is larger than :data:`LARGEST_SCALED`, or a switch or a
+        discrete action has a value of probability 0.
     """
-    refuse_impossible(demonstrations, scaling, fitted)
     places = np.repeat([f"obs/{spec.key}" for spec in encoder.specs], encoder.sizes)
     for demo in demonstrations:
+        if problem := scaling.impossible(demo.name, demo.actions):
+            declare, repair = "declare another kind in control.parts", f"repair it, or leave {demo.name} out"
+            raise DemonstrationsError(f"{problem}; {repair if fitted else declare}")
         features = encoder.scaled(encoder.features(demo.observations))
         sizes = np.abs(np.concatenate([features, scaling.scaled(demo.actions)], axis=1))
         if (sizes > LARGEST_SCALED).any():

@@ -12,7 +12,7 @@ from torch.nn.functional import softplus
 
 from ddco_pyro.data.controls import ControlPart, same
 from ddco_pyro.data.demonstration import number
-from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
+from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.model.emissions import KINDS, Emission, Product
 from ddco_pyro.spec import ControlSpec, LearnedStd
 
@@ -49,20 +49,23 @@ class ControlScaling(nn.Module):
         self.counts = [len(part.dims) * part.continuous for part in parts]
         varying = [dimension for dimension in range(size) if dimension not in constant]
         self.groups = [tuple(varying.index(dimension) for dimension in part.dims) for part in parts]
-        shift, scale, standardized = _declared(spec, varying, parts)
-        self.standardized = np.array(standardized, dtype=bool)
-        self.register_buffer("shift", torch.tensor(shift, dtype=torch.float64))
-        self.register_buffer("scale", torch.tensor(scale, dtype=torch.float64))
+        count, self.standardized = len(varying), np.zeros(len(varying), dtype=bool)
+        shift, scale, low, high = np.zeros(count), np.ones(count), np.full(count, -math.inf), np.full(count, math.inf)
+        for dims, part in zip(self.groups, parts, strict=True):
+            places = list(dims)
+            self.standardized[places] = part.continuous and spec.scale == "standardize"
+            if part.low:
+                low[places], high[places] = part.low, part.high
+            if part.exact:
+                shift[places] = part.exact
+            elif part.low and not part.continuous:
+                shift[places], scale[places] = low[places], high[places] - low[places]
+        order = np.argsort([*varying, *sorted(constant)]).tolist()  # Tensor.argsort on "meta" imports sympy
+        for name, values in (("shift", shift), ("scale", scale), ("low", low), ("high", high)):
+            self.register_buffer(name, torch.tensor(values.tolist(), dtype=torch.float64), name in ("shift", "scale"))
         self.register_buffer("varying", torch.tensor(varying, dtype=torch.int64))
         self.register_buffer("constant", torch.tensor([constant[d] for d in sorted(constant)], dtype=torch.float64))
-        order = np.argsort([*varying, *sorted(constant)]).tolist()  # Tensor.argsort on "meta" imports sympy
         self.register_buffer("order", torch.tensor(order), persistent=False)
-        for name, end in (("low", -math.inf), ("high", math.inf)):
-            values = torch.full((len(varying),), end, dtype=torch.float64)
-            for dims, part in zip(self.groups, parts, strict=True):
-                if part.low:
-                    values[list(dims)] = torch.tensor(getattr(part, name), dtype=torch.float64)
-            self.register_buffer(name, values, persistent=False)
 
     @property
     def size(self) -> int:
@@ -142,11 +145,6 @@ class ControlScaling(nn.Module):
                 values = torch.where(torch.arange(values.shape[-1]) == dims[0], actions.unsqueeze(-1), values)
         return torch.cat([values, self.constant.expand(*values.shape[:-1], -1)], dim=-1)[..., self.order]
 
-    def unscaled(self, scaled: Tensor) -> np.ndarray:
-        """:meth:`emitted` as an array."""
-        controls: np.ndarray = self.emitted(scaled).numpy()
-        return controls
-
     def ends(self) -> tuple[Tensor, Tensor]:
         """Lower and upper bounds in scaled units, float32 [A'], infinite where there are none."""
         return ((self.low - self.shift) / self.scale).float(), ((self.high - self.shift) / self.scale).float()
@@ -166,27 +164,6 @@ class ControlScaling(nn.Module):
             at += emission.parameters
         in_order = [dimension for dims, _ in groups for dimension in dims] == list(range(len(self.varying)))
         return groups[0][1] if len(groups) == 1 and in_order else Product(tuple(groups))
-
-
-def _declared(
-    spec: ControlSpec, varying: Sequence[int], parts: Sequence[ControlPart]
-) -> tuple[list[float], list[float], list[bool]]:
-    """Shift and scale of each dimension that varies, and whether both are estimated from demonstrations."""
-    own = {part.name: part.scale for part in spec.parts if part.scale is not None}
-    shift, scale, standardized = [0.0] * len(varying), [1.0] * len(varying), [False] * len(varying)
-    for part in parts:
-        for place, dimension in enumerate(part.dims):
-            at = varying.index(dimension)
-            if part.low and not part.continuous:
-                shift[at], scale[at] = part.low[place], part.high[place] - part.low[place]
-            elif part.continuous:
-                shift[at] = part.exact[place] if part.exact else 0.0
-                named = next((scaled for scaled in spec.parts if dimension in scaled.dims and scaled.name in own), None)
-                declared = own[named.name] if named else spec.scale
-                standardized[at] = declared == "standardize"
-                if isinstance(declared, tuple):
-                    scale[at] = declared[named.dims.index(dimension) if named else dimension]
-    return shift, scale, standardized
 
 
 class ControlStd(nn.Module):
@@ -257,15 +234,3 @@ def _with_columns(table: Tensor, places: Sequence[int], values: Tensor) -> Tenso
 def _std_of(spec: ControlSpec, dimension: int) -> float | LearnedStd:
     named = next((part for part in spec.parts if dimension in part.dims), None)
     return spec.std if named is None or named.std is None else named.std
-
-
-def refuse_impossible(demonstrations: Demonstrations, scaling: ControlScaling, fitted: bool = False) -> None:
-    """Check that every control of these demonstrations has a probability above 0.
-
-    :param fitted: whether the model is fitted, so that its kinds of controls stand.
-    :raises DemonstrationsError: a switch or a discrete action has a value that the model does not know.
-    """
-    for demonstration in demonstrations:
-        if problem := scaling.impossible(demonstration.name, demonstration.actions):
-            declare, repair = "declare another kind in control.parts", f"repair it, or leave {demonstration.name} out"
-            raise DemonstrationsError(f"{problem}; {repair if fitted else declare}")

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ddco_pyro.data.arrays import PICTURE_DIMENSIONS, LazyArray, Observed, network_input
+from ddco_pyro.data.arrays import PICTURE_DIMENSIONS, Observed, network_input
 from ddco_pyro.data.controls import rounding
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.pictures import Transform, TransformError
@@ -61,7 +61,7 @@ class ObservationEncoder(nn.Module):
                 raise ShapeError(f"observations: {spec.key!r} {why}")
         self.specs = tuple(spec for spec in specs if kinds[spec.key] == "vector")
         pictures = [spec for spec in specs if kinds[spec.key] == "picture"]
-        self.transforms = {spec.key: _transform(spec) for spec in pictures}
+        self.transforms = {spec.key: Transform(spec.crop, spec.resize) for spec in pictures}
         self.shifts = {spec.key: spec.shift for spec in pictures if spec.shift}
         seen = {spec.key: _seen_shape(spec, shapes) for spec in specs}
         self.images = {spec.key: seen[spec.key] for spec in pictures}
@@ -79,7 +79,6 @@ class ObservationEncoder(nn.Module):
 
     @property
     def keys(self) -> list[str]:
-        """The vectors, in the spec's order."""
         return [spec.key for spec in self.specs]
 
     def shape(self, steps: int) -> InputShape:
@@ -102,7 +101,6 @@ class ObservationEncoder(nn.Module):
 
     @property
     def has_bins(self) -> bool:
-        """Whether any observation has bins."""
         return any(spec.bins for spec in self.specs)
 
     def _places(self) -> np.ndarray:
@@ -153,11 +151,7 @@ class ObservationEncoder(nn.Module):
             first += size
         return np.concatenate(moves)
 
-    def features(
-        self,
-        observations: Mapping[str, Observed],
-        times: np.ndarray | None = None,
-    ) -> np.ndarray:
+    def features(self, observations: Mapping[str, Observed], times: np.ndarray | None = None) -> np.ndarray:
         """Observations [T, ...] by name to features [T, F], not yet standardised.
 
         :param times: the number of each step [T]; by default 0 to T - 1.
@@ -179,11 +173,7 @@ class ObservationEncoder(nn.Module):
         # A split into nothing cannot be read again from an exported program.
         return dict(zip(self.keys, vector.split(self.sizes, -1), strict=True)) if self.sizes else {}
 
-    def inputs(
-        self,
-        observations: Iterable[Mapping[str, Observed]],
-        times: np.ndarray | None = None,
-    ) -> Inputs:
+    def inputs(self, observations: Iterable[Mapping[str, Observed]], times: np.ndarray | None = None) -> Inputs:
         """Sequences of observations, each [T_n, ...] by name, to padded network inputs.
 
         Pictures are read when a network asks for them.
@@ -194,7 +184,7 @@ class ObservationEncoder(nn.Module):
         vectors = [self.scaled(self.features(sequence, times)) for sequence in sequences]
         vector = padded(vectors).float()
         by_key, steps = dict(zip(self.keys, vector.split(self.sizes, -1), strict=True)), vector.shape[1]
-        pictures = {key: tuple(_as_pictures(sequence[key]) for sequence in sequences) for key in self.images}
+        pictures = {key: tuple(sequence[key] for sequence in sequences) for key in self.images}
         images = Frames(pictures, self.transforms, slice(0, steps)) if pictures else {}
         return Inputs(by_key, images, torch.arange(steps))
 
@@ -216,15 +206,8 @@ def _ends(values: np.ndarray, bins: int) -> np.ndarray:
     return np.asarray(np.quantile(np.unique(values), np.linspace(0, 1, bins + 1), method="nearest"))
 
 
-def _transform(spec: ObservationSpec) -> Transform:
-    return Transform(spec.crop, spec.resize)
-
-
 def _seen_shape(spec: ObservationSpec, shapes: Shapes) -> tuple[int, ...]:
-    """The shape of a step of an observation as networks see it.
-
-    :raises ShapeError: it cannot be cropped, scaled, binned or shifted as the spec says.
-    """
+    """The shape of a step of an observation as networks see it."""
     stored = shapes[spec.key]
     if spec.bins and len(stored) == PICTURE_DIMENSIONS:
         raise ShapeError(f"observations: {spec.key!r} has pictures: bins are for vectors")
@@ -237,13 +220,9 @@ def _seen_shape(spec: ObservationSpec, shapes: Shapes) -> tuple[int, ...]:
     if spec.shift and len(stored) != PICTURE_DIMENSIONS:
         raise ShapeError(f"observations: {spec.key!r} has shape {list(stored)} at each step: shift is for pictures")
     try:
-        return _transform(spec).shape(stored)
+        return Transform(spec.crop, spec.resize).shape(stored)
     except TransformError as error:
         raise ShapeError(f"observations: {spec.key!r} {error}") from error
-
-
-def _as_pictures(values: Observed) -> Observed:
-    return values if isinstance(values, LazyArray) else np.asarray(values)
 
 
 def padded(sequences: Sequence[np.ndarray]) -> Tensor:

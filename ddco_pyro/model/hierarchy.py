@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from types import MappingProxyType
-from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -26,6 +25,7 @@ from ddco_pyro.model.recogniser import Recogniser
 from ddco_pyro.model.seeding import HOST
 from ddco_pyro.model.tables import Tables
 from ddco_pyro.spec import ControlSpec, LevelSpec, NetworkSpec, Spec
+from ddco_pyro.spec.base import Emission
 from ddco_pyro.spec.networks import Network as AnyNetworkSpec
 from ddco_pyro.spec.networks import PerTimestepSpec
 
@@ -34,8 +34,6 @@ BYTES_AT_ONCE = 256 * 10**6
 
 PART_OF_A_GPU = 0.1
 """Share of a GPU's whole memory that networks take in place of that, so that GPUs of one kind cut alike."""
-
-Emits = Literal["options", "control"]
 
 RawOutputs = Sequence[Tensor]
 """The outputs of networks [N, T, K, F]: policy and, where it has one, termination of each level, lowest first, and the
@@ -52,7 +50,7 @@ class Caller(nn.Module):
     def __init__(
         self,
         network: NetworkSpec,
-        emits: tuple[Emits, ...],
+        emits: tuple[Emission, ...],
         options: int,
         shape: InputShape | Network,
         control: ControlSpec,
@@ -188,7 +186,6 @@ class Hierarchy(nn.Module):
         return [*(level.policy for level in self.option_levels()), self.meta_policy]
 
     def option_levels(self) -> list[Level]:
-        """The levels of options, lowest first."""
         return [level for level in self.levels if isinstance(level, Level)]
 
     def networks(self) -> dict[str, Network]:
@@ -249,7 +246,7 @@ class Hierarchy(nn.Module):
 
         :param discovering: as in :meth:`tabulate`.
         """
-        chunks = self.chunks(inputs)
+        chunks = list(inputs.chunks(self.steps_in_memory // inputs.batch[0]))
         if len(chunks) == 1:
             return self._outputs(self._run_networks(inputs, None, discovering)[0], discovering)
         each: list[RawOutputs] = []
@@ -271,10 +268,6 @@ class Hierarchy(nn.Module):
     def initial_states(self, trajectories: int) -> dict[str, State]:
         """The states of all networks before the first step, by :meth:`networks`' names."""
         return {place: network.initial_state(trajectories) for place, network in self.networks().items()}
-
-    def chunks(self, inputs: Inputs) -> list[Inputs]:
-        """The chunks of time in which these observations go through the networks; a single one where they fit."""
-        return list(inputs.chunks(self.steps_in_memory // inputs.batch[0]))
 
     def _run_networks(
         self, inputs: Inputs, before: States | None, discovering: int | None = None, _: Tensor | None = None
@@ -307,8 +300,11 @@ class Hierarchy(nn.Module):
         for level in levels:
             callers.append(level.policy(next(each), self.scaling))
             endings.append(None if level.termination is None else next(each).squeeze(-1))
-        top = raw[-1]
-        last = _uniform(top, levels[-1].count) if discovering else self.meta_policy(top, self.scaling)
+        if discovering:  # under a meta-policy that selects each option with the same probability
+            count = levels[-1].count
+            last = CallerOutputs(count, torch.zeros(*raw[-1].shape[:2], 1, count), None)
+        else:
+            last = self.meta_policy(raw[-1], self.scaling)
         return Outputs((*callers, last), tuple(endings), self.power)
 
 
@@ -318,7 +314,7 @@ def _bytes_at_once(device: torch.device) -> float:
     return BYTES_AT_ONCE
 
 
-def _meta_policy(spec: Spec) -> tuple[NetworkSpec, tuple[Emits, ...]]:
+def _meta_policy(spec: Spec) -> tuple[NetworkSpec, tuple[Emission, ...]]:
     if spec.hierarchy is not None:
         return spec.hierarchy.meta_policy, spec.hierarchy.meta_policy.emits
     assert spec.baseline is not None  # a spec has one or the other
@@ -327,8 +323,3 @@ def _meta_policy(spec: Spec) -> tuple[NetworkSpec, tuple[Emits, ...]]:
         kept = {"hidden": ()} | policy.model_dump(exclude={"network"})  # a linear policy has no hidden layers
         policy = PerTimestepSpec(network="per_timestep", **kept)
     return policy, ("control",)
-
-
-def _uniform(like: Tensor, options: int) -> CallerOutputs:
-    """A meta-policy that selects each of k options with probability 1/k, at the steps of ``like`` [N, T, ...]."""
-    return CallerOutputs(options, torch.zeros(*like.shape[:2], 1, options), None)

@@ -58,7 +58,6 @@ class CallerOutputs:
         return normalised(self.choices)
 
     def map(self, change: Callable[[Tensor], Tensor]) -> CallerOutputs:
-        """The outputs of changed tensors."""
         return CallerOutputs(
             self.options,
             None if self.logits is None else change(self.logits),
@@ -124,6 +123,5 @@ class Outputs:
         return [*logits, *numbers, *(logit for logit in self.termination_logits if logit is not None)]
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Outputs:
-        """The outputs of changed tensors."""
         logits = (None if logit is None else change(logit) for logit in self.termination_logits)
         return Outputs(tuple(caller.map(change) for caller in self.callers), tuple(logits), self.power)

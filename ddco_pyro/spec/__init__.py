@@ -5,25 +5,21 @@ An unknown key, a wrong type or a value out of range is a :class:`SpecError` wit
 
 from ddco_pyro.spec.base import SpecError
 from ddco_pyro.spec.model import BaselineSpec, HierarchySpec, LevelSpec
-from ddco_pyro.spec.networks import Activation, ConvolutionLayer, NetworkSpec, PolicySpec, Pool, network_spec
+from ddco_pyro.spec.networks import Activation, ConvolutionLayer, NetworkSpec, PolicySpec, Pool
 from ddco_pyro.spec.settings import (
     DISCRETE,
     STEP,
     ControlSpec,
     DemonstrationsSpec,
-    InferenceSpec,
     Kind,
     LearnedStd,
     ObservationSpec,
     OptionExecution,
-    PartSpec,
     PathSpec,
-    ReportSpec,
     RolloutSpec,
-    SelectionSpec,
 )
 from ddco_pyro.spec.spec import Spec, parse_spec, with_overrides
-from ddco_pyro.spec.training import LabelsSpec, OptimizerSpec, RidgeSpec, Start, TrainingSpec
+from ddco_pyro.spec.training import OptimizerSpec, RidgeSpec, Start, TrainingSpec
 from ddco_pyro.spec.yaml import dump_spec, load_spec, spec_schema, user_code
 
 __all__ = [
@@ -35,30 +31,24 @@ __all__ = [
     "ConvolutionLayer",
     "DemonstrationsSpec",
     "HierarchySpec",
-    "InferenceSpec",
     "Kind",
-    "LabelsSpec",
     "LearnedStd",
     "LevelSpec",
     "NetworkSpec",
     "ObservationSpec",
     "OptimizerSpec",
     "OptionExecution",
-    "PartSpec",
     "PathSpec",
     "PolicySpec",
     "Pool",
-    "ReportSpec",
     "RidgeSpec",
     "RolloutSpec",
-    "SelectionSpec",
     "Spec",
     "SpecError",
     "Start",
     "TrainingSpec",
     "dump_spec",
     "load_spec",
-    "network_spec",
     "parse_spec",
     "spec_schema",
     "user_code",

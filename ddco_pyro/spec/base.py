@@ -135,7 +135,7 @@ def lines(error: ValidationError, model: type[BaseModel]) -> Iterator[str]:
     for detail in errors:
         depth = len(detail["loc"])
         below = any(other["loc"][:depth] == detail["loc"] and len(other["loc"]) > depth for other in errors)
-        if detail["type"] == "default_factory_not_called" or (detail["type"] == "too_short" and below):
+        if detail["type"] == "too_short" and below:
             continue  # follows from another problem: invalid items also make a list too short
         path = _path(detail["loc"])
         if detail["type"] == "spec":
@@ -173,7 +173,6 @@ def in_words(error: ErrorDetails) -> str:
 
 
 def show(value: Any) -> str:
-    """A value as YAML has it, cut to 60 characters."""
     words = {None: "null", True: "true", False: "false"}
     text = words[value] if value is None or isinstance(value, bool) else repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."

@@ -16,9 +16,6 @@ PERCEPTRONS = ("linear", "mlp")
 HEADS = (*PERCEPTRONS, "constant")
 """The networks that can stand above a trunk."""
 
-ALWAYS: Literal["always"] = "always"
-"""The termination of options that end after every step, ψ = 1."""
-
 Termination = Annotated[
     NetworkSpec | Literal["always"],
     nested((Mapping, Network), NetworkSpec, "a network, such as {network: linear}, or always"),
@@ -44,11 +41,10 @@ class LevelSpec(Model):
     @property
     def lasts(self) -> bool:
         """Whether options can be active for more than one step."""
-        return self.termination != ALWAYS
+        return self.termination != "always"
 
     @property
     def networks(self) -> dict[str, Network]:
-        """The networks of the level by their key."""
         networks = {"trunk": self.trunk, "policy": self.policy, "termination": self.termination}
         return {key: network for key, network in networks.items() if isinstance(network, Network)}
 

@@ -16,10 +16,8 @@ from pydantic import (
     Field,
     SerializerFunctionWrapHandler,
     Tag,
-    TypeAdapter,
     field_validator,
     model_serializer,
-    model_validator,
 )
 
 from ddco_pyro.errors import nearest
@@ -63,16 +61,7 @@ class Network(Model):
     @property
     def hidden_sizes(self) -> tuple[int, ...]:
         """Sizes of the hidden layers; empty for networks without."""
-        return ()
-
-    @model_validator(mode="before")
-    @classmethod
-    def _settings_apply(cls, data: Any) -> Any:
-        if isinstance(data, dict) and (name := data.get("network", "mlp")) and isinstance(name, str):
-            foreign = [key for key in foreign_keys(name) if key in data]
-            if foreign:
-                raise invalid(*((key, f"does not apply to network {name!r}; leave it out") for key in foreign))
-        return data
+        return getattr(self, "hidden", ())
 
     def problems(self) -> Problems:
         for name in get_args(Emission):
@@ -107,11 +96,6 @@ class LayeredSpec(Network):
 
     hidden: Sizes = (64,)
     """Sizes of the hidden or recurrent layers, first layer first; a bare number is a single layer."""
-
-    @property
-    def hidden_sizes(self) -> tuple[int, ...]:
-        """Sizes of the hidden layers."""
-        return self.hidden
 
 
 class MlpSpec(LayeredSpec):
@@ -172,7 +156,6 @@ class LstmSpec(LayeredSpec):
 
     @property
     def reads(self) -> tuple[str, ...]:
-        """Names of the observations that the LSTM or the network below it reads."""
         return self.inputs or (self.over.reads if self.over else ())
 
 
@@ -186,7 +169,6 @@ class BranchesSpec(MlpSpec):
 
     @property
     def reads(self) -> tuple[str, ...]:
-        """Names of the observations that the branches read."""
         names = (name for key, branch in self.of.items() for name in branch.inputs or (key,))
         return self.inputs or tuple(dict.fromkeys(names))
 
@@ -203,7 +185,6 @@ class UserNetworkSpec(Network):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Keyword arguments of the class."""
         return self.options
 
     @field_validator("network")
@@ -272,16 +253,3 @@ TrunkSpec: TypeAlias = Annotated[NetworkSpec, AfterValidator(_has_features)]
 
 LstmSpec.model_rebuild()
 BranchesSpec.model_rebuild()
-
-_ANY: TypeAdapter[NetworkSpec] = TypeAdapter(NetworkSpec)
-
-
-def network_spec(**settings: Any) -> NetworkSpec:
-    """The validated settings of a network.
-
-    >>> network_spec(network="mlp", hidden=32).hidden
-    (32,)
-
-    :raises pydantic.ValidationError: a setting is invalid or does not apply to the network.
-    """
-    return _ANY.validate_python(settings)

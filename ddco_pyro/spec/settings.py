@@ -5,24 +5,11 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, get_args
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import BeforeValidator, Field, InstanceOf, PlainSerializer
 
-from ddco_pyro.spec.base import (
-    Count,
-    Items,
-    Model,
-    Positive,
-    Problems,
-    Seed,
-    Share,
-    Text,
-    bare,
-    invalid,
-    nested,
-    show,
-)
+from ddco_pyro.spec.base import Count, Items, Model, Positive, Problems, Seed, Share, Text, bare, invalid, nested, show
 
 LabelNames = Annotated[Items[Text], Field(min_length=1)]
 Labels = Annotated[Text | LabelNames, nested((list, tuple), LabelNames, "a name, or a list with a name for each level")]
@@ -122,17 +109,13 @@ class ObservationSpec(Model):
     def problems(self) -> Problems:
         if self.crop is not None and 0 in self.crop[2:]:
             yield "crop", "is top, left, height, width; height and width must be at least 1"
-        if self.key == STEP and self.differences:
-            yield "differences", f"{STEP} grows by the same at each step; leave it out"
+        for key in ("differences", "angles", "quaternions", "shift"):
+            if self.key == STEP and getattr(self, key):
+                yield key, f"does not apply to {STEP}; leave it out"
         turned = [*self.angles, *(first + place for first in self.quaternions for place in range(4))]
-        for key in ("angles", "quaternions"):
-            if getattr(self, key) and self.key == STEP:
-                yield key, f"{STEP} is no angle; leave it out"
-            elif getattr(self, key) and len(set(turned)) < len(turned):
-                yield key, "name a number twice; each is part of one angle or quaternion"
-                break
-        if self.key == STEP and self.shift:
-            yield "shift", f"{STEP} is computed and is no picture; leave it out"
+        if len(set(turned)) < len(turned):
+            where = "angles" if self.angles else "quaternions"
+            yield where, "name a number twice; each is part of one angle or quaternion"
 
     def turned(self, size: int) -> int:
         """For vectors: numbers of a step of ``size`` numbers, with angles and quaternions in their place."""
@@ -173,13 +156,6 @@ class LearnedStd(Model):
 
 Std = Annotated[Positive | LearnedStd, nested((Mapping,), LearnedStd, "a positive number or {learn: true}")]
 
-ScaleName = Literal["standardize", "none"]
-Scales = Annotated[Items[Positive], Field(min_length=1)]
-Scale = Annotated[
-    ScaleName | Scales,
-    nested((list, tuple), Scales, "standardize, none, or a list of positive numbers", get_args(ScaleName)),
-]
-
 Kind = Literal["auto", "gaussian", "student", "clipped", "hurdle", "binary", "categorical"]
 """The kinds of distribution. Each has a class of its name in a module of its name in ``model/emissions``."""
 DISCRETE = ("binary", "categorical")
@@ -192,14 +168,10 @@ class DistributionSpec(Model):
     kind: Kind = "auto"
     """``gaussian``: unbounded; ``student``: heavy tails, those of Student's t with four degrees of freedom, which all
     dimensions of a step share; ``clipped``: a Gaussian censored at bounds; ``hurdle``: one exact value with some
-    probability, else Gaussian or clipped; ``binary``: two values; ``categorical``: discrete actions, as integers or
-    one-hot rows; ``auto``: chosen for each dimension from the demonstrations and shown by ``check``, never
-    ``student``."""
+    probability, else Gaussian or clipped; ``binary``: two values; ``categorical``: discrete actions, as integers;
+    ``auto``: chosen for each dimension from the demonstrations and shown by ``check``, never ``student``."""
     std: Std | None = None
     """Standard deviation σ in scaled units, or ``{learn: true, floor: ...}``; null in a part: as in ``control.std``."""
-    scale: Scale | None = None
-    """``standardize`` (by the training demonstrations), ``none``, or a list with a positive divisor for each dimension;
-    null in a part: as in ``control.scale``."""
 
 
 class PartSpec(DistributionSpec):
@@ -211,11 +183,8 @@ class PartSpec(DistributionSpec):
     """Control dimensions, counted from 0."""
 
     def problems(self) -> Problems:
-        if isinstance(self.scale, tuple) and len(self.scale) != len(self.dims):
-            yield "scale", f"has {len(self.scale)} numbers, but the part has {len(self.dims)} dimensions"
-        for setting in ("scale", "std"):
-            if self.kind in DISCRETE and getattr(self, setting) is not None:
-                yield setting, f"does not apply to kind: {self.kind}; leave it out"
+        if self.kind in DISCRETE and self.std is not None:
+            yield "std", f"does not apply to kind: {self.kind}; leave it out"
 
 
 class ControlSpec(DistributionSpec):
@@ -223,9 +192,8 @@ class ControlSpec(DistributionSpec):
 
     std: Std = 0.1
     """Standard deviation σ in scaled units, or ``{learn: true, floor: ...}``."""
-    scale: Scale = "standardize"
-    """``standardize`` (by the training demonstrations), ``none``, or a list with a positive divisor for each control
-    dimension."""
+    scale: Literal["standardize", "none"] = "standardize"
+    """``standardize``: continuous dimensions are scaled by their mean and spread in the training demonstrations."""
     power: float = Field(default=1.0, gt=0, le=1)
     """β: how many times the log-density of the control counts in training and in posteriors of the options (a power, or
     coarsened, likelihood). The less it counts, the longer segments are. Reported log-likelihoods are of densities."""
@@ -306,7 +274,6 @@ class PathSpec(NamedTuple):
 
 
 def _paths(value: Any) -> Any:
-    """One path or several."""
     return tuple(_path(one) for one in (value if isinstance(value, list | tuple) and not _is_pair(value) else (value,)))
 
 

@@ -157,7 +157,8 @@ class Spec(Model):
             text = f"there is no level {name!r}; a baseline has none; leave training.labels out"
             yield "training.labels.level", text
         elif name not in known:
-            yield "training.labels.level", _no_level(name, known)
+            text = f"there is no level {name!r}{nearest(name, known)}; there is: {', '.join(known)}"
+            yield "training.labels.level", text
         elif any("options" not in emits for emits in self._emitted[known.index(name) + 1 :]):
             text = f"no policy selects the options of {name!r}; let the policies above emit options"
             yield "training.labels.level", text
@@ -179,10 +180,6 @@ class Spec(Model):
         """The choices that the policies of each level, and last the meta-policy, emit."""
         meta_policy = [self.hierarchy.meta_policy.emits] if self.hierarchy else []
         return [*(level.policy.emits for level in self._levels), *meta_policy]
-
-
-def _no_level(name: str, known: list[str]) -> str:
-    return f"there is no level {name!r}{nearest(name, known)}; there is: {', '.join(known)}"
 
 
 def _grid_problems(spec: Spec) -> Problems:

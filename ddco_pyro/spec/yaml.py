@@ -97,10 +97,8 @@ def read_mapping(path: str | Path, kind: str) -> dict[str, Any]:
         raise SpecError(f"{path}: cannot be read: {error.strerror}; check the path") from error
     except SpecError as error:
         raise SpecError(*(f"{path}: {problem}" for problem in error.problems)) from None
-    if data is None:
-        raise SpecError(f"{path}: the file is empty; it has to hold a {kind}")
     if not isinstance(data, dict):
-        raise SpecError(f"{path}: the file holds {show(data)}, not a mapping (key: value)")
+        raise SpecError(f"{path}: holds {show(data)}, not a mapping (key: value), as a {kind} is")
     return data
 
 

@@ -70,9 +70,7 @@ def build_hierarchy(spec: Spec, dimensions: Dimensions, seed: int | None = None)
         known = ", ".join(sorted(dimensions.shapes))
         raise SpecError(f"observations: there is no {', '.join(missing)} (there are: {known})")
     _refuse_undrawable(spec, dimensions.shapes)
-    scale, size = spec.control.scale, dimensions.control_size
-    if isinstance(scale, tuple) and len(scale) != size:
-        raise SpecError(f"control.scale: has {len(scale)} numbers, but the control has {size} dimensions")
+    size = dimensions.control_size
     refuse_unknown_dimensions(spec.control, size)
     parts = dimensions.parts
     if parts is None and dimensions.control:

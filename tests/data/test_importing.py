@@ -169,12 +169,10 @@ def test_episodes_without_all_of_their_video_are_left_out(tmp_path: Path, out: P
     assert (set(left_out), Demonstrations.read(out).names) == ({"demo_2", "demo_3"}, ("demo_0", "demo_1"))
 
 
-def test_lerobot_splits_and_subtasks(tmp_path: Path, out: Path) -> None:
-    splits = odd.info(splits={"train": "0:3", "val": "3:4"})
+def test_lerobot_subtasks(tmp_path: Path, out: Path) -> None:
     subtasks = odd.rewritten(odd.DATA, lambda table: table.append_column("subtask_index", table["frame_index"]))
-    import_demonstrations(odd.changed(splits, subtasks)(tmp_path), out)
+    import_demonstrations(odd.changed(subtasks)(tmp_path), out)
     demos = Demonstrations.read(out, labels=["subtask"])
-    assert demos.masks == {"train": ("demo_0", "demo_1", "demo_2"), "valid": ("demo_3",)}
     np.testing.assert_array_equal(demos[3].labels["subtask"], np.arange(8))
 
 
@@ -323,6 +321,15 @@ def test_minaris_episodes_are_counted(written_by_minari, out: Path) -> None:
         "demo_3": "demo_3: obs/arm/joints has 10 steps, but actions has 8",
     }.items():
         assert message in left_out[name]
+
+
+def test_minaris_values_that_were_never_stored_are_no_zeros(written_by_minari, out: Path) -> None:
+    folder, _ = written_by_minari(spaces.Box(-1, 1, (2,)))
+    with h5py.File(folder / "data" / "main_data.hdf5", "r+") as file:
+        del file["episode_2/actions"]
+        file["episode_2"].create_dataset("actions", (7, 2), "f4", chunks=(1, 2))[:3] = 1.0
+    with pytest.raises(DemonstrationsError, match="demo_2: actions claims 7 chunks, but the file holds 3"):
+        import_demonstrations(folder, out)
 
 
 def test_minaris_paths_stay_in_the_dataset(written_by_minari, out: Path) -> None:

@@ -5,12 +5,10 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 from command_line import call
 from odd_files import layouts as odd
-from odd_files.hdf5 import instead
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.errors import DemonstrationsError
@@ -44,14 +42,6 @@ def test_maniskill(obs: str, tmp_path: Path) -> None:
         np.testing.assert_array_equal(demos[1].observations["extra/is_grasped"].ravel(), [0, 0, 1, 1, 1])
 
 
-def test_maniskill_with_two_observations_too_many_is_refused(tmp_path: Path) -> None:
-    path = odd.maniskill(tmp_path, "array")
-    with h5py.File(path, "r+") as file:
-        instead(file, "traj_1/obs", odd.state(1, 2))
-    with pytest.raises(DemonstrationsError, match="demo_1: obs/state has 7 steps, but actions has 5"):
-        imported(path, tmp_path)
-
-
 @pytest.mark.parametrize("encoded", [False, True])
 def test_act(encoded: bool, tmp_path: Path) -> None:
     folder = odd.act(tmp_path, encoded)
@@ -62,13 +52,6 @@ def test_act(encoded: bool, tmp_path: Path) -> None:
         np.testing.assert_array_equal(demo.observations["qpos"], odd.state(number))
         seen = np.asarray(demo.observations["images/top"])
         np.testing.assert_allclose(seen, odd.pictures(number), atol=2 * encoded)  # JPEG
-
-
-def test_one_episode_of_act(tmp_path: Path) -> None:
-    folder = odd.act(tmp_path)
-    demos = imported(folder / "episode_2.hdf5", tmp_path)
-    assert demos.names == ("demo_2",)
-    np.testing.assert_array_equal(demos[0].actions, odd.control(2))
 
 
 def test_the_base_of_a_mobile_robot_is_part_of_its_control(tmp_path: Path) -> None:

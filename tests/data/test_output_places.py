@@ -13,7 +13,6 @@ import h5py
 import pytest
 import toy_task
 from command_line import Ended, call
-from odd_files import places as places_rows
 from odd_files import snapshot
 from random_demonstrations import demonstrations
 
@@ -237,13 +236,3 @@ def test_commands_are_printed_as_a_shell_takes_them(tmp_path: Path, monkeypatch)
     assert shlex.split(said) == ["ddco-pyro", "fit", "a b.yaml", "--out", "runs/a b"]
     assert "# Fit it:              ddco-pyro fit 'a b.yaml' --out runs/first\n" in Path("a b.yaml").read_text()
     assert call("check", "a b.yaml").status == 0
-
-
-@pytest.mark.parametrize("row", places_rows.ROWS.values(), ids=places_rows.ROWS)
-@pytest.mark.usefixtures("undecided")
-def test_an_odd_name_is_one_like_others(tmp_path: Path, row) -> None:
-    file = row.make(tmp_path)
-    assert call("inspect", file).status == 0
-    assert call("init", file, "--out", tmp_path / "a.yaml").status == 0
-    assert call("import", file, "--out", tmp_path / "imported.hdf5").status == 0
-    assert Demonstrations.read(tmp_path / "imported.hdf5").names == Demonstrations.read(file).names

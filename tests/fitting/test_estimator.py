@@ -183,7 +183,7 @@ def test_without_controls_it_is_a_hidden_markov_model() -> None:
     (piece,) = ours.fit_.infer(ours.fit_.demonstrations[:1])
     emission, scaling = piece.outputs.emissions[0], ours.fit_.hierarchy.scaling
     theirs.startprob_, theirs.transmat_ = ours.startprob_, ours.transmat_
-    theirs.means_ = scaling.unscaled(emission.mode[0, 0])
+    theirs.means_ = scaling.emitted(emission.mode[0, 0]).numpy()
     theirs.covars_ = (emission.std.detach().numpy() * X.std(0)) ** 2
     assert ours.score(X, lengths) == pytest.approx(theirs.score(X, lengths), abs=2e-3)
     np.testing.assert_allclose(ours.predict_proba(X, lengths), theirs.predict_proba(X, lengths), atol=1e-4)

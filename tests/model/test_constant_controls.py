@@ -15,7 +15,6 @@ from planted import make_spec
 
 import ddco_pyro
 from ddco_pyro.acting.controller import Controller
-from ddco_pyro.comparison import CompareError, compare
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.fitted import Fit
@@ -166,22 +165,3 @@ def test_folds_decide_it_once_for_all(tmp_path: Path) -> None:
         changed[4, 3] = 0.0
         folds = divide(with_controls(demos, {name: changed}), 3, 0)
         assert [Dimensions.of(fold).constant for fold in folds] == [{1: 0.1}] * 3
-
-
-def test_runs_that_score_other_dimensions_are_not_compared(whole: Fit, tmp_path: Path) -> None:
-    demos = make_demonstrations()
-    changed = demos[2].actions.copy()
-    changed[:, 3] += np.arange(9)
-    path = tmp_path / "demos.hdf5"
-    with_controls(demos, {"demo_2": changed}).write(path)
-    runs = [
-        fit(spec_for(path, compare_with=[], demonstrations=own | {"path": str(path)}), out=tmp_path / name)
-        for name, own in (("all", {}), ("without", {"exclude": ["demo_2"]}))
-    ]
-    message = (
-        rf"{runs[0].folder} and {runs[1].folder} score different things: control dimension 3 is in the likelihood of "
-        rf"{runs[0].folder} and not in that of {runs[1].folder}; fit both to the same demonstrations, with the same ver"
-    )
-    with pytest.raises(CompareError, match=message):
-        compare([one.folder for one in runs])
-    assert len(compare([whole.folder, whole.folder / "baselines" / "flat"]).rows) == 2

@@ -184,8 +184,7 @@ KINDS = {
     "student, σ of each step": lambda: student(std_of_steps()),
     "student beside": lambda: Product((((2, 0), student(STD)), ((1,), Binary(numbers(2, 3, 2, 1, seed=1))))),
     "binary": lambda: Binary(numbers(2, 3, 2, 2)),
-    "categorical": lambda: Categorical(numbers(2, 3, 2, 4), torch.tensor(False)),
-    "rows": lambda: Categorical(numbers(2, 3, 2, 4), torch.tensor(True)),
+    "categorical": lambda: Categorical(numbers(2, 3, 2, 4)),
     "hurdle": lambda: Hurdle(numbers(2, 3, 2, 1, seed=2), Gaussian(numbers(2, 3, 2, 2), STD, SCALE.log())),
     "hurdle, clipped, own σ": lambda: hurdle(
         numbers(2, 3, 2, 1, seed=2), numbers(2, 3, 2, 2), torch.stack([STD, 2 * STD])
@@ -219,7 +218,6 @@ def actions_of(kind):
     return {
         "binary": switches,
         "categorical": index.unsqueeze(-1).double(),
-        "rows": torch.nn.functional.one_hot(index, 4).double(),
         "student beside": torch.stack([reals[..., 1], switches[..., 0], reals[..., 0]], dim=-1),
         "product": torch.stack([reals[..., 1], switches[..., 0], reals[..., 0]], dim=-1),
     }.get(kind, reals if "clipped" in kind else numbers(2, 3, 2, seed=4))
@@ -254,7 +252,7 @@ def test_a_student_is_that_of_scipy(kind):
 def test_draws_of_a_student_have_its_radius_and_its_controller():
     """(a - μ)² / σ² over A dimensions is A times an F variate; the export's numpy draws the same."""
     emission = Student(numbers(1, 2), STD, SCALE.log())
-    noise = torch.randn(4000, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    noise = torch.randn(4000, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     drawn = emission.draw(noise)[:, 0]
     radius = ((drawn - emission.mean) / STD).square().sum(-1) / 2
     assert stats.kstest(radius, stats.f(2, 4).cdf).pvalue > 0.01
@@ -265,7 +263,7 @@ def test_draws_of_a_student_have_its_radius_and_its_controller():
 
 def test_the_divergence_of_students_is_at_least_that_of_draws():
     emission = student(torch.stack([STD, 2 * STD]))
-    noise = torch.randn(4000, 2, 3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    noise = torch.randn(4000, 2, 3, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     total = 0.0
     for i in range(2):
         drawn = torch.stack([emission.draw(one)[..., i, :] for one in noise])
@@ -290,14 +288,13 @@ def test_log_of_the_normal_distribution_function():
     np.testing.assert_allclose(slope[~near], -x[~near], rtol=1e-7)  # φ / Φ goes to -x
 
 
-@pytest.mark.parametrize("kind", ["binary", "categorical", "rows"])
+@pytest.mark.parametrize("kind", ["binary", "categorical"])
 def test_probabilities_sum_to_one_and_other_values_have_none(kind):
     emission = KINDS[kind]()
     size = emission.shape[-1]
     every = {
         "binary": torch.cartesian_prod(torch.arange(2.0), torch.arange(2.0)),
         "categorical": torch.arange(4.0).unsqueeze(1),
-        "rows": torch.eye(4),
     }[kind].double()
     total = sum(emission.log_density(action.expand(2, 3, size)).exp() for action in every)
     torch.testing.assert_close(total, torch.ones_like(total))
@@ -318,7 +315,7 @@ def test_draws_have_the_density_and_stay_possible(kind):
     assert all(torch.isfinite(mean).all() for mean in means)
     error = (means[0].var(0) / (DRAWS / 2)).sqrt()
     assert ((means[0].mean(0) - means[1].mean(0)).abs() < 5 * error + 1e-9).all()
-    if kind in ("binary", "categorical", "rows"):
+    if kind in ("binary", "categorical"):
         probability = emission.log_density(emission.mode[..., 0, :])[..., 0].exp()
         share = (drawn == emission.mode[..., 0, :]).all(-1).double().mean(0)
         assert (share - probability).abs().max() < 5 * (0.25 / DRAWS) ** 0.5

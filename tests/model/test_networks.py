@@ -10,7 +10,6 @@ from stacked_networks import (
     COPIES,
     FEATURES,
     LONGEST,
-    OUTPUTS,
     PIXELS,
     SHAPE,
     answer,
@@ -22,12 +21,11 @@ from stacked_networks import (
     separate,
 )
 from torch import nn
-from user_networks import Stateful
 
-from ddco_pyro.model.networks import Inputs, InputShape, ShapeError, build
+from ddco_pyro.model.networks import Inputs, InputShape, ShapeError
 from ddco_pyro.model.networks.conv import POOLED
 from ddco_pyro.model.networks.perceptrons import StackedLinear
-from ddco_pyro.spec import Activation, network_spec
+from ddco_pyro.spec import Activation
 
 
 @pytest.mark.parametrize(
@@ -220,21 +218,6 @@ def test_a_network_of_ones_own():
     assert_close(network(inputs)[0][:, :, 3, 1], 2 * inputs.vector.sum(-1))
 
 
-def test_trying_a_network_of_ones_own_leaves_no_trace():
-    shape = InputShape({"state": FEATURES}, {"camera": PIXELS}, steps=1)
-    torch.manual_seed(0)
-    network = build(network_spec(network="user_networks:Stateful"), shape, OUTPUTS, COPIES).module
-    drawn = torch.rand(3)
-    torch.manual_seed(0)
-    untried = Stateful(shape, OUTPUTS, COPIES)
-    assert torch.equal(torch.rand(3), drawn)
-    states = zip(network.state_dict().items(), untried.state_dict().items(), strict=True)
-    assert all(name == other and torch.equal(value, expected) for (name, value), (other, expected) in states)
-    assert network.training
-    assert int(network.norm.num_batches_tracked) == 0
-    assert all(parameter.grad is None for parameter in network.parameters())
-
-
 @pytest.mark.parametrize(
     ("how", "message"),
     [
@@ -270,20 +253,3 @@ def test_an_output_of_another_shape_is_refused_when_the_network_is_made(how, mes
 def test_a_network_that_cannot_be_built_says_why(shape, settings, message):
     with pytest.raises(ShapeError, match=message):
         make(shape, **settings)
-
-
-@pytest.mark.parametrize("keys", [("cam.rgb", "values"), ("type", "training"), ("b", "a")])
-@pytest.mark.parametrize("layers", [[], [{"filters": 2, "kernel": 3}] * 2])
-def test_a_picture_may_have_any_name(keys, layers):
-    """A network for two pictures gives what one gives that has the same weights under plain names."""
-    plain, settings = ("one", "two"), {"layers": layers} if layers else {}
-    seen = make_inputs(images=plain)
-
-    def network_of(names):
-        return make(InputShape({}, dict.fromkeys(names, PIXELS)), network="conv", hidden=[4], **settings)
-
-    def given(names):
-        return network_of(names)(Inputs({}, dict(zip(names, seen.images.values(), strict=True)), seen.time))[0]
-
-    assert torch.equal(given(keys), given(plain))
-    network_of(keys).load_state_dict(network_of(plain).state_dict())

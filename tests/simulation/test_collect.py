@@ -139,10 +139,6 @@ def test_what_never_changes_is_constant(path):
         "takes two values, 1 and 2",
         "constant (-0.25): no part of the model, emitted as it is",
     ]
-    hierarchy = build_hierarchy(spec(control={"kind": "gaussian", "scale": [4.0, 2.0, 8.0]}), found)
-    assert hierarchy.scaling.scale.tolist() == [4.0, 2.0]
-    with pytest.raises(SpecError, match=r"control.scale: has 2 numbers, but the control has 3 dimensions"):
-        check_networks(spec(control={"scale": [4.0, 2.0]}), found)
 
 
 def test_a_control_that_never_changes_is_refused(path):
@@ -208,7 +204,6 @@ def own(options):
     ("changes", "message"),
     [
         ({"observations": ["offsets", "pose", "jaw"]}, r"^observations: there is no pose, jaw \(there are: camera, of"),
-        ({"control": {"scale": [1.0]}}, r"^control\.scale: has 1 numbers, but the control has 2 dimensions$"),
         (
             {"observations": ["visited"], "report": {"trajectory": "visited"}},
             r"^report\.trajectory: 'visited' is 1 num",

@@ -17,7 +17,6 @@ from ddco_pyro.spec import (
     SpecError,
     dump_spec,
     load_spec,
-    network_spec,
     parse_spec,
     spec_schema,
     with_overrides,
@@ -105,8 +104,8 @@ DEEP = "not valid YAML: nested too deeply"
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "the file is empty; it has to hold a spec"),
-        ("- a\n- b\n", "the file holds ['a', 'b'], not a mapping (key: value)"),
+        ("", "holds null, not a mapping (key: value), as a spec is"),
+        ("- a\n- b\n", "holds ['a', 'b'], not a mapping (key: value), as a spec is"),
         ("seed: 1\ntask: [a\n", "line 3, column 1: not valid YAML: expected ',' or ']', but got '<stream end>'"),
         ("seed: 1\ntask: a\nseed: 2\n", "line 3, column 1: not valid YAML: key 'seed' is given twice"),
         ("a: *b\n", "line 1, column 4: not valid YAML: found undefined alias 'b'"),
@@ -124,17 +123,6 @@ def test_files_that_hold_no_spec(tmp_path: Path, text: str | bytes, message: str
     assert str(caught.value).startswith(f"{path}: ")
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_ordinary_aliases_and_merge_keys_are_read(tmp_path: Path) -> None:
-    anchored = EXAMPLE.replace("policy: {network: mlp", "policy: &mlp {network: mlp", 1).replace(
-        "meta_policy: {network: mlp, hidden: [64], emits: [options]}",
-        "meta_policy: {<<: *mlp, emits: [options]}\ncompare_with: [{kind: flat, policy: *mlp}]",
-    )
-    spec = load_spec(write(tmp_path, anchored))
-    assert spec.hierarchy is not None
-    assert spec.compare_with[0].policy == network_spec(network="mlp", hidden=(64,), dropout=0.0)
-    assert spec.hierarchy.meta_policy.hidden == (64,)
 
 
 # --- overrides --------------------------------------------------------------------------------------------------------
@@ -181,7 +169,7 @@ def test_another_network_drops_the_settings_of_the_old_one() -> None:
     linear = with_overrides(parse_spec(data), {f"{path}.network": "linear"})
     assert linear.hierarchy is not None
     assert linear.hierarchy.levels[0].policy.hidden_sizes == ()
-    with pytest.raises(SpecError, match="hidden: does not apply to network 'linear'"):
+    with pytest.raises(SpecError, match="hidden: unknown key; valid here: network, inputs, emits"):
         with_overrides(parse_spec(data), {f"{path}.hidden": [3], f"{path}.network": "linear"})
 
 
@@ -267,23 +255,16 @@ def refusal(overrides: dict[str, Any]) -> str:
 
 
 REFUSED: list[tuple[dict[str, Any], str]] = [
-    *(
-        (
-            {"compare_with": ["flat", {"kind": "per_timestep", "policy": {"network": name, **settings}}]},
-            "compare_with.1.policy.network: per_timestep has a perceptron for each step: use one of linear, mlp, "
-            f"got {name!r}, or say kind: flat",
-        )
-        for name, settings in {"lstm": {}, "conv": {}, "branches": {"of": {"pose": {}}}, "module:Net": {}}.items()
+    (
+        {"compare_with": ["flat", {"kind": "per_timestep", "policy": {"network": "lstm"}}]},
+        "compare_with.1.policy.network: per_timestep has a perceptron for each step: use one of linear, mlp, got",
     ),
     ({"hierarchy.levels.0.count": "5"}, "hierarchy.levels.0.count: must be a whole number, got '5'"),
-    ({"hierarchy.levels.0.count": True}, "hierarchy.levels.0.count: must be a whole number, got true"),
-    ({"hierarchy.levels": {"count": 3}}, "hierarchy.levels: must be a list, got {'count': 3}"),
     ({"hierarchy.levels.0.cuont": 5}, "hierarchy.levels.0.cuont: unknown key; did you mean hierarchy.levels.0.count?"),
     ({"inference.xyz": 3}, "inference.xyz: unknown key; valid here: engine"),
     ({"hierarchy.levels": [{"count": 1}, {"count": 2}]}, "hierarchy.levels.1.name: 'option' is also the name of"),
     ({"hierarchy.levels.0.name": "a b"}, "hierarchy.levels.0.name: must be letters, digits, '_' or '-'"),
     ({"hierarchy.levels.0.policy.emits": ["options", "control"]}, "hierarchy.levels.0.policy.emits: the lowest level"),
-    ({"hierarchy.meta_policy.emits": ["option"]}, "hierarchy.meta_policy.emits.0: must be options or control"),
     ({"hierarchy.meta_policy.emits": ["options", "options"]}, "hierarchy.meta_policy.emits: 'options' is given twice"),
     ({"hierarchy.meta_policy.network": "mpl"}, "hierarchy.meta_policy.network: no network is called 'mpl'"),
     (
@@ -299,18 +280,13 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         {"hierarchy.meta_policy": {"network": "constant", "inputs": ["a"]}},
         "hierarchy.meta_policy.inputs: a constant re",
     ),
-    ({"hierarchy.meta_policy": {"network": "linear", "hidden": [8]}}, "hierarchy.meta_policy.hidden: does not apply"),
-    ({"control.parts": [{"name": "arm", "dims": [0, 1], "scale": [1.0]}]}, "control.parts.0.scale: has 1 numbers"),
-    ({"control.parts": [{"name": "jaw", "dims": [0], "kind": "binary", "scale": [1]}]}, "control.parts.0.scale: does"),
-    ({"observations": ["step"]}, "observations: step alone says nothing about the state"),
-    ({"observations": ["state", {"key": "step", "differences": True}]}, "observations.1.differences: step grows by"),
-    ({"hierarchy.meta_policy": {"network": "conv", "layers": []}}, "hierarchy.meta_policy.layers: must have at least"),
-    ({"hierarchy.meta_policy": {"network": "branches"}}, "hierarchy.meta_policy.of: missing; it has to be given"),
+    ({"hierarchy.meta_policy": {"network": "linear", "hidden": [8]}}, "hierarchy.meta_policy.hidden: unknown key"),
+    ({"control.parts": [{"name": "jaw", "dims": [0], "kind": "binary", "std": 1}]}, "control.parts.0.std: does"),
+    ({"observations": ["state", {"key": "step", "differences": True}]}, "observations.1.differences: does not apply"),
     (
         {"hierarchy.levels.0.trunk": {"network": "mlp"}, "hierarchy.levels.0.policy": {"network": "lstm"}},
         "hierarchy.levels.0.policy.network: reads the trunk: use one of linear, mlp, constant, got 'lstm'",
     ),
-    ({"hierarchy.meta_policy.dropout": 1}, "hierarchy.meta_policy.dropout: must be less than 1, got 1"),
     ({"hierarchy": None}, "hierarchy: missing; declare a hierarchy, or a baseline in its place"),
     ({"baseline": "flat"}, "baseline: stands beside hierarchy; keep one of the two"),
     ({"compare_with": ["flt"]}, "compare_with.0.kind: must be flat or flat_equal or per_timestep or mixture"),
@@ -327,19 +303,15 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         "training.labels.level: no policy selects the options of 'option'; let the policies above emit options",
     ),
     ({"training.starts": ["clusters"]}, "training.starts.0: must be vq or vq_controls or windows or equal_parts"),
-    ({"training.starts": []}, "training.starts: "),
     ({"task": None}, "task: missing; name a task, or give a file in demonstrations.path"),
     ({"observations": ["a", "a"]}, "observations.1.key: 'a' is given twice; keep one"),
     ({"observations": ["hand_pos", "goal"], "report.trajectory": "hand_po"}, "report.trajectory: there is no"),
     ({"report.trajectory": ["pose", "grip", 3]}, "report.trajectory: must be KEY or [KEY, slice], such as [pose, 3:6]"),
     ({"report.trajectory": ["pose", "3-6"]}, "report.trajectory: there is no observation '3-6'"),
-    ({"report.trajectory": []}, "report.trajectory: must have at least 1 item(s)"),
     ({"control.std": -0.1}, "control.std: must be a positive number or {learn: true}, got -0.1"),
-    ({"control.scale": "standardise"}, "control.scale: must be standardize, none, or a list of positive numbers"),
-    ({"control.scale": [1.0, 0.0]}, "control.scale.1: must be greater than 0, got 0.0"),
+    ({"control.scale": "standardise"}, "control.scale: must be standardize or none, got 'standardise'"),
     ({"training.optimizer.lr": float("inf")}, "training.optimizer.lr: must be a finite number, got inf"),
     ({"training.layerwise": "yes"}, "training.layerwise: must be true, false, or segments, got 'yes'"),
-    ({"training": None}, "training: must be a mapping (key: value), got null"),
     ({"seed": 2**32}, "seed: must be at most 4294967295, got 4294967296"),
 ]
 
@@ -359,13 +331,6 @@ def test_every_problem_has_its_line() -> None:
         "seed: must be a whole number, got 'a'",
         "traning: unknown key; did you mean training?",
     ]
-
-
-def test_keys_that_are_not_text_are_refused() -> None:
-    with pytest.raises(SpecError, match=r"^selection\.grid\.3: a key must be text"):
-        parse_spec({**SMALL, "selection": {"grid": {3: [1]}}})
-    with pytest.raises(SpecError, match=r"^3: a key must be text"):
-        parse_spec({**SMALL, 3: 4})  # type: ignore[dict-item]
 
 
 def places(node: Any) -> Iterator[tuple[Any, Any]]:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import pytest
 import torch
+from pydantic import TypeAdapter
 from torch import nn
 
 from ddco_pyro.model.networks import Inputs, InputShape, ShapeError, build
 from ddco_pyro.model.networks.perceptrons import StackedLinear
-from ddco_pyro.spec import network_spec
+from ddco_pyro.spec import NetworkSpec
 
 FEATURES, OUTPUTS, COPIES, LONGEST = 3, 2, 4, 5
 SHAPE = InputShape({"state": FEATURES}, {}, LONGEST)
@@ -17,7 +18,7 @@ PIXELS = (14, 18, 3)
 
 def make(shape=SHAPE, **settings):
     torch.manual_seed(0)
-    return build(network_spec(**settings), shape, OUTPUTS, COPIES).eval()
+    return build(TypeAdapter(NetworkSpec).validate_python(settings), shape, OUTPUTS, COPIES).eval()
 
 
 def answer(network, inputs, state=None):

@@ -5,8 +5,6 @@ from __future__ import annotations
 import torch
 from torch import nn
 
-from ddco_pyro.model.networks import Inputs
-
 
 class Own(nn.Module):
     """A network as a user might write it."""
@@ -48,28 +46,11 @@ class Wrong(Own):
         if self.how == "list":
             return found.tolist()
         return {
-            "joined": lambda: found.flatten(2),
             "swapped": lambda: found.transpose(2, 3),
             "squeezed": lambda: found.squeeze(0),
             "time first": lambda: found.transpose(0, 1),
             "fails": lambda: found @ torch.ones(7),
         }[self.how]()
-
-
-class Stateful(Own):
-    """Normalises by what it has seen, and has a table of the steps that there are."""
-
-    def __init__(self, shape, outputs, copies):
-        super().__init__(shape, outputs, copies)
-        self.norm = nn.BatchNorm1d(shape.vector)
-        self.bias = nn.Parameter(torch.zeros(shape.steps))
-        self.pictures = shape.images
-
-    def forward(self, inputs):
-        assert {key: image.shape[2:] for key, image in inputs.images.items()} == self.pictures
-        assert all(image.dtype == torch.uint8 for image in inputs.images.values())
-        seen = self.norm(inputs.vector.flatten(0, 1)).unflatten(0, inputs.batch)
-        return super().forward(Inputs({"seen": seen + self.bias[inputs.time, None]}, {}, inputs.time))
 
 
 class Remembering(nn.Module):

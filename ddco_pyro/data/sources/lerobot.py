@@ -45,12 +45,8 @@ OBSERVATION, ACTION = "observation.", "action"
 SUBTASK = "subtask_index"
 ANNOTATIONS = Path("meta") / "lerobot_annotations.json"
 IMAGES_AT_ONCE = 32
-LONGEST_GAP = 1.5
-"""Frames are missing where a gap between times is longer than LONGEST_GAP × the median gap."""
 _NO_CONTROL = {"timestamp", "frame_index", "episode_index", "index", "task_index", "image", "video", "string"}
 """Names and types of features that are never the control."""
-_LONGEST = 1e9
-"""Longest video, seconds."""
 _DAMAGE = (pyarrow.ArrowException, OSError, KeyError, ValueError, TypeError, IndexError)
 
 
@@ -82,9 +78,6 @@ class LeRobot:
         self.keys = dict(zip(observed, keys, strict=True))
         self._actions = tuple(actions) or (ACTION,)
         self._check_actions()
-        if isinstance(template := self.info.get("video_path"), str):  # before anything is read
-            numbers = dict.fromkeys(("chunk_index", "file_index", "episode_index"), 0)
-            inside(folder, filled(folder, template, {**numbers, "video_key": "video"}))
         self._episodes, self._twice = _episodes(folder)
         if not self._episodes:
             raise DemonstrationsError(f"{folder}: meta/episodes holds no episodes; at least one is needed")
@@ -93,10 +86,8 @@ class LeRobot:
         self._annotated, self._names = self._annotations() if SUBTASK not in self.features else ({}, [])
         files = {self._path("data_path", index, "data") for index in self._episodes}  # some may be missing
         self.data_files = tuple(sorted(path.relative_to(folder) for path in files))
-        self._check_frames()
 
     def source(self) -> Source:
-        """The episodes as demonstrations."""
         folder, robot = self.folder, self.info.get("robot_type")
         about: dict[str, Attribute] = {"robot_type": robot} if isinstance(robot, str) else {}
         if self._names:
@@ -105,10 +96,9 @@ class LeRobot:
         more = (folder / path for path in (ANNOTATIONS, *self.data_files))
         files = (folder / "meta" / "info.json", *meta, *(path for path in more if path.is_file()))
         names = tuple(f"demo_{index}" for index in (*self._episodes, *self._missing))
-        return Source(names, self._read, files, self._masks(names), self._frequency, about, self.keys)
+        return Source(names, self._read, files, {}, self._frequency, about, self.keys)
 
     def _check_actions(self) -> None:
-        """Refuse features that do not exist as the control."""
         types = {name: about.get("dtype") if isinstance(about, dict) else None for name, about in self.features.items()}
         there = [name for name, dtype in types.items() if not {name, str(dtype)} & _NO_CONTROL]
         for feature in self._actions:
@@ -136,21 +126,6 @@ class LeRobot:
             raise damaged(path, "", error) from error
         return found, list(names)
 
-    def _check_frames(self) -> None:
-        """Refuse a dataset if neither its rows nor its episodes' lengths add up to ``total_frames``.
-
-        If one of the two does, reading the episode that differs reports the problem.
-        """
-        total, files = self.info.get("total_frames"), [self.folder / path for path in self.data_files]
-        lengths = [length for row in self._episodes.values() if isinstance(length := row.get("length"), int)]
-        whole = len(lengths) == len(self._episodes) and not self._missing and all(path.is_file() for path in files)
-        if whole and isinstance(total, int) and total != sum(lengths):
-            rows = sum(_count(file) for file in files)
-            if total != rows:
-                raise DemonstrationsError(
-                    f"{self.folder}: meta/info.json counts {total} frames, and {rows} are there; correct total_frames"
-                )
-
     def _path(self, template: str, index: int, prefix: str, **more: str) -> Path:
         """A file of an episode, in the dataset's folder, by a template of ``meta/info.json``."""
         try:
@@ -162,23 +137,8 @@ class LeRobot:
             raise damaged(self.folder, f"demo_{index}: {template}", error) from error
         return inside(self.folder, path)
 
-    def _masks(self, names: Sequence[str]) -> dict[str, tuple[str, ...]]:
-        """The splits, such as ``train: "0:40"``, except splits of all episodes."""
-        masks: dict[str, tuple[str, ...]] = {}
-        splits = self.info.get("splits")
-        for name, span in splits.items() if isinstance(splits, dict) else ():
-            start, _, stop = str(span).partition(":")
-            if start.isdecimal() and stop.isdecimal():
-                members = [f"demo_{index}" for index in self._episodes if int(start) <= index < int(stop)]
-                if 0 < len(members) < len(names):
-                    masks["valid" if name in ("val", "validation") else name] = tuple(members)
-        return masks
-
     def _read(self, name: str) -> Demonstration:
-        """One episode.
-
-        :raises DemonstrationsError: rows are missing, out of order or damaged, or their number is wrong.
-        """
+        """One episode."""
         index = int(name.removeprefix("demo_"))
         if index in self._missing:
             raise DemonstrationsError(f"{name} {self._missing[index]}")
@@ -207,19 +167,21 @@ class LeRobot:
 
     def _check(self, rows: _Rows, index: int) -> None:
         """Refuse an episode with a wrong number of rows, or with rows out of order."""
-        about, there = self._episodes[index], len(rows)
-        start, stop = about.get("dataset_from_index"), about.get("dataset_to_index")
-        spanned = None if start is None or stop is None else stop - start
-        for what, length in (("length", about.get("length")), ("dataset_to_index - dataset_from_index", spanned)):
-            if length is not None and length != there:
-                raise DemonstrationsError(
-                    f"{rows.name}: {what} in meta/episodes is {length}, and {rows.path} has {there} rows of it"
-                )
+        length = self._episodes[index].get("length")
+        if length not in (None, len(rows)):
+            raise DemonstrationsError(
+                f"{rows.name}: length in meta/episodes is {length}, and {rows.path} has {len(rows)} rows of it"
+            )
         for column, frequency in (("frame_index", 1.0), ("timestamp", self._frequency)):
             if column in rows.present and frequency:
                 times = np.asarray(rows.numbers(column, ())).astype(float)
-                if problem := _problem_of_times(times, frequency, column):
-                    raise DemonstrationsError(f"{rows.path}: {rows.name}: {problem}")
+                expected = np.arange(len(times)) / frequency
+                if (wrong := ~(np.abs(times - expected) < 0.5 / frequency)).any():
+                    at = int(wrong.argmax())
+                    raise DemonstrationsError(
+                        f"{rows.path}: {rows.name}: {column} is {times[at]:g} in row {at}, not {expected[at]:g}: "
+                        "frames are missing or out of order, or fps in meta/info.json is wrong; correct one of them"
+                    )
 
     def _observation(self, rows: _Rows, key: str, index: int) -> Observed:
         about = self.features[key]
@@ -241,28 +203,10 @@ class LeRobot:
             begin = float(self._episodes[index][f"videos/{key}/from_timestamp"])
         except _DAMAGE as error:
             raise damaged(self.folder, f"{rows.name}: {key}", error) from error
-        if not 0 <= begin < _LONGEST:
-            raise DemonstrationsError(f"{rows.name}: {key} begins at second {begin:g} of its video")
         rate = self._frequency or 1.0
         shown = frames_of_steps(path, rows.name, begin + start / rate, stop - start, rate, size)
         while block := list(islice(shown, IMAGES_AT_ONCE)):
             yield np.stack(block)
-
-
-def _problem_of_times(times: np.ndarray, frequency: float, column: str) -> str:
-    """The first problem with the times [T] of frames, in words; empty if frame t is at time t / frequency."""
-    expected = np.arange(len(times)) / frequency
-    wrong = ~(np.abs(times - expected) < 0.5 / frequency)
-    if not wrong.any():
-        return ""
-    if (np.abs(times - times[0] - expected) < 0.5 / frequency).all():
-        return f"{column} starts at {times[0]:.6g}, not at 0; subtract that from each"
-    gaps = np.diff(times)
-    if column == "timestamp" and len(gaps) and gaps.min() > 0 and gaps.max() < LONGEST_GAP * np.median(gaps):
-        rate = 1 / gaps.mean()
-        return f"{column} runs at {rate:.4g} Hz, and meta/info.json says {frequency:g}; correct one of them"
-    at = int(wrong.argmax())
-    return f"{column} is {times[at]:g} in row {at}, not {expected[at]:g}: frames are missing or out of order"
 
 
 class _Rows:
@@ -363,14 +307,6 @@ def _open(path: Path, changed: int) -> tuple[parquet.ParquetFile, Mapping[int, l
     for start, stop in pairwise(bounds):
         spans.setdefault(int(index[start]), []).append((start, stop))
     return file, spans
-
-
-def _count(path: Path) -> int:
-    """Number of rows of a parquet file, by its footer."""
-    try:
-        return parquet.read_metadata(path).num_rows
-    except _DAMAGE as error:
-        raise damaged(path, "", error) from error
 
 
 def _episodes(folder: Path) -> tuple[dict[int, dict[str, Any]], set[int]]:

@@ -30,14 +30,12 @@ def rate(said: Mapping[str, object]) -> float | None:
     """
     known = {name.lower(): value for name, value in said.items()}
     for name in (*_RATES, *_PERIODS):
-        value = known.get(name)
         try:
-            number = float(value.lower().removesuffix("hz") if isinstance(value, str) else value)  # type: ignore[arg-type]
-        except (TypeError, ValueError, OverflowError):
+            number = float(str(known.get(name)).lower().removesuffix("hz"))
+        except ValueError:
             continue
-        if isinstance(value, bool) or not 0 < number < math.inf:
-            continue
-        return number if name in _RATES else float(f"{1 / number:.9g}")
+        if 0 < number < math.inf:
+            return number if name in _RATES else float(f"{1 / number:.9g}")
     return None
 
 
@@ -126,43 +124,32 @@ def joined(parts: Mapping[str, np.ndarray], where: str) -> np.ndarray:
 
 def _storable(key: str) -> bool:
     """Whether a key is a valid path in HDF5."""
-    try:
-        length = len(key.encode())
-    except UnicodeEncodeError:
-        return False
-    return length <= 1000 and "\0" not in key and all(part not in ("", ".") for part in key.split("/"))
+    return len(key) <= 250 and "\0" not in key and all(part not in ("", ".") for part in key.split("/"))
 
 
 def stored_keys(folder: Path, names: Sequence[str], preferred: Sequence[str]) -> list[str]:
-    """Keys under which HDF5 can store observations together, whatever their order.
+    """Keys under which HDF5 can store observations together.
 
-    A name gets its preferred key, unless another name has that key, or has one above or below. Then the name itself is
-    the key, or the name with underscores in place of slashes.
+    Each name has its preferred key. Where another name has that key, or one above or below, the name itself is the key.
 
     :param preferred: of each name.
     :raises DemonstrationsError: a name cannot be stored, or occurs too often.
     """
-    keys, groups = dict[str, int](), set[str]()
-    # A key is above keys with more parts, so that keys with fewer parts go first.
-    order = sorted(range(len(names)), key=lambda i: (preferred[i].count("/"), preferred[i] != names[i], names[i]))
-    for index in order:
-        storable = [key for key in (preferred[index], names[index], names[index].replace("/", "_")) if _storable(key)]
-        if not storable:
-            raise DemonstrationsError(
-                f"{folder}: an observation is called {names[index][:100]!r}, which cannot be stored; rename it"
-            )
-        free = (key for key in storable if not (key in keys or key in groups) and not _above(key) & keys.keys())
-        if (key := next(free, None)) is None:
-            raise DemonstrationsError(f"{folder}: two observations are called {names[index]!r}; rename one")
-        keys[key] = index
-        groups |= _above(key)
-    return sorted(keys, key=keys.__getitem__)
+    for name in names:
+        if not _storable(name):
+            called = f"an observation is called {name[:100]!r}"
+            raise DemonstrationsError(f"{folder}: {called}, which cannot be stored; rename it")
+    own = [names[at] if _meets_another(at, preferred) else key for at, key in enumerate(preferred)]
+    for keys in (own, [name.replace("/", "_") for name in names]):
+        if not any(_meets_another(at, keys) for at in range(len(keys))):
+            return keys
+    raise DemonstrationsError(f"{folder}: two observations have one name, or one lies in the other; rename one")
 
 
-def _above(key: str) -> set[str]:
-    """The groups of HDF5 in which a key lies."""
-    parts = key.split("/")
-    return {"/".join(parts[:length]) for length in range(1, len(parts))}
+def _meets_another(at: int, keys: Sequence[str]) -> bool:
+    """Whether another key equals this one, or is a group above or below it."""
+    others = [f"{key}/" for place, key in enumerate(keys) if place != at]
+    return any(other.startswith(f"{keys[at]}/") or f"{keys[at]}/".startswith(other) for other in others)
 
 
 def first_missing(folder: Path, total: object, there: Collection[int], named: str) -> dict[int, str]:

@@ -7,17 +7,20 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 
 from ddco_pyro.data.demonstration import Attribute, Demonstration
 from ddco_pyro.data.errors import DemonstrationsError, damaged
-from ddco_pyro.data.hdf5 import DAMAGE, opened
+from ddco_pyro.data.hdf5 import DAMAGE, dataset_at, datasets, member, opened
 from ddco_pyro.data.sources import Source
 from ddco_pyro.data.sources.metadata import check_links, first_missing, joined, stored_keys
 from ddco_pyro.errors import nearest
 
 BARE = "observation"
 """Key of an observation array without a name."""
+
+MAIN = "main_data.hdf5"
 
 
 @contextmanager
@@ -53,6 +56,11 @@ def open_minari(path: Path, actions: Sequence[str] = ()) -> Iterator[Source]:
         index, where = int(name.removeprefix("demo_")), f"{folder}: {name}"
         if index in missing:
             raise DemonstrationsError(f"{where} {missing[index]}")
+        if (folder / MAIN).is_file():
+            with opened(folder / MAIN) as file:
+                group = member(file, f"episode_{index}", h5py.Group, "")
+                for key in datasets(group):
+                    dataset_at(group, key, f"{name}: ")  # values that were never stored would be read as zeros
         try:
             (episode,) = storage.get_episodes([index])
             (facts,) = storage.get_episode_metadata([index])
@@ -101,7 +109,7 @@ def _leaves(nested: Any, key: str, bare: str) -> Iterator[tuple[str, np.ndarray]
 
 def _episodes(folder: Path) -> set[int]:
     """The numbers of the episodes: groups of an HDF5 file, or folders of Arrow files."""
-    main = folder / "main_data.hdf5"
+    main = folder / MAIN
     if main.is_file():
         with opened(main) as file:
             names = [name.removeprefix("episode_") for name in file]

@@ -59,10 +59,7 @@ def open_robomimic(path: Path) -> Iterator[Source]:
 def _read(
     group: h5py.Group, name: str, observations: Sequence[str] | None, labels: Sequence[str] | None
 ) -> Demonstration:
-    """A demonstration.
-
-    :raises DemonstrationsError: a part is missing, is elsewhere, or claims more than is stored.
-    """
+    """A demonstration."""
 
     def found(folder: str, keys: Sequence[str] | None) -> dict[str, h5py.Dataset]:
         if keys is not None and not keys:

@@ -50,11 +50,9 @@ class Clipped(Gaussian):
 
     @property
     def mode(self) -> Tensor:
-        """μ within the bounds: the control without noise."""
         return self.mean.clamp(self.low, self.high)
 
     def draw(self, noise: Tensor) -> Tensor:
-        """μ + σ·z within the bounds."""
         return super().draw(noise).clamp(self.low, self.high)
 
 

@@ -45,12 +45,10 @@ class Gaussian(Emission):
     def of(
         cls, part: ControlPart, numbers: Tensor, parameters: Tensor, log_scale: Tensor, ends: tuple[Tensor, Tensor]
     ) -> Emission:
-        """The normal distribution with these means."""
         return Gaussian(numbers, parameters[..., : len(part.dims)], log_scale)
 
     @property
     def parameters(self) -> int:
-        """A."""
         return self.mean.shape[-1]
 
     def by_dimension(self, actions: Tensor) -> Tensor:
@@ -96,11 +94,9 @@ class Gaussian(Emission):
 
     @property
     def mode(self) -> Tensor:
-        """μ."""
         return self.mean
 
     def draw(self, noise: Tensor) -> Tensor:
-        """μ + σ·z."""
         return self.mean + self.std * noise.unsqueeze(-2)
 
     def divergence(self, i: int) -> Tensor:

@@ -50,29 +50,24 @@ class Hurdle(Emission):
     def of(
         cls, part: ControlPart, numbers: Tensor, parameters: Tensor, log_scale: Tensor, ends: tuple[Tensor, Tensor]
     ) -> Emission:
-        """The first number is y."""
         slab = Clipped.of(part, numbers[..., 1:], parameters, log_scale, ends)
         assert isinstance(slab, Gaussian)
         return Hurdle(numbers[..., :1], slab)
 
     @classmethod
     def size(cls, part: ControlPart) -> int:
-        """1 + A."""
         return 1 + len(part.dims)
 
     @property
     def shape(self) -> torch.Size:
-        """[..., K, A]."""
         return self.slab.shape
 
     @property
     def numbers(self) -> int:
-        """1 + A."""
         return 1 + self.slab.numbers
 
     @property
     def parameters(self) -> int:
-        """Those of the slab."""
         return self.slab.parameters
 
     def information(self, acting: Tensor, actions: Tensor) -> Iterator[Information]:
@@ -98,7 +93,6 @@ class Hurdle(Emission):
 
     @property
     def mode(self) -> Tensor:
-        """The mode of the more likely part."""
         return torch.where(self.logit >= 0, 0.0, self.slab.mode)
 
     def draw(self, noise: Tensor) -> Tensor:

@@ -33,30 +33,24 @@ class Product(Emission):
 
     @property
     def shape(self) -> torch.Size:
-        """[..., K, A]."""
         size = sum(len(dimensions) for dimensions, _ in self.groups)
         return torch.Size([*self.groups[0][1].shape[:-1], size])
 
     def by_dimension(self, actions: Tensor) -> Tensor:
-        """log π(a_d | s) of each caller and dimension, [..., K, A]."""
         return self._joined([emission.by_dimension(actions[..., dims]) for dims, emission in self.groups])
 
     def log_density(self, actions: Tensor) -> Tensor:
-        """log π(a | s), [..., K]."""
         return reduce(add, (emission.log_density(actions[..., dims]) for dims, emission in self.groups))
 
     def tensors(self) -> tuple[Tensor, ...]:
-        """Those of the groups."""
         return tuple(tensor for _, emission in self.groups for tensor in emission.tensors())
 
     @property
     def mode(self) -> Tensor:
-        """The most likely control of each group."""
         return self._joined([emission.mode for _, emission in self.groups])
 
     @property
     def noise(self) -> int:
-        """The sum of the groups' numbers."""
         return sum(emission.noise for _, emission in self.groups)
 
     def draw(self, noise: Tensor) -> Tensor:
@@ -69,17 +63,14 @@ class Product(Emission):
         return self._joined(draws)
 
     def divergence(self, i: int) -> Tensor:
-        """The sum of the groups' divergences."""
         return reduce(add, (emission.divergence(i) for _, emission in self.groups))
 
     def steps(self) -> list[Self]:
-        """One for each step."""
         each = zip(*(emission.steps() for _, emission in self.groups), strict=True)
         names = [dimensions for dimensions, _ in self.groups]
         return [replace(self, groups=tuple(zip(names, emissions, strict=True))) for emissions in each]
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Self:
-        """The groups of changed tensors."""
         return replace(self, groups=tuple((dimensions, emission.map(change)) for dimensions, emission in self.groups))
 
     def _joined(self, values: Sequence[Tensor]) -> Tensor:

@@ -15,43 +15,21 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-from scipy import special
 from torch import Tensor
-from torch.special import ndtr
 
 from ddco_pyro.data.controls import ControlPart
-from ddco_pyro.model.emissions.base import Emission, Information, Part, phi
+from ddco_pyro.model.emissions.base import Emission, Information, Part
 from ddco_pyro.model.emissions.gaussian import Gaussian, continuous_control
 
-NU = 4.0
+NU = 4
 """ν, the degrees of freedom."""
 
 
-def gamma_quantile(shape: float, share: float) -> float:
-    """The number below which a Gamma variate of this shape and rate 1 is with this probability."""
-
-    def below(x: float) -> float:
-        term = total = math.exp(shape * math.log(x) - x - math.lgamma(shape + 1))
-        step = shape
-        while term > 1e-17 * total:
-            step += 1
-            term *= x / step
-            total += term
-        return total
-
-    low, high = -700.0, math.log(shape + 60 + 20 * math.sqrt(shape))  # logarithms
-    for _ in range(100):
-        middle = (low + high) / 2
-        low, high = (middle, high) if below(math.exp(middle)) < share else (low, middle)
-    return math.exp(high)
-
-
 def student_control(part: Part, mean: np.ndarray, std: np.ndarray, z: np.ndarray | None) -> np.ndarray:
-    """A mean, or a draw around it, in the control's own units; the last of ``z`` decides the scale."""
+    """A mean, or a draw around it, in the control's own units; the last of ``z`` decide the scale."""
     if z is None:
         return continuous_control(part, mean, std, None)
-    stretch = math.sqrt(2.0 / gamma_quantile(2.0, phi(z[-1])))  # of ν / 2
-    return continuous_control(part, mean, std * stretch, z[:-1])
+    return continuous_control(part, mean, std / np.sqrt(np.square(z[len(mean) :]).mean()), z[: len(mean)])
 
 
 @dataclass(frozen=True)
@@ -62,15 +40,14 @@ class Student(Gaussian):
     upper bounds of those of the controls alone.
     """
 
-    further_noise: ClassVar[int] = 1
-    helpers: ClassVar = (phi, gamma_quantile, continuous_control)
+    further_noise: ClassVar[int] = NU
+    helpers: ClassVar = (continuous_control,)
     control: ClassVar = staticmethod(student_control)
 
     @classmethod
     def of(
         cls, part: ControlPart, numbers: Tensor, parameters: Tensor, log_scale: Tensor, ends: tuple[Tensor, Tensor]
     ) -> Emission:
-        """The Student t with these means."""
         return Student(numbers, parameters[..., : len(part.dims)], log_scale)
 
     def log_density(self, actions: Tensor) -> Tensor:
@@ -101,7 +78,6 @@ class Student(Gaussian):
         yield Information(slice(0, size), acting * precision, std=tuple(range(size)), count=acting)
 
     def draw(self, noise: Tensor) -> Tensor:
-        """μ + σ z / √τ, where Φ of the last number is the share of Gamma variates below ντ / 2."""
-        share = ndtr(noise[..., -1:].double()).unsqueeze(-2)
-        stretch = (NU / (2 * torch.as_tensor(special.gammaincinv(NU / 2, share.numpy())))).sqrt()
-        return self.mean + self.std * (noise[..., :-1].unsqueeze(-2) * stretch).to(self.mean.dtype)
+        """μ + σ z / √τ, where τ is the mean square of the last ν numbers, a χ² variate divided by ν."""
+        z, squares = noise[..., :-NU], noise[..., -NU:].double().square()
+        return self.mean + self.std * (z * squares.mean(-1, keepdim=True).rsqrt()).unsqueeze(-2).to(self.mean.dtype)

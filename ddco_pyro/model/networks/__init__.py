@@ -10,7 +10,7 @@ from typing import Any
 from ddco_pyro.model.networks.conv import Conv
 from ddco_pyro.model.networks.inputs import Inputs, InputShape, ShapeError
 from ddco_pyro.model.networks.lstm import Lstm
-from ddco_pyro.model.networks.perceptrons import Branches, Constant, Linear, Mlp, Network, PerTimestep, State, States
+from ddco_pyro.model.networks.perceptrons import Branches, Constant, Mlp, Network, PerTimestep, State, States
 from ddco_pyro.model.networks.user import UserNetwork
 from ddco_pyro.spec import NetworkSpec
 from ddco_pyro.spec.networks import UserNetworkSpec
@@ -30,7 +30,7 @@ __all__ = [
 ]
 
 CLASSES: dict[str, type[Network]] = {
-    "linear": Linear,
+    "linear": Mlp,
     "constant": Constant,
     "mlp": Mlp,
     "per_timestep": PerTimestep,

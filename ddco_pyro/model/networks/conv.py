@@ -66,18 +66,18 @@ class Conv(Network):
             for own in firsts
         )
         if pool == "spatial_softmax":
-            self.strengthen(SHARPNESS)
+            with torch.no_grad():
+                for parameter in (each for layers in self._layers().values() for each in layers[-1].parameters()):
+                    parameter.mul_(SHARPNESS)
         maps = sum(self._map_features(key, own, shape.images[key]) for key, own in self._layers().items())
         self.layers = Perceptrons(copies, shape.vector + maps, hidden, dropout, activation)
 
     def forward(self, inputs: Inputs, state: State = ()) -> tuple[Tensor, State]:
-        """[N, T, K, features], and the state."""
         vector = inputs.vector.flatten(0, 1).expand(self.copies, -1, -1)
         maps = [self._maps(layers, inputs.images[key].flatten(0, 1)) for key, layers in self._layers().items()]
         return options_last(self.layers(torch.cat([vector, *maps], dim=-1)), inputs.batch), state
 
     def numpy_form(self) -> NumpyForm:
-        """Perceptrons over the vectors and the pooled maps of each picture."""
         pictures = [self._picture_form(key, layers) for key, layers in self._layers().items()]
         return self.layers.numpy_form(joined([vectors(self.reads, self.copies), *pictures]))
 
@@ -87,13 +87,6 @@ class Conv(Network):
         facts |= {"activation": self.layers.activation, "standardize": self.standardize}
         arrays = arrays_of({str(number): layer for number, layer in enumerate(layers)})
         return facts | {"pool": self.pool}, arrays
-
-    def strengthen(self, factor: float) -> None:
-        """Multiply the last maps of each picture by a factor."""
-        with torch.no_grad():
-            for layers in self._layers().values():
-                for parameter in layers[-1].parameters():
-                    parameter.mul_(factor)
 
     def _layers(self) -> dict[str, list[nn.Conv2d]]:
         """The convolutions of each picture."""

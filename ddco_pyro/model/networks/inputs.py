@@ -45,13 +45,6 @@ class Frames(Mapping[str, Tensor]):
         """(N, T)."""
         return len(next(iter(self.arrays.values()))), self.steps.stop - self.steps.start
 
-    def loaded(self) -> dict[str, Tensor]:
-        """All pictures, in memory.
-
-        :raises DemonstrationsError: a file cannot be read.
-        """
-        return {key: self[key] for key in self}
-
     def part(self, rows: Tensor | slice, steps: slice) -> Frames:
         """The frames of some trajectories and of consecutive steps; nothing is read."""
         chosen = torch.arange(self.batch[0])[rows].tolist()
@@ -151,7 +144,7 @@ class Inputs:
 
         :raises DemonstrationsError: a file cannot be read.
         """
-        return Inputs(self.vectors, self.images.loaded(), self.time) if isinstance(self.images, Frames) else self
+        return Inputs(self.vectors, dict(self.images), self.time) if isinstance(self.images, Frames) else self
 
     def to(self, device: torch.device) -> Inputs:
         """These inputs on a device; images have to be in memory."""

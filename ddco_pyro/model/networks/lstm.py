@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
 
 import torch
 from torch import Tensor, nn
 
 from ddco_pyro.model.networks.inputs import Inputs, InputShape
 from ddco_pyro.model.networks.perceptrons import (
-    Linear,
+    Mlp,
     Network,
     NumpyForm,
     Perceptrons,
@@ -37,18 +36,16 @@ class Lstm(Network):
     ) -> None:
         super().__init__()
         self.copies, self.horizon = copies, horizon
-        self.over = over or Linear(shape, copies)
+        self.over = over or Mlp(shape, copies)
         sizes = zip([self.over.features, *hidden], hidden, strict=False)
         self.memory = nn.ModuleList(StackedLstm(copies, *pair) for pair in sizes)
         self.layers = Perceptrons(copies, hidden[-1], ())
 
     def initial_state(self, trajectories: int) -> State:
-        """Zeros, after the state of ``over``."""
         own = [layer.recurrent.new_zeros(trajectories, *layer.size) for layer in self._memory() for _ in "hc"]
         return (*self.over.initial_state(trajectories), *own)
 
     def forward(self, inputs: Inputs, state: State) -> tuple[Tensor, State]:
-        """[N, T, K, features], and the state after the last step."""
         within = len(state) - 2 * len(self.memory)
         features, after = self.over(inputs, state[:within])
         values = options_first(features)
@@ -62,7 +59,6 @@ class Lstm(Network):
         return options_last(self.layers(values), inputs.batch), after
 
     def numpy_form(self) -> NumpyForm | None:
-        """Layers that remember, over the form of ``over``; None where that has none."""
         of = self.over.numpy_form()
         if of is None:
             return None
@@ -90,7 +86,7 @@ class StackedLstm(nn.Module):
         if batch[1] == 1:
             return self._step(values, h.transpose(0, 1), c.transpose(0, 1))
         sequences = values.unflatten(1, batch).expand(self.size[0], -1, -1, -1)
-        with _without_warning():
+        with warnings.catch_warnings(action="ignore", category=UserWarning):  # of scattered weights, on GPUs
             each = [
                 torch.lstm(sequence, own, weights, True, 1, 0.0, self.training, False, True)
                 for sequence, own, weights in zip(sequences, self._states(h, c), self._weights(), strict=True)
@@ -116,7 +112,6 @@ class StackedLstm(nn.Module):
             yield h[None, :, copy].contiguous(), c[None, :, copy].contiguous()
 
     def _weights(self) -> Iterator[list[Tensor]]:
-        """Weights and biases of each copy, as torch has them."""
         for weight, bias, recurrent in zip(self.inputs.weight, self.inputs.bias, self.recurrent, strict=True):
             yield [weight.mT.contiguous(), recurrent.mT.contiguous(), bias[0], torch.zeros_like(bias[0])]  # for GPUs
 
@@ -144,11 +139,3 @@ def _in_windows(
             h, c = (state.unflatten(0, (trajectories, windows))[:, -1] for state in (h, c))
             parts.append(said.unflatten(1, (trajectories, size)))
     return torch.cat(parts, dim=2).flatten(1, 2), h, c
-
-
-@contextmanager
-def _without_warning() -> Iterator[None]:
-    """Suppresses torch's warning about scattered weights on GPUs."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "RNN module weights are not part of single contiguous chunk", UserWarning)
-        yield

@@ -163,6 +163,8 @@ class Network(nn.Module):
 class Mlp(Network):
     """K perceptrons over all vectors side by side, or over the features of a trunk (SM 1.1, SM 1.3).
 
+    Without hidden layers the head is K linear maps.
+
     :raises ShapeError: there are images, which only a convolution can read.
     """
 
@@ -186,21 +188,12 @@ class Mlp(Network):
         return self.trunk_size is None and len(self.layers) == 1
 
     def forward(self, seen: Inputs | Tensor, state: State = ()) -> tuple[Tensor, State]:
-        """[N, T, K, features], and the state."""
         if isinstance(seen, Tensor):
             return options_last(self.layers(options_first(seen)), (seen.shape[0], seen.shape[1])), state
         return options_last(self.layers(seen.vector.flatten(0, 1).unsqueeze(0)), seen.batch), state
 
     def numpy_form(self) -> NumpyForm:
-        """Perceptrons over vectors or a trunk."""
         return self.layers.numpy_form(({"kind": "trunk"}, {}) if self.trunk_size else vectors(self.reads, self.copies))
-
-
-class Linear(Mlp):
-    """The vectors, or a trunk's features, themselves; with a head K linear maps of them."""
-
-    def __init__(self, shape: InputShape | Network, copies: int) -> None:
-        super().__init__(shape, copies)
 
 
 class Constant(Mlp):
@@ -211,11 +204,9 @@ class Constant(Mlp):
         self.trunk_size = (shape.copies, shape.features) if isinstance(shape, Network) else None
 
     def forward(self, seen: Inputs | Tensor, state: State = ()) -> tuple[Tensor, State]:
-        """[N, T, K, features], and the state."""
         return super().forward(seen[..., :0] if isinstance(seen, Tensor) else seen.vector[..., None, :0], state)
 
     def numpy_form(self) -> NumpyForm:
-        """Perceptrons over no vector."""
         return self.layers.numpy_form(vectors((), self.copies))
 
 
@@ -253,7 +244,6 @@ class PerTimestep(Network):
         self.layers = Perceptrons(shape.steps * copies, shape.vector, hidden, dropout, activation)
 
     def forward(self, inputs: Inputs, state: State = ()) -> tuple[Tensor, State]:
-        """[N, T, K, features], and the state."""
         times = inputs.time.clamp(max=self.steps - 1)
         maps = torch.stack([times * self.copies + copy for copy in range(self.copies)], dim=1)
         values = inputs.vector.transpose(0, 1).repeat_interleave(self.copies, dim=0)
@@ -262,7 +252,6 @@ class PerTimestep(Network):
         return values.unflatten(0, maps.shape).permute(2, 0, 1, 3), state
 
     def numpy_form(self) -> NumpyForm:
-        """Perceptrons of every step over the vectors."""
         facts, arrays = self.layers.numpy_form(vectors(self.reads, self.copies))
         return facts | {"copies": self.copies, "steps": self.steps}, arrays
 
@@ -289,15 +278,12 @@ class Branches(Network):
         self.layers = Perceptrons(copies, features, hidden, dropout, activation)
 
     def branches(self) -> list[Network]:
-        """The networks that are joined."""
         return [branch for branch in self.of if isinstance(branch, Network)]
 
     def initial_state(self, trajectories: int) -> State:
-        """The states of the branches."""
         return tuple(tensor for branch in self.branches() for tensor in branch.initial_state(trajectories))
 
     def forward(self, inputs: Inputs, state: State) -> tuple[Tensor, State]:
-        """[N, T, K, features], and the state after the last step."""
         values: list[Tensor] = []
         after: State = ()
         for branch in self.branches():
@@ -307,16 +293,12 @@ class Branches(Network):
         return options_last(self.layers(torch.cat(values, -1)), inputs.batch), after
 
     def numpy_form(self) -> NumpyForm | None:
-        """Perceptrons over the branches; None where a branch has no form."""
         forms = [form for branch in self.branches() if (form := branch.numpy_form()) is not None]
         return self.layers.numpy_form(joined(forms)) if len(forms) == len(self.of) else None
 
 
 def _vectors_of(shape: InputShape) -> list[str]:
-    """The names of the vectors.
-
-    :raises ShapeError: there are images.
-    """
+    """The names of the vectors."""
     if shape.images:
         names = ", ".join(sorted(shape.images))
         remedy = "use network: conv, or name the vectors that it is to read in inputs"

@@ -43,15 +43,12 @@ class UserNetwork(Network):
 
     @property
     def features(self) -> int:
-        """The outputs."""
         return self.outputs
 
     def initial_state(self, trajectories: int) -> State:
-        """The module's own state."""
         return self.module.initial_state(trajectories) if self.remembers else ()  # type: ignore[operator, no-any-return]
 
     def forward(self, inputs: Inputs, state: State = ()) -> tuple[Tensor, State]:
-        """What the module gives, and its state."""
         return self.module(inputs, state) if self.remembers else (self.module(inputs), state)
 
     def begin_at(self, outputs: int, value: float = 0.0) -> None:

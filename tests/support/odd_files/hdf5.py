@@ -94,13 +94,12 @@ def circle(group: h5py.Group, folder: Path) -> None:
 # --- what is claimed --------------------------------------------------------------------------------------------------
 
 
-def rows_claimed(group: h5py.Group, folder: Path, rows: int = 10**12) -> None:
-    """Arrays of so many steps of which one chunk is stored."""
+def rows_claimed(group: h5py.Group, folder: Path) -> None:
+    """Arrays of 1e12 steps of which one chunk is stored."""
     for key, size in (("actions", 2), ("obs/offsets", 4), ("obs/visited", 1)):
         del group[key]
-        chunk = min(rows, 10**4)
-        dataset = group.create_dataset(key, (rows, size), "f8", chunks=(chunk, size), compression="gzip")
-        dataset.id.write_direct_chunk((0, 0), zlib.compress(bytes(8 * size * chunk)))
+        dataset = group.create_dataset(key, (10**12, size), "f8", chunks=(10**4, size), compression="gzip")
+        dataset.id.write_direct_chunk((0, 0), zlib.compress(bytes(8 * size * 10**4)))
 
 
 def last_not_whole(folder: Path) -> Path:
@@ -118,23 +117,6 @@ def chunk_missing(group: h5py.Group, folder: Path) -> None:
     del group["obs/offsets"]
     dataset = group.create_dataset("obs/offsets", (STEPS, 4), "f8", chunks=(STEPS - 1, 3))
     dataset[: STEPS - 1] = 1.0
-
-
-# --- values -----------------------------------------------------------------------------------------------------------
-
-
-def half(group: h5py.Group, folder: Path, value: float) -> None:
-    """Numbers of 16 bits in all demonstrations; one of ``demo_1`` is this."""
-    for demo in group.file["data"].values():
-        for key in ("obs/offsets", "actions"):
-            instead(demo, key, demo[key][:].astype(np.float16))
-    with np.errstate(over="ignore"):
-        group["obs/offsets"][3, 2] = np.float16(value)
-
-
-def discrete(group: h5py.Group, folder: Path) -> None:
-    for demo in group.file["data"].values():
-        instead(demo, "actions", np.arange(STEPS) % 3)
 
 
 # --- specs ------------------------------------------------------------------------------------------------------------
@@ -180,20 +162,12 @@ ROWS: dict[str, Row] = {
     "dangling link": Row(changed(soft, "data/demo_1", "demo_9"), LINK.format("demo_9")),
     "hard link": Row(changed(twice), None),
     "a group in itself": Row(changed(circle), "demo_1: obs/again: its groups go in a circle"),
-    "1e12 rows": Row(changed(rows_claimed), r"demo_1: actions claims 16000000000000 bytes, but the file holds \d+"),
-    "a million rows": Row(
-        changed(rows_claimed, 10**6), r"demo_1: actions claims 100 chunks, but the file holds 1; write it again"
-    ),
+    "1e12 rows": Row(changed(rows_claimed), "demo_1: actions claims 100000000 chunks, but the file holds 1; write"),
     "a chunk missing": Row(changed(chunk_missing), r"demo_1: obs/offsets claims 4 chunks, but the file holds 2"),
-    "16 bits, infinite": Row(
-        changed(half, 1e30), r"demo_1: obs/offsets is inf at step 3, index \[2\]|the first in demo_1 at step 3"
-    ),
-    "discrete actions": Row(changed(discrete), None),
     "a pipe": Row(partial(pipe, name="demos.hdf5"), r"is neither a regular file nor a folder"),
     "spec: a pipe": Row(pipe, r"is no file of at most 256 kB"),
     "spec: a device": Row(endless, r"is no file of at most 256 kB"),
     "spec: large": Row(text("a: [" + "1, " * 500_000 + "]"), r"is no file of at most 256 kB"),
-    "spec: nested": Row(text("[" * 2_000), r"nested too deeply"),
     "spec: of a pipe": Row(text(SPEC.format("PIPE")), r"is no regular file"),
     "spec: of a device": Row(text(SPEC.format("/dev/zero")), r"is no regular file"),
 }

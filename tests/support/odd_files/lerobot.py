@@ -149,11 +149,6 @@ def climbing(dataset: Path) -> None:
     info(data_path="data/l/../../../outside.parquet")(dataset)
 
 
-def absolute(dataset: Path) -> None:
-    outside = shutil.copy(dataset / DATA, dataset.parent / "outside.parquet")
-    info(data_path=str(outside))(dataset)
-
-
 def twice(table: pyarrow.Table) -> pyarrow.Table:
     return pyarrow.concat_tables([table, table.slice(2, 1)])
 
@@ -200,11 +195,8 @@ def of_episode(table: pyarrow.Table, index: int) -> pyarrow.Table:
 OUT = "leads out of the dataset"
 PATHS = {
     "lerobot data_path climbs": Row(changed(climbing), OUT),
-    "lerobot data_path absolute": Row(changed(absolute), OUT),
     "lerobot file linked elsewhere": Row(changed(moved_out(DATA)), OUT),
     "lerobot data linked elsewhere": Row(changed(moved_out(Path("data"))), OUT),
-    "lerobot videos linked elsewhere": Row(changed(moved_out(Path("videos"))), OUT),
-    "lerobot stray link": Row(changed(lambda dataset: (dataset / "x.mp4").symlink_to("/etc/hostname")), OUT),
     "lerobot link to a folder": Row(
         changed(lambda dataset: (dataset / "loop").symlink_to(dataset)), "loop is a link to a folder"
     ),
@@ -213,15 +205,11 @@ PATHS = {
     ),
     "lerobot fifo": Row(changed(lambda dataset: os.mkfifo(dataset / "data" / "x")), "is no regular file"),
     "lerobot wide number": Row(changed(info(data_path="data/{chunk_index:9999999999d}")), "may have only"),
-    "lerobot wide padding": Row(changed(info(data_path="data/{chunk_index:013d}")), "may have only"),
-    "lerobot nameless field": Row(changed(info(data_path="data/{0}")), "may have only"),
-    "lerobot attribute": Row(changed(info(data_path="data/{chunk_index.__class__}")), "may have only"),
     "lerobot NUL in a path": Row(changed(info(data_path="data/\0")), "is no path in it"),
-    "lerobot long path": Row(changed(info(data_path="data/" + 5000 * "x")), "is no path in it|is missing"),
 }
 """Paths and links that are refused before anything is read."""
 
-DROPPED = without_rows(7), episode(1, "length", 5), episode(1, "dataset_to_index", 10), info(total_frames=25)
+DROPPED = without_rows(7), episode(1, "length", 5)
 """A frame of episode 1 is gone, and everything that counts says so."""
 
 EPISODES_NOT_WHOLE = {
@@ -236,43 +224,19 @@ EPISODES_NOT_WHOLE = {
     ),
     "lerobot reversed": (changed(reversed_rows(5, 11)), "demo_1: frame_index is 5 in row 0, not 0"),
     "lerobot wrong length": (changed(episode(1, "length", 9)), "demo_1: length in meta/episodes is 9, and .* has 6"),
-    "lerobot wrong span": (
-        changed(episode(1, "dataset_to_index", 12)),
-        "demo_1: dataset_to_index - dataset_from_index in meta/episodes is 7, and .* has 6",
-    ),
     "lerobot no rows": (changed(without_rows(*range(5, 11))), "demo_1: its rows are missing in"),
     "lerobot ragged": (changed(RAGGED), "demo_0: action has 1 numbers in row 0, and meta/info.json says 2; correct"),
     "lerobot null action": (
         in_episode_1("action", lambda row, value: None if row == 7 else value),
         "demo_1: action is null in row 2; repair it",
     ),
-    "lerobot null number": (
-        in_episode_1("action", lambda row, value: [value[0], None] if row == 7 else value),
-        "demo_1: action has 1 numbers in row 2, and",
-    ),
-    "lerobot null state": (
-        in_episode_1("observation.state", lambda row, value: None if row == 7 else value),
-        r"demo_1: observation\.state is null in row 2; repair it",
-    ),
-    "lerobot null time": (
-        in_episode_1("timestamp", lambda row, value: None if row == 7 else value),
-        "demo_1: timestamp is null in row 2; repair it",
-    ),
     "lerobot late": (
         in_episode_1("timestamp", lambda _, value: value + 3.2),
-        r"demo_1: timestamp starts at 3\.2, not at 0; subtract that",
-    ),
-    "lerobot late frames": (
-        in_episode_1("frame_index", lambda _, value: value + 7),
-        r"demo_1: frame_index starts at 7, not at 0; subtract that",
+        r"demo_1: timestamp is 3\.2 in row 0, not 0: .* or fps in meta/info\.json is wrong",
     ),
     "lerobot 50 Hz": (
         in_episode_1("timestamp", lambda _, value: value / 5),
-        r"demo_1: timestamp runs at 50 Hz, and meta/info\.json says 10; correct one",
-    ),
-    "lerobot late, 50 Hz, and uneven": (
-        in_episode_1("timestamp", lambda row, value: 3 + value / 5 + 0.001 * (row % 2)),
-        r"demo_1: timestamp runs at (50|49\.\d+|50\.\d+) Hz, and meta/info\.json says 10",
+        r"demo_1: timestamp is 0\.02 in row 1, not 0\.1",
     ),
 }
 """Datasets of which one episode is not whole, and what is said of it."""
@@ -287,14 +251,11 @@ ROWS = {
         "demo_3 is missing: the metadata counts 4 episodes, and meta/episodes has 3",
     ),
     "lerobot uncounted episode": Row(changed(info(total_episodes=3)), "counts 3 episodes, and meta/episodes has 4"),
-    "lerobot many episodes counted": Row(changed(info(total_episodes=10**12)), "counts 1000000000000 episodes"),
-    "lerobot uncounted frames": Row(changed(info(total_frames=27)), "counts 27 frames, and 26 are there"),
     "lerobot without episodes": Row(
-        changed(rewritten(EPISODES, lambda table: table.slice(0, 0)), info(total_episodes=0, total_frames=0)),
+        changed(rewritten(EPISODES, lambda table: table.slice(0, 0)), info(total_episodes=0)),
         "meta/episodes holds no episodes",
     ),
     "lerobot key with a NUL": Row(changed(feature("observation.a\0b")), "which cannot be stored; rename it"),
-    "lerobot key of nothing": Row(changed(feature("observation.")), "which cannot be stored; rename it"),
     "lerobot key twice": Row(changed(column("observation.images/top")), None),
     "lerobot key below another": Row(changed(column("observation.state.x")), None),
     "lerobot feature without a column": Row(changed(feature("observation.x")), r"demo_0: has no column observation\.x"),
@@ -303,6 +264,4 @@ ROWS = {
         "there is no feature 'action'.*; there is: observation.state, action.continuous; .* --action action.continuous",
     ),
     "lerobot without a place of videos": Row(changed(WITHOUT_VIDEOS), None),
-    "lerobot splits are a list": Row(changed(info(splits=[1])), None),
-    "lerobot endless frequency": Row(changed(info(fps=float("inf"))), None),
 }
