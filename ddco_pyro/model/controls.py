@@ -27,6 +27,8 @@ class ControlScaling(nn.Module):
     its value and nowhere else; its spread is that of the other steps. Constant dimensions are outside the model.
     Constant values, bounds, and the values of switches and hurdles are emitted exactly.
 
+    With ``control.relative_to`` a control is relative to an observation wherever it is scaled.
+
     :param size: A.
     :param constant: the constant dimensions and their values, in the control's own units.
     :param parts: the kinds of the other dimensions.
@@ -45,7 +47,7 @@ class ControlScaling(nn.Module):
         self, spec: ControlSpec, size: int, constant: dict[int, float], parts: tuple[ControlPart, ...]
     ) -> None:
         super().__init__()
-        self.parts = parts
+        self.parts, self.relative_to = parts, spec.relative_to
         self.counts = [len(part.dims) * part.continuous for part in parts]
         varying = [dimension for dimension in range(size) if dimension not in constant]
         self.groups = [tuple(varying.index(dimension) for dimension in part.dims) for part in parts]
@@ -83,7 +85,7 @@ class ControlScaling(nn.Module):
     def fit(self, demonstrations: Demonstrations) -> None:
         """Where the spec says ``standardize``: take mean and spread of these demonstrations' controls."""
         if self.standardized.any():
-            rows = np.concatenate([self._exactly(demo.actions) for demo in demonstrations])
+            rows = np.concatenate([self._exactly(demo.controls(self.relative_to)) for demo in demonstrations])
             shift, spread = rows.mean(0), rows.std(0)
             for dims, part in zip(self.groups, self.parts, strict=True):
                 if part.exact:
@@ -266,6 +268,6 @@ def refuse_impossible(demonstrations: Demonstrations, scaling: ControlScaling, f
     :raises DemonstrationsError: a switch or a discrete action has a value that the model does not know.
     """
     for demonstration in demonstrations:
-        if problem := scaling.impossible(demonstration.name, demonstration.actions):
+        if problem := scaling.impossible(demonstration.name, demonstration.controls(scaling.relative_to)):
             declare, repair = "declare another kind in control.parts", f"repair it, or leave {demonstration.name} out"
             raise DemonstrationsError(f"{problem}; {repair if fitted else declare}")
