@@ -145,7 +145,8 @@ class Controller:
         ended = [table[rows, choice, 1].exp() for table, choice in zip(now.termination, self._choices, strict=True)]
         self.all_terminations = _columns(ended, len(self.seeds))
         self.time += 1
-        return self.hierarchy.scaling.emitted(control).numpy()
+        controls, key = self.hierarchy.scaling.emitted(control).numpy(), self.hierarchy.scaling.relative_to
+        return controls if key is None else controls + np.stack([seen[key] for seen in self._window.last])
 
     def _chosen(self, now: Step, generators: Sequence[np.random.Generator]) -> tuple[Tensor, ...]:
         if self.options == "marginal":
@@ -194,12 +195,12 @@ class ObservationError(BadInput):
 class Window:
     """A window over the last observations, for what the encoder makes of several.
 
-    ``time`` counts the observations.
+    ``time`` counts the observations, of which ``last`` has the latest of each episode.
     """
 
     def __init__(self, encoder: ObservationEncoder) -> None:
         self.encoder, self.time = encoder, 0
-        self._last: list[list[dict[str, np.ndarray]]] = []
+        self.last: list[dict[str, np.ndarray]] = []
 
     def inputs(self, observations: Sequence[Mapping[str, np.ndarray]]) -> Inputs:
         """The networks' inputs for an observation of each of N episodes, T = 1.
@@ -213,7 +214,7 @@ class Window:
         ]
         if not now:
             raise ObservationError("there are no observations; give one for each episode")
-        last = [*self._last, now][-2:]  # differences are from the step before
+        last = [self.last, now] if self.last else [now]  # differences are from the step before
         episodes = zip(*last, strict=True)
         recent = self.encoder.inputs(
             ({key: np.stack([seen[key] for seen in episode]) for key in self.encoder.shapes} for episode in episodes),
@@ -223,7 +224,7 @@ class Window:
         inputs = Inputs(latest.vectors, latest.images, torch.tensor([self.time]))
         for key, vector in latest.vectors.items():
             refuse_large(f"observation {key!r}", vector.numpy())
-        self._last, self.time = last, self.time + 1
+        self.last, self.time = now, self.time + 1
         return inputs
 
     def _checked(self, observation: Mapping[str, np.ndarray], key: str, shape: tuple[int, ...]) -> np.ndarray:

@@ -179,6 +179,8 @@ class Monitor:
                 f"the control applied since the last observation is needed, shape ({scaling.size},); got none"
             )
         row = numbers("the control", control, (scaling.size,))[None]
+        if scaling.relative_to is not None:
+            row = row - self._window.last[0][scaling.relative_to]
         if problem := scaling.impossible("the control", row):
             raise ObservationError(f"{problem}; is it in the demonstrations' units?")
         scaled = scaling.scaled(row)

@@ -1,9 +1,9 @@
-"""What coincides in demonstrations: copies, controls among observations, and angles that are one after a turn."""
+"""What coincides in demonstrations: copies, what is no observation, and angles that are one after a turn."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -45,70 +45,150 @@ class Copies:
             )
 
 
-# --- controls among observations --------------------------------------------------------------------------------------
+# --- what is no observation -------------------------------------------------------------------------------------------
 
 LOOKED_AT = 1000
 """Steps of each demonstration in which observations are compared with controls."""
 
-SHIFTS = {0: "at the same step", 1: "of the next step", -1: "of the step before"}
-"""Steps by which a control follows the observation that equals it."""
+SHIFTS = {0: ("at the same step", 1e-3), 1: ("of the next step", 1e-3), -1: ("of the step before", 1e-6)}
+"""Steps by which a control follows the observation that tells it, and the largest share of the observation's variance,
+1 - R², that the control leaves unexplained."""
+
+FEWEST = 10
+"""Fewest pairs of steps that tell anything."""
+
+EXACT = 1e-9
+"""What is unexplained by rounding alone."""
+
+LATER = 0.1
+"""An observation that follows the control of the step before is a state that the control moved. A copy of a later
+control leaves less than this part of what that one leaves."""
+
+CLOCKS = {"timestamp", "timestamps", "time", "clock"}
+"""Keys of observations that are clocks where they rise, however unevenly."""
+
+EVEN = 0.1
+"""Other scalars are clocks where they rise by steps that differ by at most this part of one."""
+
+GENERATED = {
+    "subtask_term_signals": "is a label, labels/subtask, and no observation",
+    "datagen_info": "is what a generator of data plans, and no robot sees it",
+    "target_eef_pose": "is the target of a controller, the answer that a policy has to give",
+}
+"""Parts of keys that MimicGen and Isaac Lab give to what is no observation, and why."""
+
+
+NEAR = 0.25
+"""A target is this near to what it is a target of: the root mean square of their difference, in deviations of it."""
 
 
 class Leaks:
-    """Numbers of observations that equal controls in all demonstrations.
-
-    :ivar equal: by place and shift, [D, A]: whether they are always equal.
-    """
+    """Observations that no policy should read: controls in any units, clocks, and what a generator of data writes."""
 
     def __init__(self) -> None:
-        self.equal: dict[str, dict[int, np.ndarray]] = {}
-        self._compared: set[tuple[str, int]] = set()
+        self._origin: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+        self._moments: dict[tuple[str, int], list[np.ndarray]] = {}
+        self._clocks: dict[str, bool] = {}
 
     def add(self, place: str, rows: np.ndarray, commands: np.ndarray) -> None:
         """Compare an observation [T, D] of a demonstration with its controls [T, A]."""
-        rows = rows[:LOOKED_AT]
-        commands = commands[: len(rows)]
-        floats = [array.dtype for array in (rows, commands) if array.dtype.kind == "f"]
-        coarser = min(floats, key=lambda dtype: dtype.itemsize, default=np.dtype(np.float64))
-        with np.errstate(over="ignore"):
-            rows, commands = rows.astype(coarser), commands.astype(coarser)
-        shape = rows.shape[1], commands.shape[1]
-        for shift, equal in self.equal.setdefault(place, {shift: np.ones(shape, bool) for shift in SHIFTS}).items():
-            observed = rows[max(-shift, 0) : max(len(rows) - max(shift, 0), 0)]
-            ahead = commands[max(shift, 0) :][: len(observed)]
-            self._compared |= {(place, shift)} if len(observed) else set()
-            for dimension in np.flatnonzero(equal.any(0)):
-                equal[:, dimension] &= (observed == ahead[:, [dimension]]).all(0)
+        rows, commands = rows[:LOOKED_AT].astype(np.float64), commands[:LOOKED_AT].astype(np.float64)
+        if len(rows) > 2:
+            self._clocks[place] = self._clocks.get(place, True) and _rises(place, rows)
+        origin = self._origin.setdefault(place, (rows[:1], commands[:1]))  # against cancellation
+        x, a = rows - origin[0], commands - origin[1]
+        for shift in SHIFTS:
+            seen = x[max(-shift, 0) : max(len(x) - max(shift, 0), 0)]
+            told = a[max(shift, 0) :][: len(seen)]
+            with np.errstate(over="ignore", invalid="ignore"):
+                each = [
+                    np.array(len(seen)),
+                    seen.sum(0),
+                    told.sum(0),
+                    (seen**2).sum(0),
+                    (told**2).sum(0),
+                    seen.T @ told,
+                ]
+            before = self._moments.get((place, shift))
+            self._moments[place, shift] = [np.add(*pair) for pair in zip(before, each, strict=True)] if before else each
 
-    def _found(self, place: str, shift: int, varying: Sequence[int]) -> tuple[list[int], list[int]]:
-        """The dimensions of an observation that equal controls ``shift`` steps later, and those control dimensions."""
-        if (place, shift) not in self._compared:
-            return [], []
-        equal = self.equal[place][shift][:, list(varying)]
-        observed, controls = np.flatnonzero(equal.any(1)).tolist(), np.flatnonzero(equal.any(0)).tolist()
-        return observed, [varying[column] for column in controls]
+    def _unexplained(self, place: str) -> np.ndarray:
+        """1 - R² of each number of an observation by each control at each of :data:`SHIFTS`, [3, D, A]."""
+        found = []
+        for shift in SHIFTS:
+            count, x, a, xx, aa, xa = self._moments[place, shift]
+            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+                rest = 1 - (count * xa - np.outer(x, a)) ** 2 / np.outer(count * xx - x**2, count * aa - a**2)
+            found.append(np.where(np.isfinite(rest) & (count >= FEWEST), rest, 1.0))
+        return np.maximum(found, EXACT)
 
-    def whole(self, place: str, varying: Sequence[int], still: Sequence[int]) -> bool:
-        """Whether an observation holds nothing but controls that are still to be predicted.
+    def _found(self, place: str, varying: Sequence[int]) -> dict[int, tuple[list[int], list[int]]]:
+        """By shift, the numbers of an observation that tell controls, and these controls."""
+        rest = self._unexplained(place)[:, :, list(varying)]
+        best, least = rest.argmin(0), rest.min(0)
+        told = least <= np.array([limit for _, limit in SHIFTS.values()])[best]
+        told &= (least <= LATER * rest[-1]) | (least == EXACT) | (best == len(SHIFTS) - 1)
+        each = ((shift, told & (best == place)) for place, shift in enumerate(SHIFTS))
+        return {
+            shift: (np.flatnonzero(which.any(1)).tolist(), np.array(varying)[which.any(0)].tolist())
+            for shift, which in each
+            if which.any()
+        }
 
+    def followed(self, place: str, varying: Sequence[int]) -> bool:
+        """Whether the control is a target of an observation: near to it at this or the next step, number by number.
+
+        The observation has as many numbers, and their difference at the same step varies where the control does.
+        """
+        if place not in self._origin or len({rows.shape[1] for rows in self._origin[place]}) > 1:
+            return False
+        near, offset = [], np.subtract(*self._origin[place][::-1])[0]
+        for shift in (-1, 0):
+            count, x, a, xx, aa, xa = self._moments[place, shift]
+            count, square = np.maximum(count, 1), xx + aa - 2 * xa.diagonal()
+            with np.errstate(over="ignore", invalid="ignore"):
+                spread, changes = aa - a**2 / count, square - (a - x) ** 2 / count
+                apart = square + 2 * offset * (a - x) + count * offset**2
+                near.append((apart <= NEAR**2 * spread)[varying].all())
+        moves = np.isin(np.arange(len(changes)), varying)
+        return bool(any(near) and ((changes > EXACT * spread.max()) == moves).all())
+
+    def reason(self, place: str, varying: Sequence[int], still: Sequence[int]) -> str:
+        """Why an observation is no observation, in words; empty where a policy may read it.
+
+        :param varying: the control dimensions that vary.
         :param still: the constant dimensions of the observation.
         """
-        if place not in self.equal:
-            return False
-        rest = set(range(len(self.equal[place][0]))) - set(still)
-        return bool(rest) and rest <= {number for shift in (0, 1) for number in self._found(place, shift, varying)[0]}
+        for part, why in GENERATED.items():
+            if part in place.split("/"):
+                return why
+        if self._clocks.get(place):
+            return "is a clock, which reads other values on another day; the built-in step counts from 0"
+        rest = set(range(len(self._origin[place][0][0]))) - set(still) if place in self._origin else set()
+        found = {shift: each for shift, each in self._found(place, varying).items() if shift >= 0} if rest else {}
+        if not rest or not rest <= {number for observed, _ in found.values() for number in observed}:
+            return ""
+        controls = " and ".join(f"control {listed(told)} {SHIFTS[shift][0]}" for shift, (_, told) in found.items())
+        return f"is {controls}, up to units and noise, which a policy has to predict"
 
-    def notes(self, varying: Sequence[int], names: Sequence[str]) -> Iterator[str]:
-        """A line for each observation and shift, of the varying control dimensions in these demonstrations."""
-        for place in self.equal:
-            for shift, when in SHIFTS.items():
-                observed, controls = self._found(place, shift, varying)
-                if observed:
-                    effect = "tend to repeat it" if shift < 0 else "see what they have to predict"
-                    yield (
-                        f"{place}: {listed(observed)} = control {listed(controls)} {when}, in all {len(names)} "
-                        f"demonstrations, the first {names[0]}: policies {effect}"
-                    )
+    def notes(self, varying: Sequence[int], left_out: Collection[str]) -> Iterator[str]:
+        """A line for each shift, of observations that hold controls among other numbers, or the one before.
+
+        :param left_out: observations that are not to be read at all.
+        """
+        for place in (place for place in self._origin if place not in left_out):
+            for shift, (observed, controls) in self._found(place, varying).items():
+                effect = "tend to repeat it" if shift < 0 else "see what they have to predict"
+                what = f"{place}: {listed(observed)} = control {listed(controls)} {SHIFTS[shift][0]}"
+                yield f"{what}, up to units and noise: policies {effect}"
+
+
+def _rises(place: str, rows: np.ndarray) -> bool:
+    """Whether an observation [T, D] is one number that rises as a clock does."""
+    steps = np.diff(rows[:, :1], axis=0)
+    if rows.shape[1] != 1 or not (steps >= 0).all() or not steps.any():
+        return False
+    return place.rpartition("/")[2] in CLOCKS or bool(np.ptp(steps) <= EVEN * np.median(steps))
 
 
 # --- angles and quaternions -------------------------------------------------------------------------------------------

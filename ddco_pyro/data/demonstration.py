@@ -111,6 +111,21 @@ class Demonstration:
         seen = {f"obs/{key}": array for key, array in self.observations.items()}
         return {"actions": self.actions, **seen, **{f"labels/{key}": array for key, array in self.labels.items()}}
 
+    def controls(self, relative_to: str | None = None) -> np.ndarray:
+        """The controls [T, A]; minus the observation of this key, where there is one.
+
+        :raises DemonstrationsError: the observation has not the shape of the controls.
+        """
+        if relative_to is None:
+            return self.actions
+        seen = self.observations[relative_to]
+        if is_picture(seen) or seen.shape != self.actions.shape:
+            shapes = f"{[*seen.shape[1:]]} at each step, and the control {[*self.actions.shape[1:]]}"
+            raise DemonstrationsError(
+                f"control.relative_to: obs/{relative_to} has shape {shapes}; both have to be equal"
+            )
+        return self.actions - np.asarray(seen, np.float64)
+
     def __len__(self) -> int:
         return len(self.actions) if self.actions.ndim else 0
 

@@ -159,9 +159,10 @@ class Inspection:
     :param lengths: number of steps of each demonstration by name.
     :param problems: a line for each problem that a fit refuses.
     :param frequency: control steps per second, Hz; None if unknown.
-    :param control: statistics of each control dimension.
+    :param control: statistics of each control dimension, of the control minus ``relative_to`` where there is one.
     :param coincidences: a line for each kind of suspicious equality.
-    :param leaks: observations, ``obs/<key>``, that hold nothing but controls still to be predicted.
+    :param leaks: observations, ``obs/<key>``, that no policy should read, and why.
+    :param relative_to: the observation of which the control is a target; None without one.
     :param excluded: names of demonstrations that were skipped.
     :param unreadable: names of demonstrations that could not be read.
     :param turns: the angles in radians and the first numbers of quaternions that jump, by place of the array.
@@ -178,7 +179,8 @@ class Inspection:
     problems: list[str] = field(default_factory=list)
     control: tuple[ControlDimension, ...] = ()
     coincidences: tuple[str, ...] = ()
-    leaks: tuple[str, ...] = ()
+    leaks: Mapping[str, str] = field(default_factory=dict)
+    relative_to: str | None = None
     excluded: tuple[str, ...] = ()
     unreadable: list[str] = field(default_factory=list)
     odd: Mapping[str, str] = field(default_factory=dict)
@@ -198,7 +200,10 @@ class Inspection:
         """A line for each odd demonstration, unusual control dimension, coincidence, and kind of control."""
         auto = control_parts(ControlSpec(), self.control) if self.control else ()
         kinds = (f"{line}, by control.kind: auto" for line in described(auto))
-        return [*self.exclusions, *notes(self.control), *self.coincidences, *kinds]
+        leaks = (f"{place} {why}" for place, why in self.leaks.items())
+        target = f"the control is a target of obs/{self.relative_to}: what follows is of their difference"
+        followed = [f"{target}, control.relative_to: {self.relative_to}"] if self.relative_to else []
+        return [*self.exclusions, *followed, *notes(self.control), *self.coincidences, *leaks, *kinds]
 
     @property
     def observations(self) -> list[Field]:
@@ -229,6 +234,7 @@ class Inspection:
             "masks": {name: list(names) for name, names in self.masks.items()},
             "fields": [array.as_json() for array in self.fields.values()],
             "control_dimensions": [dimension.as_data() for dimension in self.control],
+            "relative_to": self.relative_to,
             "odd": dict(self.odd),
             "notes": self.notes,
             "problems": self.problems,
@@ -287,12 +293,19 @@ class _Inspector:
             for place, jumps in self.jumps.items()
         }
         found.turns = {place: each for place, each in turns.items() if any(each)}
+        seen = [array for array in found.observations if found.everywhere(array)]
+        reasons = {array.place: self.leaks.reason(array.place, varying, array.constant) for array in found.observations}
+        found.leaks = {place: why for place, why in reasons.items() if why}
+        if not any(dimension.integer or len(dimension.values) == 2 for dimension in found.control):
+            followed = (one.key for one in seen if not reasons[one.place] and self.leaks.followed(one.place, varying))
+            found.relative_to = next(followed, None)
+        if (key := found.relative_to) is not None:
+            found.control = control_dimensions({name: self.source.read(name).controls(key) for name in self.controls})
         found.coincidences = (
             *self.copies.notes(found.masks),
-            *self.leaks.notes(varying, list(self.copies.digests)),
+            *self.leaks.notes(varying, {*found.leaks, f"obs/{key}"}),
             *(note for place, jumps in self.jumps.items() for note in jumps.notes(place, *ends[place])),
         )
-        found.leaks = tuple(place for place in fields if self.leaks.whole(place, varying, fields[place].constant))
 
     def _odd(self, dimensions: Sequence[ControlDimension]) -> dict[str, str]:
         """Names of demonstrations to exclude, and why.

@@ -194,6 +194,7 @@ def _filled(
         unusable_labels=unusable_labels,
         vectors=vectors,
         turns=inspection.turns,
+        relative_to=inspection.relative_to,
         zip=zip,
         images=images,
         pictures=not vectors,
@@ -279,4 +280,4 @@ def _left_out(inspection: Inspection, field: Field) -> str:
         return "is constant"
     if len(field.constant + field.rounding) == len(field.minimum):
         return "is constant up to rounding"
-    return "is the control that a policy has to predict" if field.place in inspection.leaks else ""
+    return inspection.leaks.get(field.place, "")

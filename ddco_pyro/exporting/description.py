@@ -115,6 +115,7 @@ def describe(hierarchy: Hierarchy, control: RolloutSpec, program: StepProgram) -
         "step": {"key": STEP, "longest": float(encoder.longest)} if STEP in vectors else None,
         "features": dict(zip(encoder.keys, encoder.sizes, strict=True)),
         "levels": [level.count for level in hierarchy.option_levels()],
+        "relative_to": scaling.relative_to,
         "varying": scaling.varying.tolist(),
         "scale": scale.tolist(),
         "shift": shift.tolist(),

@@ -90,7 +90,8 @@ class Runner:
         self.choices = choose(self.outputs, generator)
         self.terminations = self._psi(self.outputs)
         self._last, self.time = now, self.time + 1
-        return self._control(self.outputs, generator)
+        control, key = self._control(self.outputs, generator), self.about["relative_to"]
+        return control if key is None else control + now[key]
 
     def _psi(self, outputs: Outputs) -> tuple[float, ...]:
         """ψ of each active choice, lowest level first; 1 for control."""

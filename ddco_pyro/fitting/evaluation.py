@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -210,6 +211,7 @@ CONSTANT: Mapping[str, Any] = {
     "compare_with": [],
     "observations": ["nothing"],
     "control.power": 1,
+    "control.relative_to": None,
     "training": {"optimizer": {"name": "em"}, "tune_fraction": 0, "starts": ["random"]},
     "report": {},
 }
@@ -229,19 +231,22 @@ def marginal(spec: Spec, size: Sizes, parts: Mapping[str, Demonstrations]) -> Ma
     }
     stds = {path: std if isinstance(std, LearnedStd) else LearnedStd(learn=True) for path, std in own.items() if std}
     learned = {path: {"learn": True, "floor": std.floor} for path, std in stds.items()}
-    train = _unseen(tuning_split(spec, size, parts["train"])[0])
+    unseen = partial(_unseen, relative_to=spec.control.relative_to)
+    train = unseen(tuning_split(spec, size, parts["train"])[0])
     alike = replace(size, shapes=train.observation_shapes, steps=max(train.lengths))  # of the same kinds
     model = train_model(with_overrides(spec, {**CONSTANT, **learned}), alike, train).hierarchy
     values = {
-        name: float(sum(piece.log_likelihood.sum() for piece in infer(model, _unseen(part))) / sum(part.lengths))
+        name: float(sum(piece.log_likelihood.sum() for piece in infer(model, unseen(part))) / sum(part.lengths))
         for name, part in parts.items()
     }
     return Marginal(**values, controls=len(model.scaling.varying))
 
 
-def _unseen(demos: Demonstrations) -> Demonstrations:
-    """Demonstrations with a constant in place of their observations."""
-    return Demonstrations(tuple(replace(one, observations={"nothing": np.zeros((len(one), 1))}) for one in demos))
+def _unseen(demos: Demonstrations, relative_to: str | None) -> Demonstrations:
+    """Demonstrations with a constant in place of their observations, and with what options are of as their controls."""
+    each = ((one, one.controls(relative_to)) for one in demos)
+    nothing = (replace(one, observations={"nothing": np.zeros((len(one), 1))}, actions=own) for one, own in each)
+    return Demonstrations(tuple(nothing))
 
 
 def _options(

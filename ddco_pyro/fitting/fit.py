@@ -115,7 +115,8 @@ def fit(
         if demos is None and not finished:
             with clock("demonstrations"):
                 demos = read_demonstrations(spec, on_event)
-            models = check_models(spec, Dimensions.of(demos))  # the control decides the baselines too
+            # the control decides the baselines too
+            models = check_models(spec, Dimensions.of(demos, spec.control.relative_to))
         if folder is not None:
             if demos is not None:
                 record(folder, demos)
@@ -160,7 +161,7 @@ def _fit_models(
     clock = clock or Clock()
     spec, *_ = next(iter(models.values()))
     specs = {other: its for other, (its, _) in list(models.items())[1:]}
-    split, size = train_and_valid(spec, demos), Dimensions.of(demos)
+    split, size = train_and_valid(spec, demos), Dimensions.of(demos, spec.control.relative_to)
     later = {other for other, its in specs.items() if _shares_recogniser(its)}
 
     def baseline(other: str) -> Callable[..., Fit]:
@@ -292,7 +293,7 @@ def fit_beside(
         record(folder, demos, recorded(folder.parent.parent))
         if is_finished(folder):
             return load(folder, allow_code=True)
-    models = {name: (spec, check_networks(spec, Dimensions.of(demos)))}
+    models = {name: (spec, check_networks(spec, Dimensions.of(demos, spec.control.relative_to)))}
     return replace(_fit_models(models, demos, folder, on_event, workers, name=name), given=None)
 
 

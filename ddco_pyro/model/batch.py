@@ -88,7 +88,7 @@ def encode(
     """
     refuse_unusable(demonstrations, encoder, scaling, fitted)
     inputs = encoder.inputs(demo.observations for demo in demonstrations)
-    actions = padded([scaling.scaled(demo.actions) for demo in demonstrations]).float()
+    actions = padded([scaling.scaled(demo.controls(scaling.relative_to)) for demo in demonstrations]).float()
     return Batch(inputs, actions, torch.tensor([len(demo) for demo in demonstrations]))
 
 
@@ -103,11 +103,11 @@ def refuse_unusable(
     """
     places = np.repeat([f"obs/{spec.key}" for spec in encoder.specs], encoder.sizes)
     for demo in demonstrations:
-        if problem := scaling.impossible(demo.name, demo.actions):
+        if problem := scaling.impossible(demo.name, demo.controls(scaling.relative_to)):
             declare, repair = "declare another kind in control.parts", f"repair it, or leave {demo.name} out"
             raise DemonstrationsError(f"{problem}; {repair if fitted else declare}")
         features = encoder.scaled(encoder.features(demo.observations))
-        sizes = np.abs(np.concatenate([features, scaling.scaled(demo.actions)], axis=1))
+        sizes = np.abs(np.concatenate([features, scaling.scaled(demo.controls(scaling.relative_to))], axis=1))
         if (sizes > LARGEST_SCALED).any():
             step, column = np.argwhere(sizes > LARGEST_SCALED)[0]
             place = places[column] if column < len(places) else "actions"

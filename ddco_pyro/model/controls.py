@@ -27,6 +27,8 @@ class ControlScaling(nn.Module):
     its value and nowhere else; its spread is that of the other steps. Constant dimensions are outside the model.
     Constant values, bounds, and the values of switches and hurdles are emitted exactly.
 
+    With ``control.relative_to`` a control is relative to an observation wherever it is scaled.
+
     :param size: A.
     :param constant: the constant dimensions and their values, in the control's own units.
     :param parts: the kinds of the other dimensions.
@@ -45,7 +47,7 @@ class ControlScaling(nn.Module):
         self, spec: ControlSpec, size: int, constant: dict[int, float], parts: tuple[ControlPart, ...]
     ) -> None:
         super().__init__()
-        self.parts = parts
+        self.parts, self.relative_to = parts, spec.relative_to
         self.counts = [len(part.dims) * part.continuous for part in parts]
         varying = [dimension for dimension in range(size) if dimension not in constant]
         self.groups = [tuple(varying.index(dimension) for dimension in part.dims) for part in parts]
@@ -86,7 +88,7 @@ class ControlScaling(nn.Module):
     def fit(self, demonstrations: Demonstrations) -> None:
         """Where the spec says ``standardize``: take mean and spread of these demonstrations' controls."""
         if self.standardized.any():
-            rows = np.concatenate([self._exactly(demo.actions) for demo in demonstrations])
+            rows = np.concatenate([self._exactly(demo.controls(self.relative_to)) for demo in demonstrations])
             shift, spread = rows.mean(0), rows.std(0)
             for dims, part in zip(self.groups, self.parts, strict=True):
                 if part.exact:

@@ -209,8 +209,8 @@ def beside_baselines(
     found, total = {}, len(segmented.counts) * len(baselines.BASELINES)
     for level, count in segmented.counts.items():
         for name in baselines.BASELINES:
-            seed, observations = fit.spec.seed, fit.spec.observations
-            found[f"{level}_{name}"] = baselines.segment(name, train, demos, count, seed, observations, gripper)
+            seed, observations, key = fit.spec.seed, fit.spec.observations, fit.spec.control.relative_to
+            found[f"{level}_{name}"] = baselines.segment(name, train, demos, count, seed, observations, gripper, key)
             on_event(BaselineSegmented(name, total))
     if fit.hierarchy.recogniser is not None:
         found[baseline_labels(fit)[-1]] = [

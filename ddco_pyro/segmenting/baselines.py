@@ -47,6 +47,7 @@ def segment(
     seed: int,
     observations: Sequence[ObservationSpec] | None = None,
     gripper: int = -1,
+    relative_to: str | None = None,
 ) -> list[np.ndarray]:
     """Segments of a baseline that is fitted to ``train``: one of ``count`` kinds at each step of ``valid``, [T] each.
 
@@ -56,6 +57,7 @@ def segment(
     :param name: one of :data:`BASELINES`.
     :param observations: the observations to read; all of ``train`` for None.
     :param gripper: for ``gripper``, the control dimension whose changes divide; negative ones count from the end.
+    :param relative_to: the observation that controls are relative to; None for none.
     :raises BadInput: there is no such baseline or control dimension, or a package is not installed.
     """
     if name not in BASELINES:
@@ -65,18 +67,18 @@ def segment(
         return [equal_lengths(len(demo), count) for demo in valid]
     if name == "gripper":
         return _gripper(train, valid, gripper)
-    rows = _rows_of(train, observations)
+    rows = _rows_of(train, observations, relative_to)
     return METHODS[name]([rows(demo) for demo in train], [rows(demo) for demo in valid], count, seed)
 
 
 def _rows_of(
-    train: Demonstrations, observations: Sequence[ObservationSpec] | None
+    train: Demonstrations, observations: Sequence[ObservationSpec] | None, relative_to: str | None
 ) -> Callable[[Demonstration], np.ndarray]:
     """A function from a demonstration to a row of features for each step, standardised by the training ones."""
     shapes = train.observation_shapes
     encoder = ObservationEncoder(observations or [ObservationSpec(key=key) for key in shapes], shapes)
     encoder.fit(train)
-    controls = np.concatenate([demo.actions for demo in train])
+    controls = np.concatenate([demo.controls(relative_to) for demo in train])
     middle, spread = controls.mean(0), controls.std(0)
     varying = spread > 1e-9 * np.maximum(np.abs(controls).max(0), 1e-9)
 
@@ -92,7 +94,7 @@ def _rows_of(
             for key, transform in encoder.transforms.items()
         ]
         seen = np.concatenate([vector, *(image.double().numpy() for image in images)], axis=1)
-        scaled = (demo.actions - middle)[:, varying] / spread[varying]
+        scaled = (demo.controls(relative_to) - middle)[:, varying] / spread[varying]
         return joined(seen, scaled) if varying.any() else seen
 
     return rows

@@ -111,7 +111,7 @@ def select(
         folds = divide(demos, spec.selection.folds, spec.seed)
         held_out = [fold.masks["valid"] for fold in folds]
         write_text(folder / "folds.json", json_text({"folds": held_out}))
-        candidates = grid.candidates(spec, Dimensions.of(demos))
+        candidates = grid.candidates(spec, Dimensions.of(demos, spec.control.relative_to))
         choice = choosing.choose(candidates, _fit_all(folder, folds, candidates, on_event, workers))
         _write(folder, spec, choice, folds)
     if choice.chosen is None:

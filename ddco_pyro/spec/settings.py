@@ -194,6 +194,9 @@ class ControlSpec(DistributionSpec):
     """Standard deviation σ in scaled units, or ``{learn: true, floor: ...}``."""
     scale: Literal["standardize", "none"] = "standardize"
     """``standardize``: continuous dimensions are scaled by their mean and spread in the training demonstrations."""
+    relative_to: Text | None = None
+    """An observation of as many numbers as the control, such as measured joints where the control is their targets.
+    Options are of the control minus this observation. Controllers and exports give the control itself. Null: none."""
     power: float = Field(default=1.0, gt=0, le=1)
     """β: how many times the log-density of the control counts in training and in posteriors of the options (a power, or
     coarsened, likelihood). The less it counts, the longer segments are. Reported log-likelihoods are of densities."""

@@ -139,11 +139,12 @@ class Spec(Model):
                 yield f"observations.{index}.key", f"{key!r} is given twice; keep one"
         if not self.observed:
             yield "observations", f"{STEP} alone says nothing about the state; name an observation beside it"
-        for key in dict.fromkeys(path.key for path in self.report.trajectory or ()):
+        named = [("report.trajectory", path.key) for path in self.report.trajectory or ()]
+        named += [("control.relative_to", self.control.relative_to)] if self.control.relative_to else []
+        for place, key in dict.fromkeys(named):
             if key not in self.observed:
                 there = ", ".join(self.observed)
-                text = f"there is no observation {key!r}{nearest(key, self.observed)}; there is: {there}"
-                yield "report.trajectory", text
+                yield place, f"there is no observation {key!r}{nearest(key, self.observed)}; there is: {there}"
 
     def _labelled(self) -> Problems:
         names, known = self.demonstrations.labels, [level.name for level in self._levels]
@@ -189,6 +190,9 @@ def _grid_problems(spec: Spec) -> Problems:
         here = f"selection.grid.{path}"
         if path.partition(".")[0] == "selection":
             yield here, "the selection cannot be part of its own grid; remove it"
+            continue
+        if path == "control.relative_to":
+            yield here, "decides what the control is, for all candidates; remove it"
             continue
         for value in values:
             try:

@@ -55,7 +55,7 @@ class RecogniserSpec(Model):
 
 
 class LabelsSpec(Model):
-    """Labels that fix the active option of one level; steps labelled −1 are free."""
+    """Labels that fix the active option of one level; steps labelled −1 are free. Those held out are never used."""
 
     model_config = ConfigDict(serialize_by_alias=True)
 
@@ -63,9 +63,6 @@ class LabelsSpec(Model):
     """Name of the level."""
     source: Text = Field(alias="from")
     """Name of the integer labels in the file; the sorted labels from 0 on are the options 1, 2, ..."""
-    count: Count | None = None
-    """Number of demonstrations whose labels are used: training demonstrations in order, then tuning demonstrations.
-    Null: all. Labels of held-out demonstrations are never used."""
     recogniser: RecogniserSpec | None = None
     """A recogniser that the labelled steps train, for steps without labels and for other demonstrations; null: none."""
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +35,7 @@ def dimensions(spec: Spec, demos: Demonstrations | None = None) -> Dimensions:
     if demos is None and in_file(spec):
         demos = outline(spec)
     if demos is not None:
-        return Dimensions.of(demos)
+        return Dimensions.of(demos, spec.control.relative_to)
     assert spec.demonstrated_task is not None  # or they would be in a file
     task = find_task(spec.demonstrated_task)
     environment = task.watched(spec.demonstrations.seed, spec.observed)
@@ -47,7 +48,7 @@ def dimensions(spec: Spec, demos: Demonstrations | None = None) -> Dimensions:
     file = sought.file or cache_path(task, spec.demonstrated_task, sought, spec.observed)
     if not file.exists():
         return size
-    collected = Dimensions.of(Demonstrations.read(file, (), (), sought.exclude))
+    collected = Dimensions.of(Demonstrations.read(file, _measured(spec), (), sought.exclude), spec.control.relative_to)
     return replace(size, constant=collected.constant, control=collected.control)
 
 
@@ -124,11 +125,13 @@ def demonstrations(spec: Spec, on_event: OnEvent = ignore) -> Demonstrations:
 def outline(spec: Spec) -> Demonstrations:
     """The demonstrations in the spec's file, with zeros in place of observations, of which the headers alone are read.
 
+    The one that controls are relative to is read.
+
     :raises DemonstrationsError: as :func:`demonstrations`, except for values of observations.
     """
     path = spec.demonstrations.file
     assert path is not None  # the demonstrations are in a file
-    return _read(spec, path, _outlined)
+    return _read(spec, path, partial(_outlined, measured=_measured(spec)))
 
 
 def _read(spec: Spec, path: Path, ready: Callable[[Demonstration], Demonstration]) -> Demonstrations:
@@ -149,15 +152,20 @@ def _read(spec: Spec, path: Path, ready: Callable[[Demonstration], Demonstration
         return _set_apart(spec, Demonstrations(tuple(ready(demo) for demo in found), masks, attributes))
 
 
-def _outlined(demo: Demonstration) -> Demonstration:
-    """A demonstration with zeros, which need no memory, in place of observations."""
+def _outlined(demo: Demonstration, measured: Collection[str]) -> Demonstration:
+    """A demonstration with zeros, which need no memory, in place of observations but the measured ones."""
     check(demo)
     zeros = {
         key: np.broadcast_to(np.zeros((), np.uint8 if is_picture(array) else np.float64), array.shape)
         for key, array in demo.observations.items()
     }
-    known = Demonstration(**{**vars(demo), "observations": {}})
-    return Demonstration.stored(**{**vars(known), "observations": zeros})
+    known = Demonstration(**{**vars(demo), "observations": {key: demo.observations[key] for key in measured}})
+    return Demonstration.stored(**{**vars(known), "observations": {**zeros, **known.observations}})
+
+
+def _measured(spec: Spec) -> tuple[str, ...]:
+    """The observation that controls are relative to, if any."""
+    return tuple(filter(None, [spec.control.relative_to]))
 
 
 def seen(spec: Spec, demos: Demonstrations) -> Demonstrations:

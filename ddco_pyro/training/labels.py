@@ -22,7 +22,7 @@ class Labels:
 
     :param level: 1 is the lowest.
     :param values: the labels that the options 1, 2, ... stand for.
-    :param demonstrations: the names of the demonstrations whose labels are used.
+    :param demonstrations: the names of the demonstrations that have labels, those to train with first.
     :param train: the option of each step of the demonstrations to train with, [N, T]; -1 where it is free.
     :param tune: the same of the demonstrations to tune with.
     :param evidence: what a recogniser says of each choice at steps without labels, [N, T, 1 + k], of both.
@@ -47,12 +47,13 @@ class Labels:
         if labels is None or spec.hierarchy is None:
             return None
         number, level = next(item for item in enumerate(spec.hierarchy.levels, 1) if item[1].name == labels.level)
-        used = (*train, *(() if tune is train else tune))[: labels.count]
+        each = (*train, *(() if tune is train else tune))
+        used = [demo for demo in each if (demo.labels[labels.source] >= 0).any()]
         values = _distinct(demo.labels[labels.source] for demo in used)
-        if not _distinct(demo.labels[labels.source] for demo in used[: len(train)]):
+        if not _distinct(demo.labels[labels.source] for demo in train):
             raise SpecError(
-                f"training.labels: labels/{labels.source} is -1 at every step of the demonstrations to train with that "
-                "have labels; raise training.labels.count, or leave training.labels out"
+                f"training.labels: labels/{labels.source} is -1 at every step of the demonstrations to train with; "
+                "leave training.labels out"
             )
         if len(values) > level.count:
             raise SpecError(
@@ -72,7 +73,9 @@ def used(spec: Spec, demos: Demonstrations) -> Labels | None:
     """
     if spec.training.labels is None:
         return None
-    return Labels.of(spec, *tuning_split(spec, Dimensions.of(demos), train_and_valid(spec, demos)["train"]))
+    return Labels.of(
+        spec, *tuning_split(spec, Dimensions.of(demos, spec.control.relative_to), train_and_valid(spec, demos)["train"])
+    )
 
 
 def _distinct(labels: Iterable[np.ndarray]) -> tuple[int, ...]:

@@ -46,12 +46,13 @@ class Dimensions:
     parts: tuple[ControlPart, ...] | None = None
 
     @classmethod
-    def of(cls, demonstrations: Demonstrations) -> Dimensions:
+    def of(cls, demonstrations: Demonstrations, relative_to: str | None = None) -> Dimensions:
         """The dimensions of these demonstrations.
 
+        :param relative_to: the spec's ``control.relative_to``.
         :raises DemonstrationsError: every dimension of the control is constant.
         """
-        control = control_dimensions({demo.name: demo.actions for demo in demonstrations})
+        control = control_dimensions({demo.name: demo.controls(relative_to) for demo in demonstrations})
         constant = {dimension.number: dimension.minimum for dimension in control if dimension.constant}
         if len(constant) == len(control):
             raise DemonstrationsError(all_constant(control))

@@ -13,12 +13,14 @@ import gymnasium
 import h5py
 import minari
 import numpy as np
+import pyarrow
 import pytest
 from command_line import call
 from gymnasium import spaces
 from minari.data_collector.episode_buffer import EpisodeBuffer
 from odd_files import lerobot as odd
 from odd_files.hdf5 import instead
+from pyarrow import parquet
 from random_demonstrations import demonstrations
 
 from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
@@ -167,6 +169,40 @@ def test_episodes_without_all_of_their_video_are_left_out(tmp_path: Path, out: P
         import_demonstrations(dataset, out, choice=Choice(videos=True))
     left_out = import_demonstrations(dataset, out, choice=Choice(videos=True, skip_broken=True)).left_out
     assert (set(left_out), Demonstrations.read(out).names) == ({"demo_2", "demo_3"}, ("demo_0", "demo_1"))
+
+
+@pytest.mark.parametrize("index", [True, False], ids=["an index of pandas", "a column"])
+def test_lerobots_tasks_and_subtasks_of_frames_are_labels_with_names(index: bool, tmp_path: Path, out: Path) -> None:
+    """Subtasks have a table of names, of which one number is missing; the task of the last episode changes."""
+    column = "__index_level_0__" if index else "subtask"
+    names = pyarrow.table({"subtask_index": [2, 0], column: ["lift", "reach"]})
+
+    def framed(table: pyarrow.Table) -> pyarrow.Table:
+        tasks = table["task_index"].to_pylist()
+        tasks[-3:] = [0, 0, 0]
+        table = table.set_column(table.schema.get_field_index("task_index"), "task_index", pyarrow.array(tasks))
+        return table.append_column("subtask_index", pyarrow.array([2 * (n % 2) for n in range(len(table))]))
+
+    def both(table: pyarrow.Table) -> pyarrow.Table:
+        tasks = [*table["tasks"].to_pylist()[:-1], ["push the block", "pull the block"]]
+        return table.set_column(table.schema.get_field_index("tasks"), "tasks", pyarrow.array(tasks))
+
+    dataset = odd.changed(odd.rewritten(odd.DATA, framed), odd.rewritten(odd.EPISODES, both))(tmp_path)
+    parquet.write_table(names, dataset / "meta" / "subtasks.parquet")
+    import_demonstrations(dataset, out)
+    demos = Demonstrations.read(out)
+    assert json.loads(str(demos.attributes["label_names"])) == {
+        "subtask": ["reach", "subtask 1", "lift"],
+        "task": ["pull the block", "push the block"],
+    }
+    assert demos[3].labels["task"].tolist() == [1, 1, 1, 1, 1, 0, 0, 0]
+    assert demos[2].labels["task"].tolist() == [0] * 7
+    assert demos[0].labels["subtask"].tolist() == [0, 2, 0, 2, 0]
+
+
+def test_lerobots_task_of_a_whole_episode_is_no_label(out: Path) -> None:
+    import_demonstrations(odd.FIXTURE, out)
+    assert Demonstrations.read(out)[0].labels == {}
 
 
 def test_lerobot_subtasks(tmp_path: Path, out: Path) -> None:

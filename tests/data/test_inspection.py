@@ -171,7 +171,7 @@ NOTES: dict[str, list[str]] = {
     ],
     "a demonstration twice": ["1 of 5 demonstrations equal another one, the first demo_4, which equals demo_0: one of"],
     "an observation that is the control": [
-        "obs/command: dimensions 0-1 = control dimensions 0-1 at the same step, in all 5 demonstrations, the first",
+        "obs/command is control dimensions 0-1 at the same step, up to units and noise, which a policy has to predict",
     ],
     "a switch padded by zeros": [
         "control dimension 2: exactly 0 in 29.4 % of the steps; exactly at its minimum -1 in 47.1 % of the steps",
@@ -204,12 +204,15 @@ def test_a_control_among_other_numbers_is_noted_and_alone_left_out(shift: int, l
 
     found = inspect(write(tmp_path / "demos.hdf5", change))
     when = {-1: "of the step before", 0: "at the same step", 1: "of the next step"}[shift]
-    for place, dimension in (("obs/alone", 0), ("obs/both", 3)):
-        said = (
-            f"{place}: dimension {dimension} = control dimension 1 {when}, in all 5 demonstrations, the first demo_0: "
-        )
-        assert sum(note.startswith(said) for note in found.notes) == 1
-    assert found.leaks == (("obs/alone",) if left_out else ())
+    said = [f"obs/both: dimension 3 = control dimension 1 {when}, "]
+    said += [
+        f"obs/alone is control dimension 1 {when}, "
+        if left_out
+        else said[0].replace("both: dimension 3", "alone: dimension 0")
+    ]
+    for line in said:
+        assert sum(note.startswith(line) for note in found.notes) == 1
+    assert [*found.leaks] == (["obs/alone"] if left_out else [])
 
 
 def test_copies_are_noted_where_the_masks_part_them(tmp_path: Path) -> None:

@@ -100,7 +100,7 @@ hierarchy:
   levels: [{{name: skill, count: 3, policy: {{network: linear}}, termination: {{network: linear}}}}]
   meta_policy: {{network: linear}}
 compare_with: [{{kind: mixture}}]
-training: {{epochs: 60, optimizer: {{lr: 0.1}}, labels: {{level: skill, from: phase, count: null}}}}
+training: {{epochs: 60, optimizer: {{lr: 0.1}}, labels: {{level: skill, from: phase}}}}
 """
     )
     ended = call("fit", folder / "mine.yaml", "--out", folder / "run", "--jobs", 1)

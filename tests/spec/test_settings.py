@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import yaml
 from random_demonstrations import numbered
+from targets import targets, velocities
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.inspection import inspect
@@ -175,7 +176,7 @@ def of_scripts() -> Iterator[tuple[str, str]]:
 
 
 def of_init(folder: Path) -> Iterator[tuple[str, str]]:
-    """What ``init`` writes for vectors with angles and quaternions, pictures, labels, few demonstrations, operators."""
+    """What ``init`` writes for vectors with angles and quaternions, pictures, labels, few demonstrations, targets."""
     random, steps = np.random.default_rng(0), 30
     turns, pictures = [], []
     for _ in range(12):
@@ -190,6 +191,7 @@ def of_init(folder: Path) -> Iterator[tuple[str, str]]:
         "pictures": numbered(pictures),
         "few demonstrations": pick_and_place(4),
         "labels": Demonstrations(tuple(operators)),
+        "targets": targets(velocities(4)),
     }
     for name, demos in files.items():
         path = folder / f"{name}.hdf5"

@@ -114,18 +114,13 @@ def test_the_label_wins_over_the_cluster():
 # --- which labels are used --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("count", "used"), [(1, 1), (2, 2), (4, 4), (5, 5), (None, 5), (99, 5)])
-def test_the_first_demonstrations_in_training_have_labels_those_to_tune_with_last(count, used):
-    demos = random_demonstrations()
-    train, tune = demos.split(0.2, 0)
-    labels = Labels.of(labelled(count=count), train, tune)
-    assert labels.demonstrations == (*train.names, *tune.names)[:used]
-    known = demos.select(labels.demonstrations)
-    seen = {value for demo in known for value in options(demo.labels["phase"].tolist())} - {-1}
+def test_labels_of_demonstrations_to_train_and_to_tune_with_are_used():
+    train, tune = random_demonstrations().split(0.2, 0)
+    labels = Labels.of(labelled(), train, tune)
+    assert labels.demonstrations == tuple(name for name in (*train.names, *tune.names) if name != "demo_3")
     for part, tensor in ((train, labels.train), (tune, labels.tune)):
         for demo, row in zip(part, tensor.tolist(), strict=True):
-            given = options(demo.labels["phase"].tolist()) if demo.name in labels.demonstrations else [-1] * STEPS
-            assert row == (given if seen == {1, 2} else [min(option, 1) for option in given])
+            assert row == options(demo.labels["phase"].tolist())
 
 
 @pytest.mark.parametrize(
@@ -349,11 +344,12 @@ def test_three_labelled_demonstrations_name_the_options_of_thirty(tmp_path):
     """Held-out segments have the numbers of the labels, whichever those are; the options 1 to 3 of the truth do not."""
     names = [30, 10, 20]
     training = {"epochs": 160, "patience": 15, "starts": ["vq"], "optimizer": {"lr": 0.03}}
-    labels = {"level": "level-1", "from": "phase", "count": 3}
+    labels = {"level": "level-1", "from": "phase"}
     spec = make_spec((3,), control=CONTROL, labels=labels, **training)
     truth = make_truth(spec)
     demos, choices = plant(truth, 30, 24, seed=1)
     phases = np.array(names)[choices[..., 0].numpy() - 1]
+    phases[3:] = -1
     demos = Demonstrations(tuple(replace(demo, labels={"phase": row}) for demo, row in zip(demos, phases, strict=True)))
     held_out, true = plant(truth, 20, 24, seed=11)
     model = make_trainer(spec, demos, tmp_path).run()
@@ -370,7 +366,7 @@ def test_three_labelled_demonstrations_name_the_options_of_thirty(tmp_path):
 @pytest.fixture
 def files(tmp_path):
     """A spec and demonstrations with labels, of which two of three options have one."""
-    labels = [[0, 0, 2, 2], [0, 2, 2, 2], [0, 0, 0, 2], [0, 0, 2, 2], [0, 2, 0, 2]]
+    labels = [[0, 0, 2, 2], [0, 2, 2, 2], [0, 0, 0, 2], [-1, -1, -1, -1], [0, 2, 0, 2]]
     random_demonstrations(labels).write(tmp_path / "demos.hdf5")
     (tmp_path / "mine.yaml").write_text(
         f"""
@@ -378,7 +374,7 @@ demonstrations: {{path: {tmp_path / "demos.hdf5"}}}
 observations: [state]
 hierarchy: {{levels: [{{name: skill, count: 3, policy: {{network: linear}}}}], meta_policy: {{network: linear}}}}
 compare_with: [{{kind: flat, policy: {{network: linear}}}}]
-training: {{epochs: 3, labels: {{level: skill, from: phase, count: 2}}}}
+training: {{epochs: 3, labels: {{level: skill, from: phase}}}}
 """
     )
     return tmp_path
@@ -396,13 +392,13 @@ def test_a_start_that_does_not_follow_labels_is_warned_of(files, start):
 
 def test_a_run_says_for_which_labels_its_options_stand(files):
     output = call("check", files / "mine.yaml").out
-    assert "labels/phase, level 'skill': phase 0 is option 1, phase 2 is option 2; used of 2 demonstrations" in output
+    assert "labels/phase, level 'skill': phase 0 is option 1, phase 2 is option 2; used of 3 demonstrations" in output
     call("fit", files / "mine.yaml", "--out", files / "run")
     said = json.loads((files / "run" / "metrics.json").read_text())["trained_labels"]
     assert (said["level"], said["labels"], said["values"]) == ("skill", "phase", [0, 2])
     again = ddco_pyro.load(files / "run")
     labelled = again.demonstrations.select(said["demonstrations"])
-    assert len(labelled) == 2
+    assert len(labelled) == 3
     option = {0: 1, 2: 2}
     (segments,) = again.segment(labelled)
     same = [

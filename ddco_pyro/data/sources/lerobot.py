@@ -42,7 +42,9 @@ _CONVERT = (
     "lerobot.datasets.v30.convert_dataset_v21_to_v30)"
 )
 OBSERVATION, ACTION = "observation.", "action"
-SUBTASK = "subtask_index"
+SUBTASK, TASK = "subtask_index", "task_index"
+MOST_NAMES = 10_000
+"""Most tasks, or subtasks, that have names."""
 ANNOTATIONS = Path("meta") / "lerobot_annotations.json"
 IMAGES_AT_ONCE = 32
 _NO_CONTROL = {"timestamp", "frame_index", "episode_index", "index", "task_index", "image", "video", "string"}
@@ -55,6 +57,8 @@ class LeRobot:
 
     ``observation.images.top`` becomes ``obs/images/top``, ``action`` becomes ``actions``, and ``subtask_index`` becomes
     ``labels/subtask``. Beside ``observation.state``, the feature ``observation.state.gripper`` keeps its dots.
+    Where tasks change within an episode, ``task_index`` becomes ``labels/task``. Names are those of
+    ``meta/subtasks.parquet`` and ``meta/tasks.parquet``.
     Without the column of subtasks, the subtasks in ``meta/lerobot_annotations.json`` become labels: they are numbered
     in the order in which they first occur, and -1 marks steps before the first one.
 
@@ -83,7 +87,13 @@ class LeRobot:
             raise DemonstrationsError(f"{folder}: meta/episodes holds no episodes; at least one is needed")
         self._missing = first_missing(folder, self.info.get("total_episodes"), self._episodes, "meta/episodes")
         self._frequency = rate({"fps": self.info.get("fps")})
-        self._annotated, self._names = self._annotations() if SUBTASK not in self.features else ({}, [])
+        self._annotated, subtasks = self._annotations() if SUBTASK not in self.features else ({}, [])
+        changing = any(len(row.get("tasks") or ()) > 1 for row in self._episodes.values())
+        self._labels = {"subtask": SUBTASK} | ({"task": TASK} if changing else {})
+        names = {name: self._named(name) for name in self._labels}
+        self._names = {
+            name: each for name, each in (names | ({"subtask": subtasks} if subtasks else {})).items() if each
+        }
         files = {self._path("data_path", index, "data") for index in self._episodes}  # some may be missing
         self.data_files = tuple(sorted(path.relative_to(folder) for path in files))
 
@@ -91,7 +101,7 @@ class LeRobot:
         folder, robot = self.folder, self.info.get("robot_type")
         about: dict[str, Attribute] = {"robot_type": robot} if isinstance(robot, str) else {}
         if self._names:
-            about[LABEL_NAMES] = json.dumps({"subtask": self._names})
+            about[LABEL_NAMES] = json.dumps(self._names)
         meta = sorted((folder / "meta").rglob("*.parquet"))
         more = (folder / path for path in (ANNOTATIONS, *self.data_files))
         files = (folder / "meta" / "info.json", *meta, *(path for path in more if path.is_file()))
@@ -126,6 +136,22 @@ class LeRobot:
             raise damaged(path, "", error) from error
         return found, list(names)
 
+    def _named(self, kind: str) -> list[str]:
+        """The names of tasks, or subtasks, by number; empty where no table names them."""
+        path = self.folder / "meta" / f"{kind}s.parquet"
+        if not path.is_file():
+            return []
+        try:
+            columns = parquet.read_table(path).to_pydict()
+            numbers = columns.pop(f"{kind}_index")
+            texts = next((texts for texts in columns.values() if all(isinstance(text, str) for text in texts)), ())
+            names = {int(number): text for number, text in zip(numbers, texts, strict=True) if number >= 0}
+            if max(names, default=0) >= MOST_NAMES:
+                raise ValueError(f"{kind}_index is {max(names)}")
+        except _DAMAGE as error:
+            raise damaged(path, "", error) from error
+        return [names.get(number, f"{kind} {number}") for number in range(1 + max(names, default=-1))]
+
     def _path(self, template: str, index: int, prefix: str, **more: str) -> Path:
         """A file of an episode, in the dataset's folder, by a template of ``meta/info.json``."""
         try:
@@ -151,9 +177,10 @@ class LeRobot:
             rows = _Rows(path, index, name)
             self._check(rows, index)
             observations = {key: self._observation(rows, feature, index) for feature, key in self.keys.items()}
-            labels = {"subtask": np.asarray(rows.numbers(SUBTASK, ()))} if SUBTASK in rows.present else {}
+            there = {name: column for name, column in self._labels.items() if column in rows.present}
+            labels = {name: np.asarray(rows.numbers(column, ())) for name, column in there.items()}
             if self._annotated:
-                labels = {"subtask": np.full(len(rows), -1)}
+                labels["subtask"] = np.full(len(rows), -1)
                 for start, number in self._annotated.get(index, ()):
                     labels["subtask"][max(start, 0) :] = number
             controls = {key: np.asarray(rows.numbers(key, self.features[key]["shape"])) for key in self._actions}

@@ -1,7 +1,8 @@
 """HDF5 files of robomimic's layout, which is also this project's: read and written.
 
 A file holds groups ``data/<name>`` with ``actions`` [T, A], ``obs/<key>`` [T, ...] and optional ``labels/<name>`` [T].
-Optional datasets ``mask/<name>`` list names of demonstrations (robomimic: filter keys).
+Optional datasets ``mask/<name>`` list names of demonstrations (robomimic: filter keys). Signals of subtasks, such as
+MimicGen's and Isaac Lab's, are read as ``labels/subtask``.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from ddco_pyro.data.demonstration import Attribute, Demonstration
 from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.files import whole_file
 from ddco_pyro.data.hdf5 import attributes_of, dataset_at, datasets, lazy, member, natural, opened, values_of, written
+from ddco_pyro.data.labels import LABEL_NAMES, label_names
 from ddco_pyro.data.sources import Source
 from ddco_pyro.data.sources.metadata import rate
 
@@ -27,6 +29,12 @@ ENVIRONMENT = "env_args"
 
 STEPS, ALL_STEPS = "num_samples", "total"
 """Attributes of a demonstration and of the group ``data``: number of steps."""
+
+SUBTASK = "subtask"
+"""Labels that are made of signals, where the file has none of this name."""
+
+SIGNALS = ("datagen_info/subtask_term_signals", "obs/datagen_info/subtask_term_signals")
+"""Where MimicGen and Isaac Lab have a signal for each subtask: 1 from its last step on. What follows has none."""
 
 # --- reading ----------------------------------------------------------------------------------------------------------
 
@@ -43,7 +51,12 @@ def open_robomimic(path: Path) -> Iterator[Source]:
         masks = member(file, "mask", h5py.Group, "") if "mask" in file else {}
         known = attributes_of(data) | attributes_of(file)
         attributes = {name: known[name] for name in known if name != ALL_STEPS}
-        frequency = frequency_of(attributes)
+        frequency, order = frequency_of(attributes), list[str]()
+        if names:
+            with suppress(DemonstrationsError):  # reading it tells
+                order = list(_ends(member(data, names[0], h5py.Group, ""), names[0]))
+                known_names = label_names(attributes) if order else {}
+                attributes |= {LABEL_NAMES: json.dumps({SUBTASK: [*order, "last"], **known_names})} if order else {}
         if frequency is None and names:
             with suppress(DemonstrationsError):  # reading it tells
                 frequency = rate(attributes_of(member(data, names[0], h5py.Group, "")))
@@ -51,15 +64,46 @@ def open_robomimic(path: Path) -> Iterator[Source]:
         def read(
             name: str, observations: Sequence[str] | None = None, labels: Sequence[str] | None = None
         ) -> Demonstration:
-            return _read(member(data, name, h5py.Group, ""), name, observations, labels)
+            return _read(member(data, name, h5py.Group, ""), name, observations, labels, order)
 
         yield Source(names, read, (path,), {name: _mask(masks, name) for name in masks}, frequency, attributes)
 
 
+def _ends(group: h5py.Group, name: str) -> dict[str, int]:
+    """The last step of each subtask by name, the first one first; of one that never ends, the number of steps.
+
+    Empty without signals, and where the demonstration has labels of this name.
+    """
+    place = next((place for place in SIGNALS if place in group), None)
+    if place is None or f"labels/{SUBTASK}" in group:
+        return {}
+    members, where = member(group, place, h5py.Group, f"{name}: "), f"{name}: {place}/"
+    signals = {key: values_of(dataset_at(members, key, where), where + key) for key in datasets(members, where)}
+    ends = {key: int(np.append(values.ravel() > 0, True).argmax()) for key, values in signals.items()}
+    return dict(sorted(ends.items(), key=lambda item: item[1]))
+
+
+def _subtasks(ends: Mapping[str, int], order: Sequence[str], steps: int) -> np.ndarray:
+    """The subtask of each step [T]: the place in ``order`` of the one that ends next; behind them all the last one."""
+    labels, before = np.full(steps, len(order), np.int16), 0
+    for name, end in ends.items():
+        if end < steps and name in order:
+            labels[before : end + 1], before = order.index(name), end + 1
+    return labels
+
+
 def _read(
-    group: h5py.Group, name: str, observations: Sequence[str] | None, labels: Sequence[str] | None
+    group: h5py.Group,
+    name: str,
+    observations: Sequence[str] | None,
+    labels: Sequence[str] | None,
+    order: Sequence[str] = (),
 ) -> Demonstration:
-    """A demonstration."""
+    """A demonstration.
+
+    :param order: the names of labels/subtask that signals become; empty where the file has no signals.
+    :raises DemonstrationsError: a part is missing, is elsewhere, or claims more than is stored.
+    """
 
     def found(folder: str, keys: Sequence[str] | None) -> dict[str, h5py.Dataset]:
         if keys is not None and not keys:
@@ -72,11 +116,14 @@ def _read(
     claimed = attributes.pop(STEPS, len(control))
     if claimed != len(control):
         raise DemonstrationsError(f"{name}: actions has {len(control)} steps, but {STEPS} is {claimed}")
+    ends = _ends(group, name) if order and (labels is None or SUBTASK in labels) else {}
+    signalled = {SUBTASK: _subtasks(ends, order, len(control))} if ends else {}
     if labels is None and group.get("labels", getlink=True) is None:
         labels = ()
+    labels = labels and [key for key in labels if key not in signalled]
     seen = {key: lazy(dataset, f"{name}: obs/{key}") for key, dataset in found("obs", observations).items()}
     known = {key: values_of(dataset, f"{name}: labels/{key}") for key, dataset in found("labels", labels).items()}
-    return Demonstration.stored(name, seen, values_of(control, f"{name}: actions"), known, attributes)
+    return Demonstration.stored(name, seen, values_of(control, f"{name}: actions"), known | signalled, attributes)
 
 
 def _mask(masks: h5py.Group, mask: str) -> tuple[str, ...]:
