@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -260,6 +261,8 @@ def segment(
                     console.say(said)
             if missing:
                 print(f"--baselines: {missing}; no agreement is measured")
+        for line in segmented.unlike:
+            print(f"note: unlike the demonstrations of the fit: {line}", file=sys.stderr)
         for writer in writers:
             print(writer.write(segmented))
 

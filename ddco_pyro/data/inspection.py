@@ -21,7 +21,6 @@ from ddco_pyro.data.controls import (
     control_dimensions,
     control_parts,
     described,
-    few,
     most_few,
     notes,
     rounding,
@@ -31,6 +30,7 @@ from ddco_pyro.data.demonstration import Attribute, problem_of, unlike
 from ddco_pyro.data.division import check_division, problems_of_masks
 from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.labels import UNKNOWN, label_names
+from ddco_pyro.data.likeness import EXCLUDE, Likeness, told
 from ddco_pyro.data.sources import Source, open_source
 from ddco_pyro.spec import ControlSpec
 
@@ -165,7 +165,8 @@ class Inspection:
     :param excluded: names of demonstrations that were skipped.
     :param unreadable: names of demonstrations that could not be read.
     :param turns: the angles in radians and the first numbers of quaternions that jump, by place of the array.
-    :param odd: names of demonstrations that are dead or change the kind of a control dimension, and why.
+    :param odd: names of demonstrations that are dead, unlike the others, or change the kind of a control dimension, and
+        why.
     :param attributes: of each demonstration by its name.
     """
 
@@ -188,10 +189,7 @@ class Inspection:
     @property
     def exclusions(self) -> list[str]:
         """A line for each reason to exclude demonstrations, with their names."""
-        names = {why: [name for name in self.odd if self.odd[name] == why] for why in self.odd.values()}
-        return [
-            f"{few(members)}: {why}; exclude {'them' if len(members) > 1 else 'it'}" for why, members in names.items()
-        ]
+        return told(self.odd, len(self.lengths), EXCLUDE)
 
     @property
     def notes(self) -> list[str]:
@@ -255,7 +253,7 @@ class _Inspector:
         self.source, self.found = source, found
         self.problems: dict[tuple[str, str], list[str]] = {}  # messages by kind and subject
         self.controls: dict[str, np.ndarray] = {}
-        self.copies, self.leaks = Copies(), Leaks()
+        self.copies, self.leaks, self.likeness = Copies(), Leaks(), Likeness()
         self.jumps: dict[str, Jumps] = {}
 
     def read(self, names: Sequence[str]) -> None:
@@ -269,12 +267,14 @@ class _Inspector:
                 found.unreadable.append(name)
                 self.copies.digests.pop(name, None)
                 self.controls.pop(name, None)
+                self.likeness.discard(name)
         for name, there in places.items():
             for place in (place for place in fields if place not in there):
                 self._problem("missing", f"{name}: {place} is missing", place)
         self._name_labels()
         found.control = control_dimensions(self.controls)
-        found.odd = self._odd(found.control)
+        odd = self.likeness.unlike() | self._odd(found.control)
+        found.odd = {name: odd[name] for name in found.lengths if name in odd}
         varying = [dimension.number for dimension in found.control if not dimension.constant]
         kinds = (
             messages[0] if len(messages) == 1 else f"{messages[0]}; the first of {len(messages)} such"
@@ -313,7 +313,7 @@ class _Inspector:
                 reasons.setdefault(
                     name, f"control dimension {dimension.number} has further values there, and is a switch elsewhere"
                 )
-        return {name: reasons[name] for name in self.found.lengths if name in reasons}
+        return reasons
 
     def _name_labels(self) -> None:
         try:
@@ -360,7 +360,9 @@ class _Inspector:
         values = array.reshape(len(array), -1)
         if field.place == "actions":
             self.controls[name] = array
+            self.likeness.add(name, field.place, values)
         elif not field.image and name in self.controls:
+            self.likeness.add(name, field.place, values)
             self.leaks.add(field.place, values, self.controls[name].reshape(len(values), -1))
         if field.dtype.kind == "f" and values.shape[1] <= MOST_DIMENSIONS:
             self.jumps.setdefault(field.place, Jumps(values.shape[1])).add(values, name)

@@ -277,7 +277,7 @@ def test_an_odd_demonstration_is_named_and_left_out(name: str, spoilt: tuple[int
     spoil, why = ODD[name]
     path = recorded(tmp_path / "demos.hdf5", spoil, spoilt)
     names = [f"demo_{number}" for number in spoilt]
-    line = f"{', '.join(names)}: {why}; exclude {'them' if len(names) > 1 else 'it'}"
+    line = f"{', '.join(names)} ({len(names)} of 20): {why}; exclude such ones (demonstrations.exclude)"
     assert inspect(path).notes[0] == line
     assert call("init", path, "--out", tmp_path / "spec.yaml").status == 0
     text = (tmp_path / "spec.yaml").read_text()
