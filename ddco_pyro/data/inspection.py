@@ -32,10 +32,21 @@ from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.labels import UNKNOWN, label_names
 from ddco_pyro.data.likeness import EXCLUDE, Likeness, told
 from ddco_pyro.data.sources import Source, open_source
+from ddco_pyro.data.sources.metadata import clock_fault
 from ddco_pyro.spec import ControlSpec
 
 WIDEST = 10_000
 """Largest array, in numbers per step, of which a demonstration is read at once, and compared with controls."""
+
+
+CLOCKS = {"timestamp", "timestamps", "time", "clock"}
+"""Keys of observations that are clocks."""
+
+GAP = 3.0
+"""A clock among observations has a gap where a step is so many times as long as the median; computers are late."""
+
+SLOWEST = 0.2
+"""Control steps per second, Hz, below which a period may be in milliseconds: dt of 5 and more."""
 
 
 @dataclass
@@ -164,6 +175,7 @@ class Inspection:
     :param leaks: observations, ``obs/<key>``, that hold nothing but controls still to be predicted.
     :param excluded: names of demonstrations that were skipped.
     :param unreadable: names of demonstrations that could not be read.
+    :param clocks: the demonstration with the first fault of each clock among observations, and the fault, by place.
     :param turns: the angles in radians and the first numbers of quaternions that jump, by place of the array.
     :param odd: names of demonstrations that are dead, unlike the others, or change the kind of a control dimension, and
         why.
@@ -184,6 +196,7 @@ class Inspection:
     unreadable: list[str] = field(default_factory=list)
     odd: Mapping[str, str] = field(default_factory=dict)
     turns: Mapping[str, tuple[tuple[int, ...], tuple[int, ...]]] = field(default_factory=dict)
+    clocks: dict[str, tuple[str, str]] = field(default_factory=dict)
     attributes: dict[str, Mapping[str, Attribute]] = field(default_factory=dict)
 
     @property
@@ -196,7 +209,16 @@ class Inspection:
         """A line for each odd demonstration, unusual control dimension, coincidence, and kind of control."""
         auto = control_parts(ControlSpec(), self.control) if self.control else ()
         kinds = (f"{line}, by control.kind: auto" for line in described(auto))
-        return [*self.exclusions, *notes(self.control), *self.coincidences, *kinds]
+        return [*self.exclusions, *self.times, *notes(self.control), *self.coincidences, *kinds]
+
+    @property
+    def times(self) -> list[str]:
+        """A line for each clock with a fault, and for a rate that may be a period in milliseconds."""
+        clocks = [f"{place} {fault}, in {name}" for place, (name, fault) in self.clocks.items()]
+        if self.frequency is None or self.frequency > SLOWEST:
+            return clocks
+        asked = f'if its dt is in milliseconds, write file.attrs["control_frequency"] = {1000 * self.frequency:.4g}'
+        return [f"a step lasts {1 / self.frequency:.4g} s by the file: {asked}", *clocks]
 
     @property
     def observations(self) -> list[Field]:
@@ -364,6 +386,9 @@ class _Inspector:
         elif not field.image and name in self.controls:
             self.likeness.add(name, field.place, values)
             self.leaks.add(field.place, values, self.controls[name].reshape(len(values), -1))
+            if field.key.rpartition("/")[2] in CLOCKS and values.shape[1] == 1 and field.place not in self.found.clocks:
+                if fault := clock_fault(values[:, 0].astype(np.float64), GAP):
+                    self.found.clocks[field.place] = name, fault
         if field.dtype.kind == "f" and values.shape[1] <= MOST_DIMENSIONS:
             self.jumps.setdefault(field.place, Jumps(values.shape[1])).add(values, name)
 

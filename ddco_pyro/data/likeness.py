@@ -33,17 +33,21 @@ SURE = 0.5
 Reversing changes every sign; where nine in ten demonstrations are sure, none lies between by chance."""
 
 RESTS = 0.4
-"""A control is a gripper's if this share of the steps is within a tenth of its range from the ends: grippers' have .5 to
-1 there. Other controls change their sign with the place of an object; measured, at most .32 of theirs are there."""
+"""A control is a gripper's if this share of its steps lies within a tenth of its range from the ends.
+
+These are .5 and more of grippers' steps, and at most .32 of others', whose sign depends on where an object is."""
 
 JUMP = 2.0
 """Numbers jump if they change by so many times their usual largest change, and any other change of the demonstration.
 
-A quarter of the moving numbers, and two, do so at once where recordings are joined; in recordings of one piece, 15 %."""
+A quarter of the moving numbers, and two, do so at once where recordings are joined; elsewhere 15 % at most."""
 
 FASTER = 2.0
 """Another rate makes steps longer by this factor, and demonstrations shorter; people differ by less."""
 
+
+SAMPLED = 200
+"""Steps of each demonstration, about, by which a control's range is judged."""
 
 EXCLUDE = "; exclude such ones (demonstrations.exclude)"
 """The remedy where a fit is to be made."""
@@ -73,7 +77,9 @@ class Likeness:
     """Statistics of each number of demonstrations, which are added array by array, controls first."""
 
     def __init__(self) -> None:
-        self._controls: dict[str, np.ndarray] = {}
+        self._lengths: dict[str, int] = {}
+        self._controls = np.zeros((0, 0))  # of the demonstration whose arrays are added
+        self._sampled: list[np.ndarray] = []
         self._statistics: dict[str, dict[str, np.ndarray]] = {}
         self._correlations: dict[str, dict[str, np.ndarray]] = {}
 
@@ -83,10 +89,12 @@ class Likeness:
         The statistics of a number are its size, its span, its mean and its largest change in a step, and the step of
         the latter, −1 where another change is nearly as large.
         """
-        if rows.shape[1] > MOST_DIMENSIONS:
+        if rows.shape[1] > MOST_DIMENSIONS or (place != "actions" and name not in self._lengths):
             return
         rows = np.nan_to_num(rows.astype(np.float64), posinf=0, neginf=0)
-        controls = self._controls.setdefault(name, rows)
+        if place == "actions":
+            self._lengths[name], self._controls = len(rows), rows
+            self._sampled.append(rows[:: 1 + len(rows) // SAMPLED])
         with np.errstate(over="ignore", invalid="ignore"):
             after = np.concatenate([rows[1:], rows[-1:]])
             changes = np.abs(after - rows)
@@ -100,15 +108,15 @@ class Likeness:
             phase = np.cos(np.pi * np.outer(np.arange(len(rows)) / len(rows), (1, 2, 3)))
             around = phase if place == "actions" else np.concatenate([rows, after - rows], axis=1)
             self._statistics.setdefault(place, {})[name] = np.nan_to_num(np.stack(found), posinf=0)
-            self._correlations.setdefault(place, {})[name] = _correlations(controls, around)
+            self._correlations.setdefault(place, {})[name] = _correlations(self._controls, around)
 
     def discard(self, name: str) -> None:
         """Forget a demonstration."""
-        for kept in (self._controls, *self._statistics.values(), *self._correlations.values()):
+        for kept in (self._lengths, *self._statistics.values(), *self._correlations.values()):
             kept.pop(name, None)
 
     def add_all(self, demo: Demonstration, keys: Collection[str]) -> None:
-        """Add the controls of a demonstration, and those of its observations with these keys that are no pictures."""
+        """Add the controls of a demonstration, and its observations with these keys, except pictures."""
         arrays = {"actions": demo.actions} | {f"obs/{key}": demo.observations[key] for key in keys}
         for place, array in arrays.items():
             if not is_picture(array):
@@ -127,7 +135,7 @@ class Likeness:
         :param frequency: control steps per second of these demonstrations, Hz.
         """
         reasons: dict[str, str] = {}
-        if len(self._controls) < (LEAST if usual is None else 1):
+        if len(self._lengths) < (LEAST if usual is None else 1):
             return reasons
         for found in (self._units(usual), self._reversed(usual), self._joined(usual), self._rate(usual, frequency)):
             for why, names in found.items():
@@ -136,12 +144,12 @@ class Likeness:
 
     @property
     def _length(self) -> float:
-        return float(np.median([len(controls) for controls in self._controls.values()]))
+        return float(np.median([*self._lengths.values()] or [0]))
 
     @property
     def _each(self) -> dict[str, np.ndarray]:
         """The statistics [N, 5, D] of each array that all demonstrations have."""
-        whole = sorted(place for place, known in self._statistics.items() if len(known) == len(self._controls))
+        whole = sorted(place for place, known in self._statistics.items() if len(known) == len(self._lengths))
         return {place: np.stack([*self._statistics[place].values()]) for place in whole}
 
     def _units(self, usual: Usual | None) -> dict[str, list[str]]:
@@ -153,7 +161,7 @@ class Likeness:
                 others = others[others.min(1) > 0]
                 if len(others) > (len(own) // 2 if usual is None else 0):
                     ratios = _ratios(own, others)
-                    out = tuple(name for name, ratio in zip(self._controls, ratios, strict=True) if ratio)
+                    out = tuple(name for name, ratio in zip(self._lengths, ratios, strict=True) if ratio)
                     why = _times(float(np.median(ratios[ratios > 0])), usual) if out else ""
                     found.setdefault((why, *out), {}).setdefault(place, []).append(dim)
         return {
@@ -164,6 +172,8 @@ class Likeness:
 
     def _agreement(self, usual: Usual | None = None) -> tuple[np.ndarray, np.ndarray]:
         """The usual correlations of controls [A, F], and the cosine of each demonstration's with them [N, A]."""
+        if not self._lengths:
+            return np.zeros((0, 0)), np.zeros((1, 0))
         each = np.concatenate([np.stack([*self._correlations[place].values()]) for place in self._each], axis=2)
         reference = np.median(each, axis=0) if usual is None else np.array(usual.correlations)
         for _ in range(3 if usual is None else 0):  # with the signs of most demonstrations
@@ -175,7 +185,7 @@ class Likeness:
         """Names of demonstrations with a reversed control, by why."""
         _, agreement = self._agreement(usual)
         if usual is None:
-            steps = np.concatenate([*self._controls.values()])
+            steps = np.concatenate(self._sampled)
             low, high = steps.min(0), steps.max(0)
             rests = np.minimum(steps - low, high - steps) < 0.1 * (high - low)
             known = (rests.mean(0) > RESTS) & (np.quantile(np.abs(agreement), 0.1, axis=0) > SURE)
@@ -184,7 +194,7 @@ class Likeness:
         found: dict[str, list[str]] = {}
         for dim in np.flatnonzero(known & (agreement < -SURE).any(0)).tolist():
             why = f"control dimension {dim} has the other sign than {_where(usual)}, perhaps reversed"
-            found[why] = [name for name, own in zip(self._controls, agreement[:, dim], strict=True) if own < -SURE]
+            found[why] = [name for name, own in zip(self._lengths, agreement[:, dim], strict=True) if own < -SURE]
         return found
 
     def _joined(self, usual: Usual | None) -> dict[str, list[str]]:
@@ -195,11 +205,11 @@ class Likeness:
             own = np.concatenate([*each.values()], axis=2)
             known = [np.array(usual.statistics[place])[1, 3] for place in each] if usual else [np.median(own[:, 0], 0)]
             moves = np.concatenate(known)
-            for name, (largest, at) in zip(self._controls, own, strict=True):
+            for name, (largest, at) in zip(self._lengths, own, strict=True):
                 steps = np.bincount(at[(at >= 0) & (largest > JUMP * moves) & (moves > 0)].astype(int))
                 if steps.max(initial=0) >= max(2, np.count_nonzero(moves) / 4):
                     found[name] = int(steps.argmax()) + 1
-        if not found or (usual is None and 2 * len(found) > len(self._controls)):
+        if not found or (usual is None and 2 * len(found) > len(self._lengths)):
             return {}
         first, step = next(iter(found.items()))
         return {f"observations jump at once, in {first} at step {step}: perhaps two recordings are joined": [*found]}
@@ -208,15 +218,16 @@ class Likeness:
         """The names of all demonstrations where their rate is not that of the fit, by why."""
         if usual is None:
             return {}
-        names = [*self._controls]
+        names = [*self._lengths]
         if frequency and usual.frequency:
             other = abs(math.log(frequency / usual.frequency)) > 0.05
             return {f"{frequency:g} Hz, and {usual.frequency:g} Hz in the fit": names} if other else {}
         each = {place: np.median(values[:, 2], axis=0) for place, values in self._each.items() if place != "actions"}
-        with np.errstate(all="ignore"):
-            ratios = [values / np.array(usual.statistics[place])[1, 2] for place, values in each.items()]
-        faster = np.concatenate([[], *ratios])
-        faster = float(np.median(faster[np.isfinite(faster) & (faster > 0)]))
+        changes = np.concatenate(
+            [np.zeros((2, 0)), *([own, usual.statistics[place][1][2]] for place, own in each.items())], 1
+        )
+        moving = changes[:, changes.min(0) > 0]
+        faster = float(np.median(moving[0] / moving[1])) if moving.size else 1.0
         shorter = usual.length / self._length
         if max(faster, 1 / faster) < FASTER or not 1 / FASTER < faster / shorter < FASTER:
             return {}

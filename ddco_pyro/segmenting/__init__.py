@@ -262,7 +262,7 @@ FOUND = 40
 def _demonstrations(
     source: Source, names: Sequence[str], fit: Fit, labels: dict[str, dict[str, np.ndarray]], likeness: Likeness
 ) -> Iterator[Demonstration]:
-    """Each demonstration as the run's networks observe it. Its labels go into ``labels``, its statistics into ``likeness``.
+    """Each demonstration as the run's networks observe it. Its labels go into ``labels``.
 
     :raises DemonstrationsError: a demonstration cannot be used, or needs more memory than is allowed.
     """

@@ -20,31 +20,35 @@ Change = Callable[[Demonstration, Demonstration], tuple[dict[str, Any], np.ndarr
 """The observations and controls of a spoilt demonstration; gets another one, too."""
 
 
+def seen(demo: Demonstration) -> dict[str, np.ndarray]:
+    return {key: np.asarray(array) for key, array in demo.observations.items()}
+
+
 def scaled(factor: float, *keys: str) -> Change:
     def change(demo: Demonstration, other: Demonstration) -> tuple[dict[str, Any], np.ndarray]:
-        return {key: array * (factor if key in keys else 1) for key, array in demo.observations.items()}, demo.actions
+        return {key: array * (factor if key in keys else 1) for key, array in seen(demo).items()}, demo.actions
 
     return change
 
 
 def reversed_gripper(demo: Demonstration, other: Demonstration) -> tuple[dict[str, Any], np.ndarray]:
-    return {**demo.observations}, demo.actions * [1, 1, 1, -1]
+    return seen(demo), demo.actions * [1, 1, 1, -1]
 
 
 def joined(demo: Demonstration, other: Demonstration) -> tuple[dict[str, Any], np.ndarray]:
-    observed = {key: np.concatenate([array, other.observations[key]]) for key, array in demo.observations.items()}
+    observed = {key: np.concatenate([array, other.observations[key]]) for key, array in seen(demo).items()}
     return observed, np.concatenate([demo.actions, other.actions])
 
 
 def third(demo: Demonstration, other: Demonstration) -> tuple[dict[str, Any], np.ndarray]:
     """At a third of the rate."""
     steps = demo.actions[::3] * [3, 3, 3, 1]
-    return {key: array[::3] for key, array in demo.observations.items()}, steps
+    return {key: array[::3] for key, array in seen(demo).items()}, steps
 
 
 def moved(demo: Demonstration, other: Demonstration) -> tuple[dict[str, Any], np.ndarray]:
     """With the origin elsewhere."""
-    return {key: array + 3.0 * (key != "jaw") for key, array in demo.observations.items()}, demo.actions
+    return {key: array + 3.0 * (key != "jaw") for key, array in seen(demo).items()}, demo.actions
 
 
 POSITIONS = ("gripper", "object", "goal")
@@ -91,7 +95,7 @@ def test_a_share_of_a_file_that_is_unlike_the_rest_is_named_and_left_out(name: s
 def test_objects_and_goals_elsewhere_are_no_fault(seed: int, tmp_path: Path) -> None:
     def elsewhere(demo: Demonstration, other: Demonstration) -> tuple[dict[str, Any], np.ndarray]:
         """The scene turned by half a turn: positions and motions have the other sign."""
-        turned = {key: array * ([-1, -1, 1] if key in POSITIONS else 1) for key, array in demo.observations.items()}
+        turned = {key: array * ([-1, -1, 1] if key in POSITIONS else 1) for key, array in seen(demo).items()}
         return turned, demo.actions * [-1, -1, 1, 1]
 
     path = tmp_path / "demos.hdf5"

@@ -23,7 +23,16 @@ from ddco_pyro.data.demonstration import Attribute, Demonstration
 from ddco_pyro.data.errors import DemonstrationsError, damaged
 from ddco_pyro.data.labels import LABEL_NAMES
 from ddco_pyro.data.sources import Source
-from ddco_pyro.data.sources.metadata import check_links, filled, first_missing, inside, joined, rate, stored_keys
+from ddco_pyro.data.sources.metadata import (
+    check_links,
+    clock_fault,
+    filled,
+    first_missing,
+    inside,
+    joined,
+    rate,
+    stored_keys,
+)
 from ddco_pyro.data.sources.video import frames_of_steps
 from ddco_pyro.errors import nearest
 
@@ -45,8 +54,6 @@ OBSERVATION, ACTION = "observation.", "action"
 SUBTASK = "subtask_index"
 ANNOTATIONS = Path("meta") / "lerobot_annotations.json"
 IMAGES_AT_ONCE = 32
-LONGEST_GAP = 1.5
-"""Frames are missing where a gap between times is longer than LONGEST_GAP × the median gap."""
 _NO_CONTROL = {"timestamp", "frame_index", "episode_index", "index", "task_index", "image", "video", "string"}
 """Names and types of features that are never the control."""
 _LONGEST = 1e9
@@ -258,11 +265,11 @@ def _problem_of_times(times: np.ndarray, frequency: float, column: str) -> str:
     if (np.abs(times - times[0] - expected) < 0.5 / frequency).all():
         return f"{column} starts at {times[0]:.6g}, not at 0; subtract that from each"
     gaps = np.diff(times)
-    if column == "timestamp" and len(gaps) and gaps.min() > 0 and gaps.max() < LONGEST_GAP * np.median(gaps):
+    if column == "timestamp" and len(gaps) and not clock_fault(times):
         rate = 1 / gaps.mean()
         return f"{column} runs at {rate:.4g} Hz, and meta/info.json says {frequency:g}; correct one of them"
     at = int(wrong.argmax())
-    return f"{column} is {times[at]:g} in row {at}, not {expected[at]:g}: frames are missing or out of order"
+    return f"{column} {clock_fault(times) or f'is {times[at]:g} in row {at}, not {expected[at]:g}'}"
 
 
 class _Rows:

@@ -228,13 +228,13 @@ EPISODES_NOT_WHOLE = {
     "lerobot dropped frame": (changed(without_rows(7)), "demo_1: length in meta/episodes is 6, and .* has 5 rows"),
     "lerobot dropped frame, length corrected": (
         changed(*DROPPED),
-        "demo_1: frame_index is 3 in row 2, not 2: frames are missing or out of order",
+        "demo_1: frame_index has a gap before row 2: 1, then 3",
     ),
     "lerobot dropped frame, counted anew": (
         changed(*DROPPED, rewritten(DATA, renumbered)),
-        r"demo_1: timestamp is 0\.3 in row 2, not 0\.2: frames are missing",
+        r"demo_1: timestamp has a gap before row 2: 0\.1, then 0\.3",
     ),
-    "lerobot reversed": (changed(reversed_rows(5, 11)), "demo_1: frame_index is 5 in row 0, not 0"),
+    "lerobot reversed": (changed(reversed_rows(5, 11)), "demo_1: frame_index steps back in row 1: 5, then 4"),
     "lerobot wrong length": (changed(episode(1, "length", 9)), "demo_1: length in meta/episodes is 9, and .* has 6"),
     "lerobot wrong span": (
         changed(episode(1, "dataset_to_index", 12)),
