@@ -14,6 +14,8 @@ from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.inspection import inspect
 from ddco_pyro.data.planted import pick_and_place
 from ddco_pyro.fitting.fit import fit
+from ddco_pyro.fitting.fitted import load
+from ddco_pyro.labelling.session import Session
 from ddco_pyro.spec import load_spec, parse_spec
 
 Change = Callable[[Demonstration, Demonstration], tuple[dict[str, Any], np.ndarray]]
@@ -157,6 +159,30 @@ def test_segment_says_nothing_of_others_of_the_same_kind(run: Path, tmp_path: Pa
     path = tmp_path / "demos.hdf5"
     pick_and_place(6, seed=1).write(path)
     assert "note: " not in call("segment", run, path, "--csv", tmp_path / "segments.csv").err
+
+
+def test_label_warns_of_demonstrations_unlike_those_of_the_fit(run: Path, tmp_path: Path) -> None:
+    path = tmp_path / "demos.hdf5"
+    spoilt(pick_and_place(6, seed=1), reversed_gripper, (3, 5)).write(path)
+    session = Session(load(run), path, tmp_path / "labels.hdf5")
+    try:
+        (line,) = session.warnings()
+    finally:
+        session.close()
+    assert line.startswith("unlike the demonstrations of the fit: demo_3, demo_5 (2 of 6): control dimension 3")
+
+
+def test_fit_warns_of_demonstrations_unlike_the_others(tmp_path: Path) -> None:
+    path = tmp_path / "demos.hdf5"
+    spoilt(pick_and_place(8), reversed_gripper, (3, 5)).write(path)
+    text = (
+        f"demonstrations: {{path: {path}}}\nobservations: [gripper, object, jaw]\ncompare_with: []\n"
+        "hierarchy: {levels: [{name: skill, count: 2, policy: {network: linear}, termination: {network: linear}}], "
+        "meta_policy: {network: linear}}\ntraining: {optimizer: {name: em}, tune_fraction: 0, epochs: 2}\n"
+    )
+    (tmp_path / "spec.yaml").write_text(text)
+    said = call("fit", tmp_path / "spec.yaml", "--out", tmp_path / "run", "--jobs", 1).out
+    assert "warning: demo_3, demo_5 (2 of 8): control dimension 3 has the other sign than in most" in said
 
 
 def test_segment_says_where_files_have_other_rates(run: Path, tmp_path: Path) -> None:
