@@ -386,9 +386,9 @@ class _Inspector:
         elif not field.image and name in self.controls:
             self.likeness.add(name, field.place, values)
             self.leaks.add(field.place, values, self.controls[name].reshape(len(values), -1))
-            if field.key.rpartition("/")[2] in CLOCKS and values.shape[1] == 1 and field.place not in self.found.clocks:
-                if fault := clock_fault(values[:, 0].astype(np.float64), GAP):
-                    self.found.clocks[field.place] = name, fault
+            clock = field.key.rpartition("/")[2] in CLOCKS and values.shape[1] == 1
+            if clock and (fault := clock_fault(values[:, 0].astype(np.float64), GAP)):
+                self.found.clocks.setdefault(field.place, (name, fault))
         if field.dtype.kind == "f" and values.shape[1] <= MOST_DIMENSIONS:
             self.jumps.setdefault(field.place, Jumps(values.shape[1])).add(values, name)
 

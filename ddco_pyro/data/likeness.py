@@ -17,15 +17,17 @@ LEAST = 4
 """Fewest demonstrations in a file of which one can be unlike the others."""
 
 APART = 10.0
-"""Sizes in other units differ by this factor at least, and by more than those of the other demonstrations differ.
+"""Sizes in other units differ by this factor at least, and by more than those of the other demonstrations do.
 
-Degrees are 57 radians, and sizes of the same number within one file differ by less than 6 where it moves."""
+Degrees are 57 times radians, so demonstrations may differ in size by a factor of 5 beside."""
 
 FACTORS = {1000.0: ("millimetres", "metres"), 100.0: ("centimetres", "metres"), 57.3: ("degrees", "radians")}
 """Factors between units, the unit of the larger numbers, and that of the smaller ones."""
 
 NEAR = 2.0
-"""A ratio of sizes is a factor between units if it differs by less; a ratio of spans, twice as much."""
+"""A ratio of sizes is a factor between units if it differs from that by less.
+
+Sizes, spans and mean changes have the same ratio within twice this: a number that moves more has not other units."""
 
 SURE = 0.5
 """A demonstration agrees with the usual correlations of a control if their cosine is above; below −SURE it is reversed.
@@ -40,11 +42,10 @@ These are .5 and more of grippers' steps, and at most .32 of others', whose sign
 JUMP = 2.0
 """Numbers jump if they change by so many times their usual largest change, and any other change of the demonstration.
 
-A quarter of the moving numbers, and two, do so at once where recordings are joined; elsewhere 15 % at most."""
+Where recordings are joined, a quarter of the moving numbers and two at least do so at once."""
 
 FASTER = 2.0
 """Another rate makes steps longer by this factor, and demonstrations shorter; people differ by less."""
-
 
 SAMPLED = 200
 """Steps of each demonstration, about, by which a control's range is judged."""
@@ -112,7 +113,8 @@ class Likeness:
 
     def discard(self, name: str) -> None:
         """Forget a demonstration."""
-        for kept in (self._lengths, *self._statistics.values(), *self._correlations.values()):
+        self._lengths.pop(name, None)
+        for kept in (*self._statistics.values(), *self._correlations.values()):
             kept.pop(name, None)
 
     def add_all(self, demo: Demonstration, keys: Collection[str]) -> None:
