@@ -45,7 +45,7 @@ JUMP = 2.0
 Where recordings are joined, a quarter of the moving numbers and two at least do so at once."""
 
 FASTER = 2.0
-"""Another rate makes steps longer by this factor, and demonstrations shorter; people differ by less."""
+"""Another rate makes steps longer by this factor at least, and demonstrations shorter by about as much."""
 
 SAMPLED = 200
 """Steps of each demonstration, about, by which a control's range is judged."""
@@ -139,7 +139,7 @@ class Likeness:
         reasons: dict[str, str] = {}
         if len(self._lengths) < (LEAST if usual is None else 1):
             return reasons
-        for found in (self._units(usual), self._reversed(usual), self._joined(usual), self._rate(usual, frequency)):
+        for found in (self._units(usual), self._reversed(usual), self._rate(usual, frequency), self._joined(usual)):
             for why, names in found.items():
                 reasons |= {name: why for name in names if name not in reasons}
         return reasons
