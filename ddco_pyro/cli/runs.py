@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import sys
 import time
 from dataclasses import replace
 from importlib.util import find_spec
@@ -258,6 +259,8 @@ def segment(
                     console.say(said)
             if missing:
                 print(f"--baselines: {missing}; no agreement is measured")
+        for line in segmented.unlike:
+            print(f"note: unlike the demonstrations of the fit: {line}", file=sys.stderr)
         for each in asked:
             print(write_format(each, segmented))
 

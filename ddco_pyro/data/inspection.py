@@ -21,7 +21,6 @@ from ddco_pyro.data.controls import (
     control_dimensions,
     control_parts,
     described,
-    few,
     most_few,
     notes,
     rounding,
@@ -31,11 +30,23 @@ from ddco_pyro.data.demonstration import Attribute, problem_of, unlike
 from ddco_pyro.data.division import check_division, problems_of_masks
 from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.labels import UNKNOWN, label_names
+from ddco_pyro.data.likeness import EXCLUDE, Likeness, told
 from ddco_pyro.data.sources import Source, open_source
+from ddco_pyro.data.sources.metadata import clock_fault
 from ddco_pyro.spec import ControlSpec
 
 WIDEST = 10_000
 """Largest array, in numbers per step, of which a demonstration is read at once, and compared with controls."""
+
+
+CLOCKS = {"timestamp", "timestamps", "time", "clock"}
+"""Keys of observations that are clocks."""
+
+GAP = 3.0
+"""A clock among observations has a gap where a step is so many times as long as the median; computers are late."""
+
+SLOWEST = 0.2
+"""Control steps per second, Hz, below which a period may be in milliseconds: dt of 5 and more."""
 
 
 @dataclass
@@ -165,8 +176,10 @@ class Inspection:
     :param relative_to: the observation of which the control is a target; None without one.
     :param excluded: names of demonstrations that were skipped.
     :param unreadable: names of demonstrations that could not be read.
+    :param clocks: the demonstration with the first fault of each clock among observations, and the fault, by place.
     :param turns: the angles in radians and the first numbers of quaternions that jump, by place of the array.
-    :param odd: names of demonstrations that are dead or change the kind of a control dimension, and why.
+    :param odd: names of demonstrations that are dead, unlike the others, or change the kind of a control dimension, and
+        why.
     :param attributes: of each demonstration by its name.
     """
 
@@ -185,15 +198,13 @@ class Inspection:
     unreadable: list[str] = field(default_factory=list)
     odd: Mapping[str, str] = field(default_factory=dict)
     turns: Mapping[str, tuple[tuple[int, ...], tuple[int, ...]]] = field(default_factory=dict)
+    clocks: dict[str, tuple[str, str]] = field(default_factory=dict)
     attributes: dict[str, Mapping[str, Attribute]] = field(default_factory=dict)
 
     @property
     def exclusions(self) -> list[str]:
         """A line for each reason to exclude demonstrations, with their names."""
-        names = {why: [name for name in self.odd if self.odd[name] == why] for why in self.odd.values()}
-        return [
-            f"{few(members)}: {why}; exclude {'them' if len(members) > 1 else 'it'}" for why, members in names.items()
-        ]
+        return told(self.odd, len(self.lengths), EXCLUDE)
 
     @property
     def notes(self) -> list[str]:
@@ -203,7 +214,16 @@ class Inspection:
         leaks = (f"{place} {why}" for place, why in self.leaks.items())
         target = f"the control is a target of obs/{self.relative_to}: what follows is of their difference"
         followed = [f"{target}, control.relative_to: {self.relative_to}"] if self.relative_to else []
-        return [*self.exclusions, *followed, *notes(self.control), *self.coincidences, *leaks, *kinds]
+        return [*self.exclusions, *followed, *self.times, *notes(self.control), *self.coincidences, *leaks, *kinds]
+
+    @property
+    def times(self) -> list[str]:
+        """A line for each clock with a fault, and for a rate that may be a period in milliseconds."""
+        clocks = [f"{place} {fault}, in {name}" for place, (name, fault) in self.clocks.items()]
+        if self.frequency is None or self.frequency > SLOWEST:
+            return clocks
+        asked = f'if its dt is in milliseconds, write file.attrs["control_frequency"] = {1000 * self.frequency:.4g}'
+        return [f"a step lasts {1 / self.frequency:.4g} s by the file: {asked}", *clocks]
 
     @property
     def observations(self) -> list[Field]:
@@ -261,7 +281,7 @@ class _Inspector:
         self.source, self.found = source, found
         self.problems: dict[tuple[str, str], list[str]] = {}  # messages by kind and subject
         self.controls: dict[str, np.ndarray] = {}
-        self.copies, self.leaks = Copies(), Leaks()
+        self.copies, self.leaks, self.likeness = Copies(), Leaks(), Likeness()
         self.jumps: dict[str, Jumps] = {}
 
     def read(self, names: Sequence[str]) -> None:
@@ -275,12 +295,14 @@ class _Inspector:
                 found.unreadable.append(name)
                 self.copies.digests.pop(name, None)
                 self.controls.pop(name, None)
+                self.likeness.discard(name)
         for name, there in places.items():
             for place in (place for place in fields if place not in there):
                 self._problem("missing", f"{name}: {place} is missing", place)
         self._name_labels()
         found.control = control_dimensions(self.controls)
-        found.odd = self._odd(found.control)
+        odd = self.likeness.unlike() | self._odd(found.control)
+        found.odd = {name: odd[name] for name in found.lengths if name in odd}
         varying = [dimension.number for dimension in found.control if not dimension.constant]
         kinds = (
             messages[0] if len(messages) == 1 else f"{messages[0]}; the first of {len(messages)} such"
@@ -326,7 +348,7 @@ class _Inspector:
                 reasons.setdefault(
                     name, f"control dimension {dimension.number} has further values there, and is a switch elsewhere"
                 )
-        return {name: reasons[name] for name in self.found.lengths if name in reasons}
+        return reasons
 
     def _name_labels(self) -> None:
         try:
@@ -373,8 +395,13 @@ class _Inspector:
         values = array.reshape(len(array), -1)
         if field.place == "actions":
             self.controls[name] = array
+            self.likeness.add(name, field.place, values)
         elif not field.image and name in self.controls:
+            self.likeness.add(name, field.place, values)
             self.leaks.add(field.place, values, self.controls[name].reshape(len(values), -1))
+            clock = field.key.rpartition("/")[2] in CLOCKS and values.shape[1] == 1
+            if clock and (fault := clock_fault(values[:, 0].astype(np.float64), GAP)):
+                self.found.clocks.setdefault(field.place, (name, fault))
         if field.dtype.kind == "f" and values.shape[1] <= MOST_DIMENSIONS:
             self.jumps.setdefault(field.place, Jumps(values.shape[1])).add(values, name)
 

@@ -14,6 +14,7 @@ import numpy as np
 from ddco_pyro.data.arrays import LazyArray, Observed, blocks
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
+from ddco_pyro.data.likeness import Likeness, Usual
 from ddco_pyro.errors import BadInput
 from ddco_pyro.metrics import Record, read_record
 
@@ -36,6 +37,7 @@ class Digest(Record):
 
     :param format: the version of the run folder's format.
     :param files: size, time of the last change (ns) and inode of the file with the pictures of an observation.
+    :param usual: what the demonstrations have in common; None where a folder lacks it.
     """
 
     names: list[str]
@@ -45,6 +47,7 @@ class Digest(Record):
     labels: dict[str, str]
     masks: dict[str, list[str]]
     files: dict[str, list[int]]
+    usual: Usual | None = None
 
     def places(self) -> dict[str, Any]:
         """The digests by place in a file of demonstrations."""
@@ -73,7 +76,16 @@ def digest(demos: Demonstrations, known: Digest | None = None) -> Digest:
         labels={name: _sha256(demo.labels[name] for demo in demos) for name in sorted(demos[0].labels)},
         masks={name: [*demos.masks[name]] for name in ("train", "valid") if name in demos.masks},
         files=files,
+        usual=known.usual if known else usual(demos),
     )
+
+
+def usual(demos: Demonstrations) -> Usual:
+    """What demonstrations have in common."""
+    likeness = Likeness()
+    for demo in demos:
+        likeness.add_all(demo, demo.observations)
+    return likeness.usual(demos.frequency)
 
 
 def _sha256(arrays: Iterable[Observed]) -> str:

@@ -17,6 +17,7 @@ import sklearn.metrics  # noqa: F401  (the first edit does not wait for these)
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.labels import SOURCE
+from ddco_pyro.data.likeness import Likeness
 from ddco_pyro.data.sources import open_source
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.drawing.timeline import text
@@ -102,6 +103,7 @@ class Session:
         self.following = Following(path, self.demos, fit.spec.report.trajectory)
         self.error = ""
         self._prepare(fit)()
+        self.unlike = self._unlike()
         self.proposed = self.proposals
         """By the run."""
 
@@ -324,11 +326,19 @@ class Session:
         }
 
     def warnings(self) -> list[str]:
-        """What a person should know: the file of demonstrations changed underneath, or something failed."""
-        changed = (
-            [] if self._unchanged() else [f"{self.path} changed while it was labelled; start again to go on with it"]
-        )
-        return [*changed, *filter(None, [self.error])]
+        """What a person should know: a file that changed underneath, a failure, demonstrations unlike those of the fit."""
+        changed = f"{self.path} changed while it was labelled; start again to go on with it"
+        return [*([] if self._unchanged() else [changed]), *filter(None, [self.error]), *self.unlike]
+
+    def _unlike(self) -> list[str]:
+        likeness, nats = Likeness(), dict[str, float]()
+        for demo in self.demos:
+            likeness.add_all(demo, self.fit.hierarchy.encoder.shapes)
+        for piece in self.proposals.pieces:
+            nats |= dict(zip(piece.names, (piece.log_likelihood / piece.lengths).tolist(), strict=True))
+        return [
+            f"unlike the demonstrations of the fit: {line}" for line in self.fit.unlike(likeness, nats, self.frequency)
+        ]
 
     def _unchanged(self) -> bool:
         return self.path.exists() and version(self.path) == self.version

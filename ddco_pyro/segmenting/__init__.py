@@ -14,6 +14,7 @@ from ddco_pyro.data.demonstration import check_fitted, needed
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.labels import label_names
+from ddco_pyro.data.likeness import Likeness
 from ddco_pyro.data.memory import INFERENCE, refuse_too_much
 from ddco_pyro.data.sources import Source, open_source
 from ddco_pyro.drawing.colours import option_colour
@@ -90,6 +91,7 @@ class Segmented:
     :param label_names: for labels in the file, the names of labels 0, 1, ...
     :param matched: for labels that the run's spec compares with a level, the option that each label is matched with
         in the run's own table: of the lowest level, where labels are compared with several.
+    :param unlike: a line for each reason why demonstrations are unlike those of the fit.
     """
 
     segments: tuple[Segments, ...]
@@ -99,6 +101,7 @@ class Segmented:
     names: Mapping[str, Sequence[str]] = field(default_factory=dict)
     label_names: Mapping[str, Sequence[str]] = field(default_factory=dict)
     matched: Mapping[str, Mapping[int, int]] = field(default_factory=dict)
+    unlike: Sequence[str] = ()
 
     def __len__(self) -> int:
         return len(self.segments)
@@ -164,10 +167,13 @@ def segments(fit: Fit, source: Source, on_event: OnEvent = ignore, intervals: bo
     chosen, known = chosen_names(source, fit), label_names(source.attributes)
     labels: dict[str, dict[str, np.ndarray]] = {}
     segmented: list[Segments] = []
-    for piece in fit.infer(_demonstrations(source, chosen, fit, labels)):
+    likeness = Likeness()
+    for piece in fit.infer(_demonstrations(source, chosen, fit, labels, likeness)):
         segmented += of_piece(fit, piece, labels, intervals)
         on_event(DemonstrationsDone(len(segmented), len(chosen)))
-    return of_run(fit, segmented, source.frequency, known)
+    nats = {demo.name: demo.log_likelihood for demo in segmented}
+    unlike = fit.unlike(likeness, nats, source.frequency)
+    return replace(of_run(fit, segmented, source.frequency, known), unlike=unlike)
 
 
 def of_run(
@@ -242,7 +248,7 @@ FOUND = 40
 
 
 def _demonstrations(
-    source: Source, names: Sequence[str], fit: Fit, labels: dict[str, dict[str, np.ndarray]]
+    source: Source, names: Sequence[str], fit: Fit, labels: dict[str, dict[str, np.ndarray]], likeness: Likeness
 ) -> Iterator[Demonstration]:
     """Each demonstration as the run's networks observe it. Ground-truth labels go into ``labels``."""
     before = 0  # steps whose labels are in memory
@@ -256,6 +262,7 @@ def _demonstrations(
             key: values for key, values in found.labels.items() if values.dtype.kind in "iub" and values.ndim == 1
         }
         demo = _demonstration(found, fit)
+        likeness.add_all(demo, demo.observations)
         before += len(demo)
         yield demo
 

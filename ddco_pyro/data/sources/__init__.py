@@ -13,7 +13,7 @@ import h5py
 
 from ddco_pyro.data.demonstration import Attribute, Demonstration
 from ddco_pyro.data.errors import DemonstrationsError
-from ddco_pyro.data.formats import FORMATS
+from ddco_pyro.data.formats import FORMATS, LAYOUTS
 from ddco_pyro.errors import command, nearest, path_of
 
 __all__ = ["Source", "open_source", "refuse_foreign"]
@@ -79,14 +79,14 @@ def format_of(path: Path) -> str:
     if not (path.is_file() or path.is_dir()):
         raise DemonstrationsError(f"{path}: is neither a regular file nor a folder; name an HDF5 file")
     names = _top_names(path) if path.is_file() else ()
-    if (form := next((form for form, about in FORMATS.items() if about.fits(path, names)), None)) is not None:
+    form = next((form for form, about in FORMATS.items() if about.fits(path, names)), "")
+    inside = [path] if path.is_file() else [*path.glob("*"), *path.glob("*/*")]
+    here = {*names, *(one.suffix for one in inside), *(one.name for one in inside if one != path)}
+    if form in ("", "robomimic") and (layout := next((each for each in LAYOUTS if each.fits(here)), None)):
+        lines = "write its episodes into an HDF5 file as data/demo_0, data/demo_1, ... with the lines in docs/own.md"
+        raise DemonstrationsError(f"{path}: {layout.text}; {lines}")
+    if form:
         return form
-    roots = [path, *(one for one in path.iterdir() if one.is_dir())]
-    lines = "write its episodes into an HDF5 file as data/demo_0, data/demo_1, ... with the lines in docs/own.md"
-    if any((root / name).exists() for root in roots for name in (".zgroup", "zarr.json")):
-        raise DemonstrationsError(f"{path}: is a zarr store, as diffusion policy writes them; {lines}")
-    if any((root / "dataset_info.json").exists() and (root / "features.json").exists() for root in roots):
-        raise DemonstrationsError(f"{path}: is a TensorFlow dataset (RLDS); {lines}")
     folders = ", ".join(f"{about.text} (with {about.sign})" for about in FORMATS.values() if about.sign)
     raise DemonstrationsError(f"{path}: is a folder of no known format; name an HDF5 file, or {folders}")
 

@@ -23,7 +23,16 @@ from ddco_pyro.data.demonstration import Attribute, Demonstration
 from ddco_pyro.data.errors import DemonstrationsError, damaged
 from ddco_pyro.data.labels import LABEL_NAMES
 from ddco_pyro.data.sources import Source
-from ddco_pyro.data.sources.metadata import check_links, filled, first_missing, inside, joined, rate, stored_keys
+from ddco_pyro.data.sources.metadata import (
+    check_links,
+    clock_fault,
+    filled,
+    first_missing,
+    inside,
+    joined,
+    rate,
+    stored_keys,
+)
 from ddco_pyro.data.sources.video import frames_of_steps
 from ddco_pyro.errors import nearest
 
@@ -202,13 +211,8 @@ class LeRobot:
         for column, frequency in (("frame_index", 1.0), ("timestamp", self._frequency)):
             if column in rows.present and frequency:
                 times = np.asarray(rows.numbers(column, ())).astype(float)
-                expected = np.arange(len(times)) / frequency
-                if (wrong := ~(np.abs(times - expected) < 0.5 / frequency)).any():
-                    at = int(wrong.argmax())
-                    raise DemonstrationsError(
-                        f"{rows.path}: {rows.name}: {column} is {times[at]:g} in row {at}, not {expected[at]:g}: "
-                        "frames are missing or out of order, or fps in meta/info.json is wrong; correct one of them"
-                    )
+                if problem := _problem_of_times(times, frequency, column):
+                    raise DemonstrationsError(f"{rows.path}: {rows.name}: {problem}")
 
     def _observation(self, rows: _Rows, key: str, index: int) -> Observed:
         about = self.features[key]
@@ -234,6 +238,22 @@ class LeRobot:
         shown = frames_of_steps(path, rows.name, begin + start / rate, stop - start, rate, size)
         while block := list(islice(shown, IMAGES_AT_ONCE)):
             yield np.stack(block)
+
+
+def _problem_of_times(times: np.ndarray, frequency: float, column: str) -> str:
+    """The first problem with the times [T] of frames, in words; empty if frame t is at time t / frequency."""
+    expected = np.arange(len(times)) / frequency
+    wrong = ~(np.abs(times - expected) < 0.5 / frequency)
+    if not wrong.any():
+        return ""
+    if (np.abs(times - times[0] - expected) < 0.5 / frequency).all():
+        return f"{column} starts at {times[0]:.6g}, not at 0; subtract that from each"
+    gaps = np.diff(times)
+    if column == "timestamp" and len(gaps) and not clock_fault(times):
+        rate = 1 / gaps.mean()
+        return f"{column} runs at {rate:.4g} Hz, and meta/info.json says {frequency:g}; correct one of them"
+    at = int(wrong.argmax())
+    return f"{column} {clock_fault(times) or f'is {times[at]:g} in row {at}, not {expected[at]:g}'}"
 
 
 class _Rows:

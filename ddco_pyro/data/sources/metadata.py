@@ -39,6 +39,25 @@ def rate(said: Mapping[str, object]) -> float | None:
     return None
 
 
+LONGEST_GAP = 1.5
+"""A clock has a gap where a step is longer than LONGEST_GAP × the median step."""
+
+
+def clock_fault(times: np.ndarray, longest: float = LONGEST_GAP) -> str:
+    """The first gap, step back or repeated stamp of a clock [T], in words; empty without any.
+
+    >>> clock_fault(np.array([0.0, 0.1, 0.2, 0.5, 0.6]))
+    'has a gap before row 3: 0.2, then 0.5'
+    """
+    steps = np.diff(times)
+    wrong = np.flatnonzero((steps <= 0) | (steps > longest * np.median(steps)))
+    if not len(wrong):
+        return ""
+    at = int(wrong[0])
+    fault = "has a gap before" if steps[at] > 0 else "steps back in" if steps[at] < 0 else "repeats its stamp in"
+    return f"{fault} row {at + 1}: {times[at]:.6g}, then {times[at + 1]:.6g}"
+
+
 def inside(folder: Path, relative: str | Path) -> Path:
     """The path ``folder / relative``, which stays in ``folder`` with all links resolved; the path need not exist.
 

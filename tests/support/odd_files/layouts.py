@@ -124,6 +124,23 @@ def tfds(folder: Path) -> Path:
     return version.parent
 
 
+def hdf5(folder: Path, *groups: str) -> Path:
+    """An HDF5 file with these groups."""
+    with h5py.File(folder / "trajectory.hdf5", "w") as file:
+        for group in groups:
+            file[group] = state(0)
+    return folder / "trajectory.hdf5"
+
+
+def within(folder: Path, *names: str) -> Path:
+    """A folder with empty files of these names."""
+    for name in names:
+        path = folder / "dataset" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(b"")
+    return folder / "dataset"
+
+
 def lerobot_v2(folder: Path) -> Path:
     dataset = folder / "pusht"
     (dataset / "meta").mkdir(parents=True)
@@ -163,6 +180,23 @@ ROWS = {
     ),
     "zarr": Row(zarr, r"is a zarr store, as diffusion policy writes them; .*docs/own\.md"),
     "tfds": Row(tfds, r"is a TensorFlow dataset \(RLDS\); .*docs/own\.md"),
+    "tfrecord": Row(
+        lambda folder: within(folder, "a-train.tfrecord-00000-of-00002"), r"is a TensorFlow dataset \(RLDS\)"
+    ),
+    "mcap": Row(lambda folder: within(folder, "x.mcap") / "x.mcap", r"is a recording of ROS: .* rosbags.*docs/own\.md"),
+    "rosbag2": Row(
+        lambda folder: within(folder, "metadata.yaml", "x_0.db3"), "is a recording of ROS: read it with rosbags"
+    ),
+    "RoboMIND": Row(
+        lambda folder: hdf5(folder, "puppet/joint_position", "master/joint_position"),
+        r"has the layout of RoboMIND, with observations in puppet and controls in master; .*docs/own\.md",
+    ),
+    "RoboMIND's folder": Row(lambda folder: within(folder, "a/trajectory.hdf5"), "has the layout of RoboMIND"),
+    "AgiBot": Row(
+        lambda folder: hdf5(folder, "state/joint/position", "action/joint/position", "timestamp"),
+        "has the layout of AgiBot World, with observations in state and controls in action",
+    ),
+    "RoboSet": Row(lambda folder: hdf5(folder, "Trial0/data/qp_arm"), "has the layout of RoboSet"),
     "lerobot v2": Row(
         lerobot_v2, r"v2\.1, and v3\.x can be read; .*: python -m lerobot\.scripts\.convert_dataset_v21_to_v30"
     ),

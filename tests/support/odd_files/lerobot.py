@@ -216,13 +216,13 @@ EPISODES_NOT_WHOLE = {
     "lerobot dropped frame": (changed(without_rows(7)), "demo_1: length in meta/episodes is 6, and .* has 5 rows"),
     "lerobot dropped frame, length corrected": (
         changed(*DROPPED),
-        "demo_1: frame_index is 3 in row 2, not 2: frames are missing or out of order",
+        "demo_1: frame_index has a gap before row 2: 1, then 3",
     ),
     "lerobot dropped frame, counted anew": (
         changed(*DROPPED, rewritten(DATA, renumbered)),
-        r"demo_1: timestamp is 0\.3 in row 2, not 0\.2: frames are missing",
+        r"demo_1: timestamp has a gap before row 2: 0\.1, then 0\.3",
     ),
-    "lerobot reversed": (changed(reversed_rows(5, 11)), "demo_1: frame_index is 5 in row 0, not 0"),
+    "lerobot reversed": (changed(reversed_rows(5, 11)), "demo_1: frame_index steps back in row 1: 5, then 4"),
     "lerobot wrong length": (changed(episode(1, "length", 9)), "demo_1: length in meta/episodes is 9, and .* has 6"),
     "lerobot no rows": (changed(without_rows(*range(5, 11))), "demo_1: its rows are missing in"),
     "lerobot ragged": (changed(RAGGED), "demo_0: action has 1 numbers in row 0, and meta/info.json says 2; correct"),
@@ -232,11 +232,11 @@ EPISODES_NOT_WHOLE = {
     ),
     "lerobot late": (
         in_episode_1("timestamp", lambda _, value: value + 3.2),
-        r"demo_1: timestamp is 3\.2 in row 0, not 0: .* or fps in meta/info\.json is wrong",
+        r"demo_1: timestamp starts at 3\.2, not at 0; subtract that",
     ),
     "lerobot 50 Hz": (
         in_episode_1("timestamp", lambda _, value: value / 5),
-        r"demo_1: timestamp is 0\.02 in row 1, not 0\.1",
+        r"demo_1: timestamp runs at 50 Hz, and meta/info\.json says 10; correct one",
     ),
 }
 """Datasets of which one episode is not whole, and what is said of it."""

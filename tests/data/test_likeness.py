@@ -1,0 +1,192 @@
+"""Demonstrations unlike the others of their file, or unlike those of a fit, are named with the reason."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from command_line import call
+
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.inspection import inspect
+from ddco_pyro.data.planted import pick_and_place
+from ddco_pyro.fitting.fit import fit
+from ddco_pyro.fitting.fitted import load
+from ddco_pyro.labelling.session import Session
+from ddco_pyro.spec import load_spec, parse_spec
+
+Change = Callable[[Demonstration, Demonstration], tuple[dict[str, Any], np.ndarray]]
+"""The observations and controls of a spoilt demonstration; gets another one, too."""
+
+
+def seen(demo: Demonstration) -> dict[str, np.ndarray]:
+    return {key: np.asarray(array) for key, array in demo.observations.items()}
+
+
+def scaled(factor: float, *keys: str) -> Change:
+    def change(demo: Demonstration, other: Demonstration) -> tuple[dict[str, Any], np.ndarray]:
+        return {key: array * (factor if key in keys else 1) for key, array in seen(demo).items()}, demo.actions
+
+    return change
+
+
+def reversed_gripper(demo: Demonstration, other: Demonstration) -> tuple[dict[str, Any], np.ndarray]:
+    return seen(demo), demo.actions * [1, 1, 1, -1]
+
+
+def joined(demo: Demonstration, other: Demonstration) -> tuple[dict[str, Any], np.ndarray]:
+    observed = {key: np.concatenate([array, other.observations[key]]) for key, array in seen(demo).items()}
+    return observed, np.concatenate([demo.actions, other.actions])
+
+
+def third(demo: Demonstration, other: Demonstration) -> tuple[dict[str, Any], np.ndarray]:
+    """At a third of the rate."""
+    steps = demo.actions[::3] * [3, 3, 3, 1]
+    return {key: array[::3] for key, array in seen(demo).items()}, steps
+
+
+def moved(demo: Demonstration, other: Demonstration) -> tuple[dict[str, Any], np.ndarray]:
+    """With the origin elsewhere."""
+    return {key: array + 3.0 * (key != "jaw") for key, array in seen(demo).items()}, demo.actions
+
+
+POSITIONS = ("gripper", "object", "goal")
+
+FAULTS: dict[str, tuple[Change, str, str]] = {
+    "millimetres": (scaled(1000, *POSITIONS), "obs/gripper dimensions 0-2", "1000 times as large as {}, perhaps milli"),
+    "metres": (
+        scaled(0.01, "gripper"),
+        "obs/gripper dimensions 0-2",
+        "100 times as small as {}, perhaps metres for cen",
+    ),
+    "degrees": (scaled(57.3, "gripper"), "obs/gripper", "57.3 times as large as {}, perhaps degrees for radians"),
+    "gripper": (reversed_gripper, "control dimension 3", "the other sign than {}, perhaps reversed"),
+    "joined": (joined, "observations jump at once, in demo_3 at step 4", "perhaps two recordings are joined"),
+}
+
+
+def spoilt(demos: Demonstrations, change: Change, which: Sequence[int]) -> Demonstrations:
+    new = [
+        Demonstration(demo.name, *change(demo, demos[number - 1])) if number in which else demo
+        for number, demo in enumerate(Demonstration(d.name, d.observations, d.actions) for d in demos)
+    ]
+    return Demonstrations(tuple(new))
+
+
+@pytest.mark.parametrize("name", FAULTS)
+@pytest.mark.usefixtures("undecided")
+def test_a_share_of_a_file_that_is_unlike_the_rest_is_named_and_left_out(name: str, tmp_path: Path) -> None:
+    change, what, why = FAULTS[name]
+    path, names = tmp_path / "demos.hdf5", ("demo_3", "demo_8", "demo_12", "demo_17")
+    spoilt(pick_and_place(20), change, (3, 8, 12, 17)).write(path)
+    line, *others = inspect(path).exclusions
+    assert line.startswith(f"demo_3, demo_8, demo_12, ... (4 of 20): {what}")
+    assert why.format("in most") in line
+    assert line.endswith("; exclude such ones (demonstrations.exclude)")
+    assert not others
+    assert line in " ".join(call("inspect", path).out.split())
+    assert call("init", path, "--out", tmp_path / "spec.yaml").status == 0
+    assert f"# {line}\n" in (tmp_path / "spec.yaml").read_text()
+    assert load_spec(tmp_path / "spec.yaml").demonstrations.exclude == names
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_objects_and_goals_elsewhere_are_no_fault(seed: int, tmp_path: Path) -> None:
+    def elsewhere(demo: Demonstration, other: Demonstration) -> tuple[dict[str, Any], np.ndarray]:
+        """The scene turned by half a turn: positions and motions have the other sign."""
+        turned = {key: array * ([-1, -1, 1] if key in POSITIONS else 1) for key, array in seen(demo).items()}
+        return turned, demo.actions * [-1, -1, 1, 1]
+
+    path = tmp_path / "demos.hdf5"
+    spoilt(pick_and_place(20, seed), elsewhere, (1, 4, 6, 9, 12, 15)).write(path)
+    assert inspect(path).exclusions == []
+
+
+def test_recordings_are_alike(recording: Path) -> None:
+    assert inspect(recording).exclusions == []
+
+
+@pytest.fixture(params=["metaworld_pick_place", "pusht_human"])
+def recording(request: pytest.FixtureRequest) -> Path:
+    path = Path("/work/shared/data") / f"{request.param}.hdf5"
+    if not path.exists():
+        pytest.skip("the recording is not here")
+    return path
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("unlike")
+    demos = pick_and_place(12)
+    Demonstrations(demos.demonstrations, attributes={"control_frequency": 30}).write(folder / "demos.hdf5")
+    linear = {"policy": {"network": "linear"}, "termination": {"network": "linear"}}
+    spec = {
+        "demonstrations": {"path": str(folder / "demos.hdf5")},
+        "observations": ["gripper", "object", "goal", "jaw"],
+        "control": {"std": {"learn": True, "floor": 0.01}},
+        "hierarchy": {"levels": [{"name": "skill", "count": 4, **linear}], "meta_policy": linear["policy"]},
+        "training": {"optimizer": {"name": "em"}, "tune_fraction": 0, "epochs": 5},
+        "compare_with": [],
+    }
+    fit(parse_spec(spec), out=folder / "run")
+    return folder / "run"
+
+
+OTHERS: dict[str, tuple[Change, str, str]] = {
+    **FAULTS,
+    "rate": (third, "steps are 2.", "times as long as {}, perhaps at another rate"),
+    "origin": (moved, "-", "nats a step, and"),
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_segment_names_demonstrations_unlike_those_of_the_fit(name: str, run: Path, tmp_path: Path) -> None:
+    change, what, why = OTHERS[name]
+    path, which = tmp_path / "demos.hdf5", range(6) if name == "rate" else (3, 5)
+    spoilt(pick_and_place(6, seed=1), change, which).write(path)
+    ended = call("segment", run, path, "--csv", tmp_path / "segments.csv")
+    (line,) = (line for line in ended.err.splitlines() if line.startswith("note: "))
+    members = "demo_0, demo_1, demo_2, ... (6 of 6)" if name == "rate" else "demo_3, demo_5 (2 of 6)"
+    assert line.startswith(f"note: unlike the demonstrations of the fit: {members}: {what}")
+    assert why.format("in the fit") in line
+    assert (tmp_path / "segments.csv").exists()
+
+
+def test_segment_says_nothing_of_others_of_the_same_kind(run: Path, tmp_path: Path) -> None:
+    path = tmp_path / "demos.hdf5"
+    pick_and_place(6, seed=1).write(path)
+    assert "note: " not in call("segment", run, path, "--csv", tmp_path / "segments.csv").err
+
+
+def test_label_warns_of_demonstrations_unlike_those_of_the_fit(run: Path, tmp_path: Path) -> None:
+    path = tmp_path / "demos.hdf5"
+    spoilt(pick_and_place(6, seed=1), reversed_gripper, (3, 5)).write(path)
+    session = Session(load(run), path, tmp_path / "labels.hdf5")
+    try:
+        (line,) = session.warnings()
+    finally:
+        session.close()
+    assert line.startswith("unlike the demonstrations of the fit: demo_3, demo_5 (2 of 6): control dimension 3")
+
+
+def test_fit_warns_of_demonstrations_unlike_the_others(tmp_path: Path) -> None:
+    path = tmp_path / "demos.hdf5"
+    spoilt(pick_and_place(8), reversed_gripper, (3, 5)).write(path)
+    text = (
+        f"demonstrations: {{path: {path}}}\nobservations: [gripper, object, jaw]\ncompare_with: []\n"
+        "hierarchy: {levels: [{name: skill, count: 2, policy: {network: linear}, termination: {network: linear}}], "
+        "meta_policy: {network: linear}}\ntraining: {optimizer: {name: em}, tune_fraction: 0, epochs: 2}\n"
+    )
+    (tmp_path / "spec.yaml").write_text(text)
+    said = call("fit", tmp_path / "spec.yaml", "--out", tmp_path / "run", "--jobs", 1).out
+    assert "warning: demo_3, demo_5 (2 of 8): control dimension 3 has the other sign than in most" in said
+
+
+def test_segment_says_where_files_have_other_rates(run: Path, tmp_path: Path) -> None:
+    path = tmp_path / "demos.hdf5"
+    Demonstrations(pick_and_place(6, seed=1).demonstrations, attributes={"control_frequency": 10}).write(path)
+    said = call("segment", run, path, "--csv", tmp_path / "segments.csv").err
+    assert "(6 of 6): 10 Hz, and 30 Hz in the fit\n" in said
