@@ -326,7 +326,7 @@ class Session:
         }
 
     def warnings(self) -> list[str]:
-        """What a person should know: a file that changed underneath, a failure, demonstrations unlike those of the fit."""
+        """What a person should know: a changed file, a failure, demonstrations unlike those of the fit."""
         changed = f"{self.path} changed while it was labelled; start again to go on with it"
         return [*([] if self._unchanged() else [changed]), *filter(None, [self.error]), *self.unlike]
 
