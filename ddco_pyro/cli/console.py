@@ -135,6 +135,8 @@ class Progress:
             self._begin(label, total)
         assert self._task is not None
         task, advance = self._task, 1 if done is None else None
+        if task.finished and done is None:  # more comes than was likely
+            self._rich.update(task.id, total=2 * task.completed)
         self._rich.update(task.id, completed=done, advance=advance, note=note)
         if not self._terminal and (task.finished or time.monotonic() - self._last > PLAIN_SECONDS):
             self._last = time.monotonic()
