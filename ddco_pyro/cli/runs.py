@@ -27,6 +27,14 @@ if TYPE_CHECKING:
 FILMED = 3
 """Episodes of each method that ``rollout --video`` films."""
 
+Best = Annotated[
+    bool,
+    typer.Option(
+        "--best",
+        help="Act with the run's baseline that is likelier on held-out demonstrations than its model, by more than a "
+        "standard error, if there is one.",
+    ),
+]
 Jobs = Annotated[int, typer.Option(help="Processes that run episodes; -1 is one for each core.")]
 
 
@@ -55,6 +63,7 @@ def compare(
 def rollout(
     run: RunPath,
     episodes: Annotated[int | None, typer.Option(min=1, help="Episodes of each method; by default the spec's.")] = None,
+    best: Best = False,
     video: Annotated[bool, typer.Option("--video", help="Film the first episodes of each method.")] = False,
     jobs: Jobs = -1,
     resume: Annotated[
@@ -64,7 +73,8 @@ def rollout(
 ) -> None:
     """Roll the model, its baselines and the spec's scripted policies out from the same initial states.
 
-    The repetitions of fit --seeds are rolled out, too.
+    The repetitions of fit --seeds are rolled out, too. With --best one model alone is rolled out, beside the scripted
+    policies.
     """
     from ddco_pyro.cli import console
     from ddco_pyro.fitting.fitted import load
@@ -77,8 +87,9 @@ def rollout(
     _check_run(run, "rollouts.csv", "metrics.json")
     demos = fitted.demonstrations  # the report needs them: asked for before any episode
     with console.Progress() as progress:
-        roll_out(fitted, number, FILMED if video else 0, progress, jobs, resume)
-        roll_out_repetitions(fitted, progress, jobs)
+        roll_out(fitted, number, FILMED if video else 0, progress, jobs, resume, best)
+        if not best:
+            roll_out_repetitions(fitted, progress, jobs)
     console.successes(fitted.metrics)
     print(f"report: {write_report(fitted, demos)}")
 
@@ -312,6 +323,7 @@ def export(
     lerobot: Annotated[
         Path | None, written(out_folder, "The folder of a LeRobot policy, for lerobot_policy_ddco.")
     ] = None,
+    best: Best = False,
     onnx: Annotated[
         bool, typer.Option("--onnx", help=f"Write ONNX too (pip install 'ddco-pyro{BRACKET}export]').")
     ] = False,
@@ -334,6 +346,7 @@ def export(
     places = {"--out": out, "--lerobot": lerobot}
     check_outputs([Output(option, path, "folder") for option, path in places.items() if path], [run])
     fit = load(run, allow_code)
+    fit = fit.best if best else fit
     if lerobot:
         from ddco_pyro.exporting import export_policy
 

@@ -155,6 +155,24 @@ class Fit:
         allow_code = bool(user_code(self.spec))  # the spec names theirs too
         return {folder.name: load(folder, allow_code) for folder in folders if is_finished(folder)}
 
+    @property
+    def best(self) -> Fit:
+        """The model of the run to act with: the likeliest on held-out demonstrations.
+
+        It is a baseline only where that leads this model by more than one standard error.
+
+        :raises BadInput: no demonstrations were held out, or the leads have no standard error.
+        """
+        leads = {name: one.difference for name, one in self.metrics.comparison.items()}
+        if not self.metrics.valid or any(lead.standard_error is None for lead in leads.values()):
+            raise BadInput(
+                f"{self.place}: fewer than two demonstrations were held out, so no model is known to be the best; "
+                "leave out --best, or fit with a larger demonstrations.valid_fraction"
+            )
+        ahead = [name for name, lead in leads.items() if -lead.nats_per_step > (lead.standard_error or 0.0)]
+        best = min(ahead, key=lambda name: leads[name].nats_per_step, default=None)
+        return self if best is None else self.baselines[best]
+
     @cached_property
     def repetitions(self) -> tuple[Fit, ...]:
         """The fits with other training seeds, of ``fit --seeds``."""

@@ -18,9 +18,10 @@ FIRST_SEED = 1000
 """Seed of the first episode; each following episode adds 1."""
 
 
-def policies(fit: Fit) -> dict[str, Policy | str]:
+def policies(fit: Fit, best: bool = False) -> dict[str, Policy | str]:
     """The policies to roll out, by name: scripted ones, baselines, and the model itself last.
 
+    :param best: of the fitted ones, :attr:`Fit.best` alone.
     :raises RunError: the spec has no task, or names a scripted policy that the task lacks.
     """
     if fit.spec.task is None:
@@ -32,6 +33,8 @@ def policies(fit: Fit) -> dict[str, Policy | str]:
             f"rollout.policies: task {fit.spec.task!r} has no {', '.join(unknown)} (it has: {', '.join(known)})"
         )
     scripted: dict[str, Policy | str] = {name: name for name in fit.spec.rollout.policies}
+    if best:
+        return scripted | {fit.best.name: fit.best.controller()}
     return scripted | {name: other.controller() for name, other in fit.baselines.items()} | {fit.name: fit.controller()}
 
 
@@ -42,6 +45,7 @@ def roll_out(
     on_event: OnEvent = ignore,
     jobs: int = -1,
     resume: bool = False,
+    best: bool = False,
 ) -> Rollouts:
     """Roll out a fit, its baselines and the task's scripted policies from the same initial states.
 
@@ -50,12 +54,13 @@ def roll_out(
     :param episodes: the number of initial states.
     :param film: the number of episodes of each method to film.
     :param resume: return the finished rollouts of the run where seeds and methods are the same.
+    :param best: of the fitted models, roll out :attr:`Fit.best` alone.
     :returns: ``rollouts`` of the fit's metrics.
     :raises RunError: there is no task, or the fit has no folder.
     """
     folder = fit.run_folder
     seeds = range(FIRST_SEED, FIRST_SEED + episodes)
-    played = policies(fit)
+    played = policies(fit, best)
     held = fit.metrics.rollouts
     whole = held and (held.seed, held.episodes, {*held.methods}) == (seeds.start, episodes, {*played})
     if held and whole and resume and all(_film(fit, name, seed).exists() for name in played for seed in seeds[:film]):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections import Counter
 from dataclasses import replace
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 import yaml
 from command_line import call
+from made_metrics import compared as made
 from selecting import DATA, two_skills
 
 import ddco_pyro
@@ -19,6 +21,7 @@ from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, Demonst
 from ddco_pyro.errors import BadInput
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.fitting.run import RunError
+from ddco_pyro.metrics import Compared
 from ddco_pyro.report import write_report
 from ddco_pyro.spec import load_spec, with_overrides
 
@@ -260,6 +263,52 @@ def test_the_spec_says_what_is_seen_of_demonstrations_from_memory(in_memory: ddc
         ddco_pyro.fit(with_overrides(in_memory.spec, {"observations": ["plac"]}), two_skills())
     with pytest.raises(DemonstrationsError, match=r"there is no labels/phase; there is: nothing"):
         ddco_pyro.fit(with_overrides(in_memory.spec, {"demonstrations.labels": "phase"}), two_skills())
+
+
+# --- the model to act with --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("leads", "expected"),
+    [
+        ({"flat": (0.5, 0.1)}, "ddco"),
+        ({"flat": (-0.5, 0.6)}, "ddco"),  # less than a standard error
+        ({"flat": (-0.5, 0.4)}, "flat"),
+        ({"flat": (-0.5, 0.4), "mixture": (-0.9, 1.0)}, "flat"),
+        ({"flat": (-0.5, 0.4), "mixture": (-0.9, 0.8)}, "mixture"),
+    ],
+)
+def test_the_best_model_is_the_likeliest_by_more_than_a_standard_error(in_memory, leads, expected) -> None:
+    metrics = in_memory.metrics.model_copy(
+        update={"comparison": {name: compared(mean, error) for name, (mean, error) in leads.items()}}
+    )
+    others = {name: replace(in_memory.baselines["flat"], folder=Path(name)) for name in leads}
+    fit = replace(in_memory, metrics=metrics, beside=others)
+    assert fit.best is (fit if expected == "ddco" else others[expected])
+
+
+def compared(mean: float, error: float | None) -> Compared:
+    """A baseline that this fit leads by ``mean`` nats per step."""
+    return Compared.model_validate(made(mean, error))
+
+
+def test_no_model_is_known_to_be_the_best_where_too_few_were_held_out(in_memory) -> None:
+    one = in_memory.metrics.model_copy(update={"comparison": {"flat": compared(-1.0, None)}})
+    with pytest.raises(BadInput, match="fewer than two demonstrations were held out"):
+        _ = replace(in_memory, metrics=one).best
+
+
+def test_the_best_model_is_exported(commanded: Path, tmp_path: Path) -> None:
+    run = ddco_pyro.load(commanded / "run")
+    best = replace(run, metrics=run.metrics.model_copy(update={"comparison": {"flat": compared(-1.0, 0.1)}}))
+    best.metrics.write(commanded / "run")
+    try:
+        assert call("export", commanded / "run", "--best", "--out", tmp_path / "best").status == 0
+    finally:
+        run.metrics.write(commanded / "run")
+    assert call("export", commanded / "run", "--out", tmp_path / "own").status == 0
+    names = [json.loads((tmp_path / name / "controller.json").read_text())["names"] for name in ("own", "best")]
+    assert [sorted(each) for each in names] == [["option"], []]  # a flat policy has no options
 
 
 # --- what is read -----------------------------------------------------------------------------------------------------
