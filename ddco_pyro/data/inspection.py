@@ -30,7 +30,7 @@ from ddco_pyro.data.demonstration import Attribute, problem_of, unlike
 from ddco_pyro.data.division import check_division, problems_of_masks
 from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.labels import UNKNOWN, label_names
-from ddco_pyro.data.likeness import EXCLUDE, Likeness, told
+from ddco_pyro.data.likeness import EXCLUDE, Likeness, reasons_told
 from ddco_pyro.data.sources import Source, open_source
 from ddco_pyro.data.sources.metadata import clock_fault
 from ddco_pyro.spec import ControlSpec
@@ -204,7 +204,7 @@ class Inspection:
     @property
     def exclusions(self) -> list[str]:
         """A line for each reason to exclude demonstrations, with their names."""
-        return told(self.odd, len(self.lengths), EXCLUDE)
+        return reasons_told(self.odd, len(self.lengths), EXCLUDE)
 
     @property
     def notes(self) -> list[str]:

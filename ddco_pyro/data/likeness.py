@@ -236,7 +236,7 @@ class Likeness:
         return {f"steps are {faster:.2g} times as long as in the fit, perhaps at another rate": names}
 
 
-def told(reasons: Mapping[str, str], number: int, remedy: str = "") -> list[str]:
+def reasons_told(reasons: Mapping[str, str], number: int, remedy: str = "") -> list[str]:
     """A line for each reason why some of so many demonstrations are unlike the others, with their names."""
     names = {why: [name for name in reasons if reasons[name] == why] for why in reasons.values()}
     return [f"{few(members)} ({len(members)} of {number}): {why}{remedy}" for why, members in names.items()]

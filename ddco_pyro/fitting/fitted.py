@@ -16,7 +16,7 @@ from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.monitor import Monitor, run_lengths
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.division import unknown
-from ddco_pyro.data.likeness import Likeness, Usual, told
+from ddco_pyro.data.likeness import Likeness, Usual, reasons_told
 from ddco_pyro.errors import BadInput, path_of
 from ddco_pyro.evaluation.inferred import Inferred, Segmentation, infer
 from ddco_pyro.fitting.digest import record, recorded, usual
@@ -125,9 +125,11 @@ class Fit:
         return demos
 
     @cached_property
-    def usual(self) -> Usual:
-        """What the demonstrations of the fit have in common."""
+    def usual(self) -> Usual | None:
+        """What the demonstrations of the fit have in common; None of a fit with neither a folder nor demonstrations."""
         kept = None if self.folder is None else recorded(self.folder)
+        if kept is None and self.given is None:
+            return None
         return (kept and kept.usual) or usual(self.demonstrations)
 
     def unlike(self, likeness: Likeness, nats: Mapping[str, float], frequency: float | None) -> list[str]:
@@ -137,14 +139,14 @@ class Fit:
             range, and a nat for each control dimension: a control one σ farther off costs that.
         :param frequency: control steps per second, Hz; None if unknown.
         """
-        reasons = likeness.unlike(self.usual, frequency)
+        reasons = {} if self.usual is None else likeness.unlike(self.usual, frequency)
         known = [row.log_likelihood_per_step[self.name] for row in self.metrics.demonstrations_by_likelihood]
         low, high = min(known), max(known)
         less = [name for name in nats if nats[name] < 2 * low - high - self.hierarchy.scaling.size]
         why = (
             f"{np.median([nats[name] for name in less] or [0]):.1f} nats a step, and {low:.1f} to {high:.1f} in the fit"
         )
-        return told(dict.fromkeys(less, why) | reasons, len(nats))
+        return reasons_told(dict.fromkeys(less, why) | reasons, len(nats))
 
     @cached_property
     def baselines(self) -> Mapping[str, Fit]:

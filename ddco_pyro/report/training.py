@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from ddco_pyro.data.likeness import told
+from ddco_pyro.data.likeness import reasons_told
 from ddco_pyro.drawing.figures import INK, blank, save
 from ddco_pyro.drawing.page import Code, Columns, Facts, Folded, Section, note
 from ddco_pyro.drawing.words import number, rate
@@ -142,7 +142,7 @@ def _limits(values: np.ndarray) -> tuple[float, float]:
 def doubts(fit: Fit) -> list[tuple[str, str]]:
     """What is doubtful about a model, and what to do: its demonstrations, training, likelihood, and options."""
     metrics = fit.metrics
-    unlike = told(fit.usual.unlike, len(metrics.demonstrations_by_likelihood))
+    unlike = reasons_told(fit.usual.unlike if fit.usual else {}, len(metrics.demonstrations_by_likelihood))
     found = [*((f"{line}.", "Repair or exclude such ones (demonstrations.exclude).") for line in unlike)]
     found += [*effort.unconverged({metrics.model: metrics.training}), *verdicts.doubts(metrics)]
     return [*found, *(degeneracies(metrics, fit.spec, fit.names) if fit.spec.hierarchy else ())]

@@ -69,7 +69,7 @@ LEFT_OUT: dict[str, tuple[str, Observed, str]] = {
 def test_it_is_left_out_and_why_is_said(key: str, observed: Observed, why: str, tmp_path: Path) -> None:
     path = tmp_path / "demos.hdf5"
     found = with_observation(path, key, observed)
-    (reason,) = (note for note in found.notes if note.startswith(f"obs/{key}"))
+    (reason,) = (note for note in found.notes if note.startswith(f"obs/{key}") and why in note)
     assert reason.startswith(f"obs/{key} {why}")
     text = starting_spec(found, path).text
     assert f"# - {key}   # {why}" in text

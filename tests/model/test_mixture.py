@@ -126,7 +126,7 @@ def test_levels_above_start_from_segments_without_memory_too():
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """A run with a mixture beside it, and labels of three demonstrations."""
-    labels = {"level": "option", "from": "phase", "count": 3}
+    labels = {"level": "option", "from": "phase"}
     changes = {"compare_with": ["mixture"], "training": {"epochs": 6, "batch_size": 3, "labels": labels}}
     return ddco_pyro.fit(spec_of(**changes), out=tmp_path_factory.mktemp("runs") / "mixture")
 

@@ -48,6 +48,7 @@ class Wrong(Own):
         return {
             "swapped": lambda: found.transpose(2, 3),
             "squeezed": lambda: found.squeeze(0),
+            "joined": lambda: found.flatten(2),
             "time first": lambda: found.transpose(0, 1),
             "fails": lambda: found @ torch.ones(7),
         }[self.how]()

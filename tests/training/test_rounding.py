@@ -35,7 +35,7 @@ def make_demonstrations(number: int = 6, steps: int = 20) -> Demonstrations:
             "settled": np.full((steps, 1), 0.3 * index) + noise[:, :1],  # differs between demonstrations alone
         }
         observations = {key: values.astype(np.float32) for key, values in observations.items()}
-        records.append((observations, place + random.normal(0, 0.1, (steps, 2))))
+        records.append((observations, np.sin(place) + random.normal(0, 0.1, (steps, 2))))
     return numbered(records)
 
 
