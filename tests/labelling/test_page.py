@@ -338,7 +338,7 @@ def test_new_options_that_are_typed_one_after_the_other_have_their_own_names(tab
     with served(session) as address:
         tab = tabs(address, LATE)
         added = tab.get_by_label("Name of a new option")
-        added.focus()
+        added.click()  # once it can be seen
         tab.evaluate(SHUFFLED)
         for name in ("wait", "none", "turn"):
             tab.keyboard.type(name)
