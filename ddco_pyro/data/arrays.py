@@ -174,7 +174,7 @@ def network_input(
     if len(shape) > PICTURE_DIMENSIONS:
         return "", (
             f"has shape {list(shape)} at each step, and networks read vectors and pictures [H, W, C]; store one "
-            "picture a step (frames stacks them), or reshape it to [steps, dimensions]"
+            "picture a step, or reshape it to [steps, dimensions]"
         )
     if dtype == PICTURES:
         return "picture", ""

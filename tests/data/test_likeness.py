@@ -105,18 +105,6 @@ def test_objects_and_goals_elsewhere_are_no_fault(seed: int, tmp_path: Path) -> 
     assert inspect(path).exclusions == []
 
 
-def test_recordings_are_alike(recording: Path) -> None:
-    assert inspect(recording).exclusions == []
-
-
-@pytest.fixture(params=["metaworld_pick_place", "pusht_human"])
-def recording(request: pytest.FixtureRequest) -> Path:
-    path = Path("/work/shared/data") / f"{request.param}.hdf5"
-    if not path.exists():
-        pytest.skip("the recording is not here")
-    return path
-
-
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("unlike")

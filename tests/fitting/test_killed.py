@@ -39,7 +39,7 @@ def inputs(tmp_path: Path, toy_run) -> Path:
 
 
 def results(folder: Path) -> dict[str, object]:
-    """What a folder holds: bytes of files, and numbers of JSON files but for seconds and places."""
+    """What a folder holds: bytes of files, and numbers of JSON files, without seconds and places."""
     found = {}
     for path in folder.rglob("*"):
         if path.suffix == ".json":

@@ -20,7 +20,7 @@ from ddco_pyro.spec import SpecError, parse_spec, with_overrides
 
 ABSOLUTE = targets(velocities())
 BY_HAND = Demonstrations(tuple(replace(demo, actions=demo.actions - demo.observations["gripper"]) for demo in ABSOLUTE))
-"""The differences of the targets, which are the velocities but for rounding."""
+"""The differences of the targets, which are the velocities, up to rounding."""
 
 LINEAR = {"network": "linear"}
 DATA: dict[str, Any] = {
