@@ -341,22 +341,24 @@ def test_minaris_environment_is_never_made(written_by_minari, out: Path) -> None
         import_demonstrations(folder, out)
 
 
-def test_minaris_episodes_are_counted(written_by_minari, out: Path) -> None:
-    """One is gone, one says that it is longer, and one has an observation too many."""
+def test_minaris_episodes_and_steps_are_counted(written_by_minari, out: Path) -> None:
+    """One episode says that it is longer, one has an observation too many, and then one is gone."""
     folder, _ = written_by_minari(spaces.Box(-1, 1, (2,)))
     with h5py.File(folder / "data" / "main_data.hdf5", "r+") as file:
-        del file["episode_1"]
         file["episode_2"].attrs["total_steps"] = 9
         joints = file["episode_3/observations/arm/joints"][:]
         instead(file, "episode_3/observations/arm/joints", np.concatenate([joints, joints[:1]]))
     left_out = import_demonstrations(folder, out, choice=Choice(skip_broken=True)).left_out
-    assert Demonstrations.read(out).names == ("demo_0",)
+    assert Demonstrations.read(out).names == ("demo_0", "demo_1")
     for name, message in {
-        "demo_1": "demo_1 is missing: the metadata counts 4 episodes, and the dataset has 3",
         "demo_2": "demo_2: total_steps is 9, and there are 7 actions",
         "demo_3": "demo_3: obs/arm/joints has 10 steps, but actions has 8",
     }.items():
         assert message in left_out[name]
+    with h5py.File(folder / "data" / "main_data.hdf5", "r+") as file:
+        del file["episode_1"]
+    with pytest.raises(DemonstrationsError, match="counts 4 episodes, and the dataset has 3; correct total_episodes"):
+        inspect(folder)
 
 
 def test_minaris_values_that_were_never_stored_are_no_zeros(written_by_minari, out: Path) -> None:

@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import lru_cache, partial
-from itertools import islice, pairwise
+from itertools import islice
 from pathlib import Path
 from shlex import quote
 from typing import Any
@@ -18,16 +18,16 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ddco_pyro.data.arrays import PICTURES, LazyArray, Observed, block_steps, channels_last, turned
+from ddco_pyro.data.arrays import PICTURES, LazyArray, Observed, channels_last, turned
 from ddco_pyro.data.demonstration import Attribute, Demonstration
 from ddco_pyro.data.errors import DemonstrationsError, damaged
 from ddco_pyro.data.labels import LABEL_NAMES
 from ddco_pyro.data.sources import Source
 from ddco_pyro.data.sources.metadata import (
+    check_count,
     check_links,
     clock_fault,
     filled,
-    first_missing,
     inside,
     joined,
     rate,
@@ -91,18 +91,15 @@ class LeRobot:
         self.keys = dict(zip(observed, keys, strict=True))
         self._actions = tuple(actions) or (ACTION,)
         self._check_actions()
-        self._episodes, self._twice = _episodes(folder)
-        if not self._episodes:
-            raise DemonstrationsError(f"{folder}: meta/episodes holds no episodes; at least one is needed")
-        self._missing = first_missing(folder, self.info.get("total_episodes"), self._episodes, "meta/episodes")
+        self._episodes = _episodes(folder)
+        check_count(folder, self.info.get("total_episodes"), len(self._episodes), "meta/episodes")
         self._frequency = rate({"fps": self.info.get("fps")})
         self._annotated, subtasks = self._annotations() if SUBTASK not in self.features else ({}, [])
         changing = any(len(row.get("tasks") or ()) > 1 for row in self._episodes.values())
         self._labels = {"subtask": SUBTASK} | ({"task": TASK} if changing else {})
         names = {name: self._named(name) for name in self._labels}
-        self._names = {
-            name: each for name, each in (names | ({"subtask": subtasks} if subtasks else {})).items() if each
-        }
+        names |= {"subtask": subtasks} if subtasks else {}
+        self._names = {name: each for name, each in names.items() if each}
         files = {self._path("data_path", index, "data") for index in self._episodes}  # some may be missing
         self.data_files = tuple(sorted(path.relative_to(folder) for path in files))
 
@@ -114,7 +111,7 @@ class LeRobot:
         meta = sorted((folder / "meta").rglob("*.parquet"))
         more = (folder / path for path in (ANNOTATIONS, *self.data_files))
         files = (folder / "meta" / "info.json", *meta, *(path for path in more if path.is_file()))
-        names = tuple(f"demo_{index}" for index in (*self._episodes, *self._missing))
+        names = tuple(f"demo_{index}" for index in self._episodes)
         return Source(names, self._read, files, {}, self._frequency, about, self.keys)
 
     def _check_actions(self) -> None:
@@ -175,10 +172,6 @@ class LeRobot:
     def _read(self, name: str) -> Demonstration:
         """One episode."""
         index = int(name.removeprefix("demo_"))
-        if index in self._missing:
-            raise DemonstrationsError(f"{name} {self._missing[index]}")
-        if index in self._twice:
-            raise DemonstrationsError(f"{name}: meta/episodes names it twice; remove one of the two")
         path = self._path("data_path", index, "data")
         if not path.is_file():
             raise DemonstrationsError(f"{name}: {path} is missing; fetch the dataset again")
@@ -186,7 +179,7 @@ class LeRobot:
             rows = _Rows(path, index, name)
             self._check(rows, index)
             observations = {key: self._observation(rows, feature, index) for feature, key in self.keys.items()}
-            there = {name: column for name, column in self._labels.items() if column in rows.present}
+            there = {name: column for name, column in self._labels.items() if column in rows.schema.names}
             labels = {name: np.asarray(rows.numbers(column, ())) for name, column in there.items()}
             if self._annotated:
                 labels["subtask"] = np.full(len(rows), -1)
@@ -209,10 +202,14 @@ class LeRobot:
                 f"{rows.name}: length in meta/episodes is {length}, and {rows.path} has {len(rows)} rows of it"
             )
         for column, frequency in (("frame_index", 1.0), ("timestamp", self._frequency)):
-            if column in rows.present and frequency:
+            if column in rows.schema.names and frequency:
                 times = np.asarray(rows.numbers(column, ())).astype(float)
-                if problem := _problem_of_times(times, frequency, column):
-                    raise DemonstrationsError(f"{rows.path}: {rows.name}: {problem}")
+                expected = np.arange(len(times)) / frequency
+                wrong = ~(np.abs(times - expected) < 0.5 / frequency)
+                if wrong.any():
+                    at = int(wrong.argmax())
+                    usual = f"is {times[at]:.6g} in row {at}, not {expected[at]:.6g}; correct it, or fps in meta/info.json"
+                    raise DemonstrationsError(f"{rows.path}: {rows.name}: {column} {clock_fault(times) or usual}")
 
     def _observation(self, rows: _Rows, key: str, index: int) -> Observed:
         about = self.features[key]
@@ -240,137 +237,102 @@ class LeRobot:
             yield np.stack(block)
 
 
-def _problem_of_times(times: np.ndarray, frequency: float, column: str) -> str:
-    """The first problem with the times [T] of frames, in words; empty if frame t is at time t / frequency."""
-    expected = np.arange(len(times)) / frequency
-    wrong = ~(np.abs(times - expected) < 0.5 / frequency)
-    if not wrong.any():
-        return ""
-    if (np.abs(times - times[0] - expected) < 0.5 / frequency).all():
-        return f"{column} starts at {times[0]:.6g}, not at 0; subtract that from each"
-    gaps = np.diff(times)
-    if column == "timestamp" and len(gaps) and not clock_fault(times):
-        rate = 1 / gaps.mean()
-        return f"{column} runs at {rate:.4g} Hz, and meta/info.json says {frequency:g}; correct one of them"
-    at = int(wrong.argmax())
-    return f"{column} {clock_fault(times) or f'is {times[at]:g} in row {at}, not {expected[at]:g}'}"
-
-
 class _Rows:
     """The rows of one episode in a parquet file."""
 
     def __init__(self, path: Path, episode: int, name: str) -> None:
         self.path, self.name = path, name
-        file, spans = _open(path, path.stat().st_mtime_ns)
-        self.schema = file.schema_arrow
-        self.present = set(self.schema.names)
-        there = spans.get(episode, [])
-        if len(there) != 1:
-            what = "are not together" if there else "are missing"
+        self.schema = _file(path, path.stat().st_mtime_ns).schema_arrow
+        rows = np.flatnonzero(self._values("episode_index").to_numpy() == episode)
+        if not len(rows) or np.ptp(rows) >= len(rows):
+            what = "are not together" if len(rows) else "are missing"
             raise DemonstrationsError(f"{name}: its rows {what} in {path}")
-        ((self.start, self.stop),) = there
+        self.first, self.steps = int(rows[0]), len(rows)
 
     def __len__(self) -> int:
-        return self.stop - self.start
+        return self.steps
+
+    def _values(self, key: str) -> Any:
+        """A column of the file."""
+        if key not in self.schema.names:
+            raise DemonstrationsError(f"{self.path}: {self.name}: has no column {key}, which meta/info.json names")
+        return _column(self.path, self.path.stat().st_mtime_ns, key)
 
     def numbers(self, key: str, shape: Sequence[int]) -> LazyArray:
         """A column of numbers or lists of numbers; ``shape`` is the shape of a step."""
         dtype: np.dtype[Any] = np.dtype(np.float32)  # where the column is missing, which its reading reports
-        if key in self.present:
+        if key in self.schema.names:
             kind = self.schema.field(key).type
             while pyarrow.types.is_nested(kind) and hasattr(kind, "value_type"):
                 kind = kind.value_type
             dtype = np.dtype(object) if pyarrow.types.is_nested(kind) else np.dtype(kind.to_pandas_dtype())
-        read = partial(self._numbers, key, tuple(shape), dtype)
+        read = partial(self._numbers, key, tuple(shape))
         return LazyArray(channels_last((len(self), *shape), dtype), dtype, read, key)
 
-    def _numbers(
-        self, key: str, shape: tuple[int, ...], dtype: np.dtype, start: int, stop: int
-    ) -> Iterator[np.ndarray]:
-        at = start
+    def _numbers(self, key: str, shape: tuple[int, ...], start: int, stop: int) -> Iterator[np.ndarray]:
         try:
-            for values in self._batches(key, block_steps(shape, dtype), start, stop):
-                yield turned(self._flat(values, math.prod(shape), key, at).reshape(len(values), *shape))
-                at += len(values)
+            values = self._values(key).slice(self.first + start, stop - start)
+            row, size = np.arange(stop - start), math.prod(shape)
+            while pyarrow.types.is_nested(values.type):
+                row = np.repeat(row, compute.list_value_length(values).fill_null(0).to_numpy())
+                values = values.flatten()
+            counts = np.bincount(row[values.is_valid().to_numpy(zero_copy_only=False)], minlength=stop - start)
+            if (counts != size).any():
+                at = int((counts != size).argmax())
+                has = f"{key} has {counts[at]} numbers in row {start + at}, and meta/info.json says {size}"
+                raise DemonstrationsError(f"{self.path}: {self.name}: {has}; correct one of them")
+            yield turned(values.to_numpy(zero_copy_only=False).reshape(stop - start, *shape))
         except _DAMAGE as error:
             raise damaged(self.path, f"{self.name}: {key}", error) from error
-
-    def _flat(self, values: Any, size: int, key: str, first: int) -> np.ndarray:
-        """The numbers of a column with ``size`` numbers in each row, flat; ``first`` is the number of the first row."""
-        row, rows = np.arange(len(values)), len(values)
-        while pyarrow.types.is_nested(values.type):
-            row = np.repeat(row, compute.list_value_length(values).fill_null(0).to_numpy())
-            values = values.flatten()
-        counts = np.bincount(row[values.is_valid().to_numpy(zero_copy_only=False)], minlength=rows)
-        if (counts != size).any():
-            at = int((counts != size).argmax())
-            has = f"has {counts[at]} numbers in row {first + at}, and meta/info.json says {size}; correct one of them"
-            raise DemonstrationsError(
-                f"{self.path}: {self.name}: {key} {has if counts[at] else f'is null in row {first + at}; repair it'}"
-            )
-        return values.to_numpy(zero_copy_only=False)
 
     def images(self, key: str, size: tuple[int, int], start: int, stop: int) -> Iterator[np.ndarray]:
         """Encoded pictures of consecutive steps, uint8 [steps, H, W, 3], in blocks."""
 
         def decoded(encoded: bytes | None) -> np.ndarray:
-            if encoded is None:
-                raise DemonstrationsError(f"{self.path}: {self.name}: an image is not in the parquet file itself")
-            image = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR)
+            image = None if encoded is None else cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR)
             if image is None or image.shape[:2] != size:
-                wanted = f"{size[0]} x {size[1]}"
-                raise DemonstrationsError(f"{self.path}: {self.name}: an image is damaged, or not {wanted}")
+                wrong = f"an image is damaged, not in the parquet file itself, or not {size[0]} x {size[1]}"
+                raise DemonstrationsError(f"{self.path}: {self.name}: {wrong}")
             return np.ascontiguousarray(image[..., ::-1])
 
         try:
-            for values in self._batches(key, IMAGES_AT_ONCE, start, stop):
-                yield np.stack([decoded(picture["bytes"]) for picture in values.to_pylist()])
+            values = self._values(key)
+            for first in range(start, stop, IMAGES_AT_ONCE):
+                some = values.slice(self.first + first, min(IMAGES_AT_ONCE, stop - first))
+                yield np.stack([decoded(picture["bytes"]) for picture in some.to_pylist()])
         except _DAMAGE as error:
             raise damaged(self.path, f"{self.name}: {key}", error) from error
 
-    def _batches(self, key: str, rows: int, start: int, stop: int) -> Iterator[Any]:
-        """A column's values of steps of the episode, from the row groups that hold them."""
-        if key not in self.present:
-            raise DemonstrationsError(f"{self.path}: {self.name}: has no column {key}, which meta/info.json names")
-        start, stop = self.start + start, self.start + stop
-        file, _ = _open(self.path, self.path.stat().st_mtime_ns)
-        ends = np.cumsum([file.metadata.row_group(group).num_rows for group in range(file.metadata.num_row_groups)])
-        first, last = np.searchsorted(ends, [start, stop - 1], side="right")
-        at = 0 if first == 0 else int(ends[first - 1])
-        for batch in file.iter_batches(rows, list(range(first, last + 1)), [key]):
-            low, high = max(start - at, 0), min(stop - at, len(batch))
-            at += len(batch)
-            if low < high:
-                yield batch.column(0).slice(low, high - low)
+
+@lru_cache(maxsize=1)
+def _file(path: Path, changed: int) -> parquet.ParquetFile:
+    """A parquet file; ``changed`` identifies its version."""
+    return parquet.ParquetFile(path)
 
 
-@lru_cache(maxsize=2)
-def _open(path: Path, changed: int) -> tuple[parquet.ParquetFile, Mapping[int, list[tuple[int, int]]]]:
-    """A parquet file, and the spans of rows of each episode; ``changed`` identifies the version of the file."""
-    file = parquet.ParquetFile(path)
-    index = file.read(["episode_index"]).column(0).to_numpy()
-    bounds = [0, *(np.flatnonzero(np.diff(index)) + 1).tolist(), len(index)]
-    spans: dict[int, list[tuple[int, int]]] = {}
-    for start, stop in pairwise(bounds):
-        spans.setdefault(int(index[start]), []).append((start, stop))
-    return file, spans
+@lru_cache(maxsize=8)
+def _column(path: Path, changed: int, key: str) -> Any:
+    """A column of a parquet file, in one piece: LeRobot's files have about 100 MB."""
+    return _file(path, changed).read([key]).column(key).combine_chunks()
 
 
-def _episodes(folder: Path) -> tuple[dict[int, dict[str, Any]], set[int]]:
-    """The rows of ``meta/episodes`` by episode, without statistics, and the episodes with two rows."""
+def _episodes(folder: Path) -> dict[int, dict[str, Any]]:
+    """The rows of ``meta/episodes`` by episode, without statistics."""
     episodes: dict[int, dict[str, Any]] = {}
-    twice: set[int] = set()
     for path in sorted((folder / "meta" / "episodes").rglob("*.parquet")):
         try:
             names = parquet.read_schema(path).names
             rows = parquet.read_table(path, columns=[key for key in names if not key.startswith("stats/")]).to_pylist()
             for row in rows:
                 index = int(row["episode_index"])
-                twice |= {index} & episodes.keys()
+                if index in episodes:
+                    raise DemonstrationsError(f"{path}: demo_{index}: is there twice; remove one of the two")
                 episodes[index] = row
         except _DAMAGE as error:
             raise damaged(path, "", error) from error
-    return dict(sorted(episodes.items())), twice
+    if not episodes:
+        raise DemonstrationsError(f"{folder}: meta/episodes holds no episodes; at least one is needed")
+    return dict(sorted(episodes.items()))
 
 
 def _info(path: Path) -> dict[str, Any]:
@@ -393,4 +355,5 @@ def open_lerobot(path: Path, actions: Sequence[str] = ()) -> Iterator[Source]:
     try:
         yield LeRobot(path, actions).source()
     finally:
-        _open.cache_clear()
+        _file.cache_clear()
+        _column.cache_clear()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -104,16 +104,12 @@ def check_links(folder: Path) -> None:
 def filled(folder: Path, template: str, values: Mapping[str, int | str]) -> str:
     """A template such as ``data/chunk-{chunk_index:03d}.parquet`` with its placeholders filled.
 
-    The only format is zero padding of a number, to a width of at most 12.
+    The only format is zero padding, to a width of at most 12.
 
     :raises DemonstrationsError: the template has other placeholders or formats.
     """
-
-    def fill(found: re.Match[str]) -> str:
-        value, width = values.get(found[1], found[0]), int(found[2] or 0)
-        return found[0] if width > 12 or (width and isinstance(value, str)) else str(value).zfill(width)
-
-    path = re.sub(r"\{(\w+)(?::0(\d\d?)d)?\}", fill, template)
+    placeholder = rf"\{{({'|'.join(values)})(?::0(\d|1[0-2])d)?\}}"
+    path = re.sub(placeholder, lambda found: str(values[found[1]]).zfill(int(found[2] or 0)), template)
     if {*path} & {*"{}"}:
         known = ", ".join(f"{{{name}}}" for name in values)
         raise DemonstrationsError(
@@ -141,11 +137,6 @@ def joined(parts: Mapping[str, np.ndarray], where: str) -> np.ndarray:
     return np.concatenate([array.reshape(steps, math.prod(array.shape[1:])) for array in parts.values()], axis=1)
 
 
-def _storable(key: str) -> bool:
-    """Whether a key is a valid path in HDF5."""
-    return len(key) <= 250 and "\0" not in key and all(part not in ("", ".") for part in key.split("/"))
-
-
 def stored_keys(folder: Path, names: Sequence[str], preferred: Sequence[str]) -> list[str]:
     """Keys under which HDF5 can store observations together.
 
@@ -155,33 +146,29 @@ def stored_keys(folder: Path, names: Sequence[str], preferred: Sequence[str]) ->
     :raises DemonstrationsError: a name cannot be stored, or occurs too often.
     """
     for name in names:
-        if not _storable(name):
+        if len(name) > 250 or "\0" in name or not {"", "."}.isdisjoint(name.split("/")):
             called = f"an observation is called {name[:100]!r}"
             raise DemonstrationsError(f"{folder}: {called}, which cannot be stored; rename it")
-    own = [names[at] if _meets_another(at, preferred) else key for at, key in enumerate(preferred)]
+    own = [name if _meets(key, preferred) else key for name, key in zip(names, preferred, strict=True)]
     for keys in (own, [name.replace("/", "_") for name in names]):
-        if not any(_meets_another(at, keys) for at in range(len(keys))):
+        if not any(_meets(key, keys) for key in keys):
             return keys
     raise DemonstrationsError(f"{folder}: two observations have one name, or one lies in the other; rename one")
 
 
-def _meets_another(at: int, keys: Sequence[str]) -> bool:
-    """Whether another key equals this one, or is a group above or below it."""
-    others = [f"{key}/" for place, key in enumerate(keys) if place != at]
-    return any(other.startswith(f"{keys[at]}/") or f"{keys[at]}/".startswith(other) for other in others)
+def _meets(key: str, keys: Sequence[str]) -> bool:
+    """Whether another of the keys equals this one of them, or is a group above or below it."""
+    own = f"{key}/"
+    return sum(own.startswith(f"{other}/") or f"{other}/".startswith(own) for other in keys) > 1
 
 
-def first_missing(folder: Path, total: object, there: Collection[int], named: str) -> dict[int, str]:
-    """The number of the first missing episode and the problem; empty if no episode is missing.
+def check_count(folder: Path, total: object, there: int, named: str) -> None:
+    """Refuse a dataset whose metadata count other episodes than there are.
 
     :param total: number of episodes by the metadata; ignored unless a whole number.
-    :param there: numbers of the episodes that exist.
     :param named: where the episodes are, for messages.
-    :raises DemonstrationsError: more episodes exist than the metadata counts.
+    :raises DemonstrationsError: they do.
     """
-    if not isinstance(total, int) or total == len(there):
-        return {}
-    counts = f"the metadata counts {total} episodes, and {named} has {len(there)}"
-    if total < len(there):
-        raise DemonstrationsError(f"{folder}: {counts}; correct total_episodes")
-    return {next(index for index in range(len(there) + 1) if index not in there): f"is missing: {counts}"}
+    if isinstance(total, int) and total != there:
+        counts = f"the metadata counts {total} episodes, and {named} has {there}"
+        raise DemonstrationsError(f"{folder}: {counts}; correct total_episodes, or fetch the dataset again")

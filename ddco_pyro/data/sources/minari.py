@@ -14,7 +14,7 @@ from ddco_pyro.data.demonstration import Attribute, Demonstration
 from ddco_pyro.data.errors import DemonstrationsError, damaged
 from ddco_pyro.data.hdf5 import DAMAGE, dataset_at, datasets, member, opened
 from ddco_pyro.data.sources import Source
-from ddco_pyro.data.sources.metadata import check_links, first_missing, joined, stored_keys
+from ddco_pyro.data.sources.metadata import check_count, check_links, joined, stored_keys
 from ddco_pyro.errors import nearest
 
 BARE = "observation"
@@ -49,13 +49,11 @@ def open_minari(path: Path, actions: Sequence[str] = ()) -> Iterator[Source]:
     except (*DAMAGE, AssertionError, ImportError, AttributeError, RecursionError) as error:
         raise damaged(folder, "", error) from error
     stored = _episodes(folder)
-    missing = first_missing(folder, storage.total_episodes, stored, "the dataset") if stored else {}
-    names = tuple(f"demo_{index}" for index in sorted({*stored, *missing}))
+    if stored:
+        check_count(folder, storage.total_episodes, len(stored), "the dataset")
 
     def read(name: str) -> Demonstration:
         index, where = int(name.removeprefix("demo_")), f"{folder}: {name}"
-        if index in missing:
-            raise DemonstrationsError(f"{where} {missing[index]}")
         if (folder / MAIN).is_file():
             with opened(folder / MAIN) as file:
                 group = member(file, f"episode_{index}", h5py.Group, "")
@@ -76,7 +74,7 @@ def open_minari(path: Path, actions: Sequence[str] = ()) -> Iterator[Source]:
         return Demonstration.stored(name, observations, control, {}, {"episode_index": index, **seed})
 
     files = tuple(sorted(path for path in folder.rglob("*") if path.is_file()))
-    yield Source(names, read, files, attributes={"dataset_id": str(storage.metadata.get("dataset_id", ""))})
+    yield Source(tuple(f"demo_{index}" for index in sorted(stored)), read, files, attributes={"dataset_id": str(storage.metadata.get("dataset_id", ""))})
 
 
 def _control(folder: Path, nested: Any, chosen: Sequence[str], where: str) -> np.ndarray:

@@ -228,15 +228,15 @@ EPISODES_NOT_WHOLE = {
     "lerobot ragged": (changed(RAGGED), "demo_0: action has 1 numbers in row 0, and meta/info.json says 2; correct"),
     "lerobot null action": (
         in_episode_1("action", lambda row, value: None if row == 7 else value),
-        "demo_1: action is null in row 2; repair it",
+        "demo_1: action has 0 numbers in row 2, and meta/info.json says 2; correct",
     ),
     "lerobot late": (
         in_episode_1("timestamp", lambda _, value: value + 3.2),
-        r"demo_1: timestamp starts at 3\.2, not at 0; subtract that",
+        r"demo_1: timestamp is 3\.2 in row 0, not 0; correct it, or fps",
     ),
     "lerobot 50 Hz": (
         in_episode_1("timestamp", lambda _, value: value / 5),
-        r"demo_1: timestamp runs at 50 Hz, and meta/info\.json says 10; correct one",
+        r"demo_1: timestamp is 0\.02 in row 1, not 0\.1; correct it, or fps",
     ),
 }
 """Datasets of which one episode is not whole, and what is said of it."""
@@ -245,10 +245,10 @@ ROWS = {
     **PATHS,
     **{name: Row(*row) for name, row in EPISODES_NOT_WHOLE.items()},
     "lerobot missing file": Row(changed(second_file), r"demo_2: .*file-001\.parquet is missing"),
-    "lerobot episode twice": Row(changed(rewritten(EPISODES, twice)), "demo_2: meta/episodes names it twice"),
+    "lerobot episode twice": Row(changed(rewritten(EPISODES, twice)), "demo_2: is there twice; remove one"),
     "lerobot episodes missing": Row(
         changed(rewritten(EPISODES, lambda table: table.slice(0, 3))),
-        "demo_3 is missing: the metadata counts 4 episodes, and meta/episodes has 3",
+        "the metadata counts 4 episodes, and meta/episodes has 3; correct total_episodes, or fetch",
     ),
     "lerobot uncounted episode": Row(changed(info(total_episodes=3)), "counts 3 episodes, and meta/episodes has 4"),
     "lerobot without episodes": Row(
