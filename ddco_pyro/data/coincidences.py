@@ -15,34 +15,26 @@ from ddco_pyro.data.errors import DemonstrationsError
 # --- copies -----------------------------------------------------------------------------------------------------------
 
 
-class Copies:
-    """Demonstrations that equal another one in all arrays but labels.
+def copies(digests: Mapping[str, Any], masks: Mapping[str, Sequence[str]]) -> Iterator[str]:
+    """A line for demonstrations that equal another one in all arrays but labels, where a split may part them.
 
-    :ivar digests: of the places and values of its arrays, by the name of each demonstration.
+    :param digests: of the places and values of its arrays, by the name of each demonstration.
     """
-
-    def __init__(self) -> None:
-        self.digests: dict[str, Any] = {}
-
-    def notes(self, masks: Mapping[str, Sequence[str]]) -> Iterator[str]:
-        """A line for the copies, of which one may be trained on and the other held out."""
-        known: dict[bytes, str] = {}
-        each = [(known.setdefault(digest.digest(), name), name) for name, digest in self.digests.items()]
-        pairs = [(first, again) for first, again in each if first != again]
-        effect = "one of two that are the same may be trained on and the other held out"
-        if masks.keys() & {"train", "valid"}:
-            try:
-                valid = set(split_by_masks(list(self.digests), masks)[1])
-            except DemonstrationsError:
-                return  # reported as a problem
-            pairs = [pair for pair in pairs if (pair[0] in valid) != (pair[1] in valid)]
-            effect = "one of them is trained on and the other held out"
-        if pairs:
-            first, again = pairs[0]
-            yield (
-                f"{len(pairs)} of {len(self.digests)} demonstrations equal another one, the first {again}, which "
-                f"equals {first}: {effect}"
-            )
+    known: dict[bytes, str] = {}
+    pairs = [(known.setdefault(digest.digest(), name), name) for name, digest in digests.items()]
+    pairs = [(first, again) for first, again in pairs if first != again]
+    effect = "one of two that are the same may be trained on and the other held out"
+    if masks.keys() & {"train", "valid"}:
+        try:
+            valid = set(split_by_masks(list(digests), masks)[1])
+        except DemonstrationsError:
+            return  # reported as a problem
+        pairs = [pair for pair in pairs if len({*pair} & valid) == 1]
+        effect = "one of them is trained on and the other held out"
+    if pairs:
+        first, again = pairs[0]
+        those = f"{len(pairs)} of {len(digests)} demonstrations equal another one"
+        yield f"{those}, the first {again}, which equals {first}: {effect}"
 
 
 # --- what is no observation -------------------------------------------------------------------------------------------
@@ -86,8 +78,8 @@ class Leaks:
     """Observations that no policy should read: controls in any units, clocks, and what a generator of data writes."""
 
     def __init__(self) -> None:
-        self._origin: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-        self._moments: dict[tuple[str, int], list[np.ndarray]] = {}
+        self._origin: dict[str, tuple[np.ndarray, np.ndarray]] = {}  # subtracted from both, against cancellation
+        self._products: dict[tuple[str, int], np.ndarray] = {}
         self._clocks: dict[str, bool] = {}
 
     def add(self, place: str, rows: np.ndarray, commands: np.ndarray) -> None:
@@ -95,30 +87,28 @@ class Leaks:
         rows, commands = rows[:LOOKED_AT].astype(np.float64), commands[:LOOKED_AT].astype(np.float64)
         if len(rows) > 2:
             self._clocks[place] = self._clocks.get(place, True) and _rises(place, rows)
-        origin = self._origin.setdefault(place, (rows[:1], commands[:1]))  # against cancellation
-        x, a = rows - origin[0], commands - origin[1]
+        origin = self._origin.setdefault(place, (rows[:1], commands[:1]))
         for shift in SHIFTS:
-            seen = x[max(-shift, 0) : max(len(x) - max(shift, 0), 0)]
-            told = a[max(shift, 0) :][: len(seen)]
+            seen = rows[max(-shift, 0) : max(len(rows) - max(shift, 0), 0)]
+            told = commands[max(shift, 0) :][: len(seen)]
+            both = np.column_stack([np.ones(len(seen)), seen - origin[0], told - origin[1]])
             with np.errstate(over="ignore", invalid="ignore"):
-                each = [
-                    np.array(len(seen)),
-                    seen.sum(0),
-                    told.sum(0),
-                    (seen**2).sum(0),
-                    (told**2).sum(0),
-                    seen.T @ told,
-                ]
-            before = self._moments.get((place, shift))
-            self._moments[place, shift] = [np.add(*pair) for pair in zip(before, each, strict=True)] if before else each
+                self._products[place, shift] = self._products.get((place, shift), 0) + both.T @ both
+
+    def _moments(self, place: str, shift: int) -> tuple[float, np.ndarray, np.ndarray]:
+        """The number of steps, the sums and the centred products of an observation and the controls behind it."""
+        products = self._products[place, shift]
+        count, sums = max(products[0, 0], 1.0), products[0, 1:]
+        return count, sums, products[1:, 1:] - np.outer(sums, sums) / count
 
     def _unexplained(self, place: str) -> np.ndarray:
         """1 - R² of each number of an observation by each control at each of :data:`SHIFTS`, [3, D, A]."""
-        found = []
+        found, size = [], self._origin[place][0].shape[1]
         for shift in SHIFTS:
-            count, x, a, xx, aa, xa = self._moments[place, shift]
             with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-                rest = 1 - (count * xa - np.outer(x, a)) ** 2 / np.outer(count * xx - x**2, count * aa - a**2)
+                count, _, products = self._moments(place, shift)
+                squares = products.diagonal()
+                rest = 1 - products[:size, size:] ** 2 / np.outer(squares[:size], squares[size:])
             found.append(np.where(np.isfinite(rest) & (count >= FEWEST), rest, 1.0))
         return np.maximum(found, EXACT)
 
@@ -142,15 +132,16 @@ class Leaks:
         """
         if place not in self._origin or len({rows.shape[1] for rows in self._origin[place]}) > 1:
             return False
-        near, offset = [], np.subtract(*self._origin[place][::-1])[0]
+        near, apart = [], np.subtract(*self._origin[place][::-1])[0]
+        each = len(apart)
         for shift in (-1, 0):
-            count, x, a, xx, aa, xa = self._moments[place, shift]
-            count, square = np.maximum(count, 1), xx + aa - 2 * xa.diagonal()
             with np.errstate(over="ignore", invalid="ignore"):
-                spread, changes = aa - a**2 / count, square - (a - x) ** 2 / count
-                apart = square + 2 * offset * (a - x) + count * offset**2
-                near.append((apart <= NEAR**2 * spread)[varying].all())
-        moves = np.isin(np.arange(len(changes)), varying)
+                count, sums, products = self._moments(place, shift)
+                squares, spread = products.diagonal(), products.diagonal()[each:]
+                changes = squares[:each] + spread - 2 * products[:each, each:].diagonal()
+                offset = apart + (sums[each:] - sums[:each]) / count
+                near.append((changes + count * offset**2 <= NEAR**2 * spread)[varying].all())
+        moves = np.isin(np.arange(each), varying)
         return bool(any(near) and ((changes > EXACT * spread.max()) == moves).all())
 
     def reason(self, place: str, varying: Sequence[int], still: Sequence[int]) -> str:

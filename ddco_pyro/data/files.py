@@ -9,6 +9,7 @@ import json
 import math
 import os
 import platform
+import secrets
 import shutil
 import stat
 import tempfile
@@ -153,6 +154,9 @@ def _check_writable(output: Output) -> None:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES)) from error
 
 
+_TEMPORARY = ".tmp"
+
+
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
     """A temporary file that replaces ``path`` when the block ends without an error.
@@ -162,27 +166,46 @@ def whole_file(path: Path) -> Iterator[Path]:
     :raises NoSpace: the disk is full.
     :raises NotWritable: nothing may be written there.
     """
+    if path.exists() and not path.is_file():
+        raise Output("", path).refused("is no regular file")
+    with _whole(path) as temporary:
+        temporary.touch()
+        yield temporary
+
+
+@contextmanager
+def whole_folder(path: Path) -> Iterator[Path]:
+    """A temporary folder that replaces ``path`` when the block ends without an error, as :func:`whole_file` does."""
+    with _whole(path) as temporary:
+        temporary.mkdir()
+        yield temporary
+
+
+@contextmanager
+def _whole(path: Path) -> Iterator[Path]:
+    """A temporary path for what is to replace ``path``; those that killed processes of this machine left go."""
     with _explained(path):
-        if path.exists() and not path.is_file():
-            raise Output("", path).refused("is no regular file")
-        place = _target(path)
-        handle, name = tempfile.mkstemp(prefix=_prepared(place), suffix=_TEMPORARY, dir=place.parent)
-        os.close(handle)
-        temporary = Path(name)
+        place = Path(os.path.realpath(path)) if path.is_symlink() else path
+        place.parent.mkdir(parents=True, exist_ok=True)
+        for old in place.parent.glob(f"{glob.escape(_prefix(place))}*{_TEMPORARY}"):
+            process = old.name.removeprefix(_prefix(place)).partition("-")[0]
+            if process.isdecimal() and not Path(f"/proc/{process}").exists():
+                _remove(old)
+        temporary = place.with_name(f"{_prefix(place)}{os.getpid()}-{secrets.token_hex(4)}{_TEMPORARY}")
+        replaced = temporary.with_name(f"{temporary.name}{_TEMPORARY}")
         try:
             yield temporary
-            _flush(temporary)
-            temporary.chmod(0o644)
-            temporary.replace(place)
+            for part in (temporary, *temporary.rglob("*")):
+                _flush(part)
+            temporary.chmod(0o755 if temporary.is_dir() else 0o644)
+            if place.is_dir():
+                place.rename(replaced)
+            temporary.rename(place)
         finally:
-            temporary.unlink(missing_ok=True)
-
-
-def _target(path: Path) -> Path:
-    return Path(os.path.realpath(path)) if path.is_symlink() else path
-
-
-_TEMPORARY = ".tmp"
+            if replaced.exists() and not place.exists():
+                replaced.rename(place)
+            _remove(replaced)
+            _remove(temporary)
 
 
 def _flush(path: Path) -> None:
@@ -191,44 +214,8 @@ def _flush(path: Path) -> None:
             os.fsync(written.fileno())
 
 
-@contextmanager
-def whole_folder(path: Path) -> Iterator[Path]:
-    """A temporary folder that replaces ``path`` when the block ends without an error.
-
-    :raises NoSpace: the disk is full.
-    :raises NotWritable: nothing may be written there.
-    """
-    with _explained(path):
-        place = _target(path)
-        temporary = Path(tempfile.mkdtemp(prefix=_prepared(place), suffix=_TEMPORARY, dir=place.parent))
-        replaced = temporary.with_name(f"{temporary.name}{_TEMPORARY}")
-        try:
-            yield temporary
-            for file in temporary.rglob("*"):
-                _flush(file)
-            temporary.chmod(0o755)
-            if place.exists():
-                place.rename(replaced)
-            temporary.rename(place)
-        finally:
-            if replaced.exists() and not place.exists():
-                replaced.rename(place)
-            for old in (replaced, temporary):
-                shutil.rmtree(old, ignore_errors=True)
-
-
-def _prepared(place: Path) -> str:
-    """The prefix of this process's temporary names beside ``place``, after cleaning up.
-
-    Temporary files that killed processes of this machine left for ``place`` are removed.
-    """
-    place.parent.mkdir(parents=True, exist_ok=True)
-    prefix = _prefix(place)
-    for old in place.parent.glob(f"{glob.escape(prefix)}*{_TEMPORARY}"):
-        process = old.name.removeprefix(prefix).partition("-")[0]
-        if process.isdecimal() and not Path(f"/proc/{process}").exists():
-            shutil.rmtree(old, ignore_errors=True) if old.is_dir() else old.unlink(missing_ok=True)
-    return f"{prefix}{os.getpid()}-"
+def _remove(path: Path) -> None:
+    shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
 
 
 def _prefix(place: Path) -> str:

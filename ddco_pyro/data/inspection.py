@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ddco_pyro.data.arrays import LARGEST, NUMBERS, LazyArray, Observed, blocks, network_input, usable
-from ddco_pyro.data.coincidences import Copies, Jumps, Leaks
+from ddco_pyro.data.coincidences import CLOCKS, Jumps, Leaks, copies
 from ddco_pyro.data.controls import (
     FEWEST,
     MOST_DIMENSIONS,
@@ -34,13 +34,6 @@ from ddco_pyro.data.likeness import EXCLUDE, Likeness, reasons_told
 from ddco_pyro.data.sources import Source, open_source
 from ddco_pyro.data.sources.metadata import clock_fault
 from ddco_pyro.spec import ControlSpec
-
-WIDEST = 10_000
-"""Largest array, in numbers per step, of which a demonstration is read at once, and compared with controls."""
-
-
-CLOCKS = {"timestamp", "timestamps", "time", "clock"}
-"""Keys of observations that are clocks."""
 
 GAP = 3.0
 """A clock among observations has a gap where a step is so many times as long as the median; computers are late."""
@@ -176,7 +169,7 @@ class Inspection:
     :param relative_to: the observation of which the control is a target; None without one.
     :param excluded: names of demonstrations that were skipped.
     :param unreadable: names of demonstrations that could not be read.
-    :param clocks: the demonstration with the first fault of each clock among observations, and the fault, by place.
+    :param clocks: a line for the first fault of each clock among observations, by place.
     :param turns: the angles in radians and the first numbers of quaternions that jump, by place of the array.
     :param odd: names of demonstrations that are dead, unlike the others, or change the kind of a control dimension, and
         why.
@@ -197,8 +190,8 @@ class Inspection:
     excluded: tuple[str, ...] = ()
     unreadable: list[str] = field(default_factory=list)
     odd: Mapping[str, str] = field(default_factory=dict)
-    turns: Mapping[str, tuple[tuple[int, ...], tuple[int, ...]]] = field(default_factory=dict)
-    clocks: dict[str, tuple[str, str]] = field(default_factory=dict)
+    turns: dict[str, tuple[tuple[int, ...], tuple[int, ...]]] = field(default_factory=dict)
+    clocks: dict[str, str] = field(default_factory=dict)
     attributes: dict[str, Mapping[str, Attribute]] = field(default_factory=dict)
 
     @property
@@ -219,11 +212,11 @@ class Inspection:
     @property
     def times(self) -> list[str]:
         """A line for each clock with a fault, and for a rate that may be a period in milliseconds."""
-        clocks = [f"{place} {fault}, in {name}" for place, (name, fault) in self.clocks.items()]
-        if self.frequency is None or self.frequency > SLOWEST:
-            return clocks
-        asked = f'if its dt is in milliseconds, write file.attrs["control_frequency"] = {1000 * self.frequency:.4g}'
-        return [f"a step lasts {1 / self.frequency:.4g} s by the file: {asked}", *clocks]
+        asked = []
+        if self.frequency is not None and self.frequency <= SLOWEST:
+            said = f'if its dt is in milliseconds, write file.attrs["control_frequency"] = {1000 * self.frequency:.4g}'
+            asked = [f"a step lasts {1 / self.frequency:.4g} s by the file: {said}"]
+        return [*asked, *self.clocks.values()]
 
     @property
     def observations(self) -> list[Field]:
@@ -281,7 +274,8 @@ class _Inspector:
         self.source, self.found = source, found
         self.problems: dict[tuple[str, str], list[str]] = {}  # messages by kind and subject
         self.controls: dict[str, np.ndarray] = {}
-        self.copies, self.leaks, self.likeness = Copies(), Leaks(), Likeness()
+        self.digests: dict[str, Any] = {}
+        self.leaks, self.likeness = Leaks(), Likeness()
         self.jumps: dict[str, Jumps] = {}
 
     def read(self, names: Sequence[str]) -> None:
@@ -293,7 +287,7 @@ class _Inspector:
             except DemonstrationsError as error:
                 self._problem("unreadable", str(error), re.sub(r"\d+", "", str(error).removeprefix(name)))
                 found.unreadable.append(name)
-                self.copies.digests.pop(name, None)
+                self.digests.pop(name, None)
                 self.controls.pop(name, None)
                 self.likeness.discard(name)
         for name, there in places.items():
@@ -303,31 +297,33 @@ class _Inspector:
         found.control = control_dimensions(self.controls)
         odd = self.likeness.unlike() | self._odd(found.control)
         found.odd = {name: odd[name] for name in found.lengths if name in odd}
-        varying = [dimension.number for dimension in found.control if not dimension.constant]
         kinds = (
             messages[0] if len(messages) == 1 else f"{messages[0]}; the first of {len(messages)} such"
             for messages in self.problems.values()
         )
         found.problems = [*kinds, *_problems_of_division(self.source, names, found.masks), *_problems(found)]
-        ends = {place: (fields[place].minimum, fields[place].maximum) for place in self.jumps}
-        turns = {
-            place: (tuple(jumps.angles(*ends[place])["2π"]), tuple(jumps.quaternions))
-            for place, jumps in self.jumps.items()
-        }
-        found.turns = {place: each for place, each in turns.items() if any(each)}
-        seen = [array for array in found.observations if found.everywhere(array)]
+        self._coincidences()
+
+    def _coincidences(self) -> None:
+        """What of the demonstrations coincides, and the control minus what it is a target of."""
+        found = self.found
+        varying = [dimension.number for dimension in found.control if not dimension.constant]
         reasons = {array.place: self.leaks.reason(array.place, varying, array.constant) for array in found.observations}
         found.leaks = {place: why for place, why in reasons.items() if why}
         if not any(dimension.integer or len(dimension.values) == 2 for dimension in found.control):
-            followed = (one.key for one in seen if not reasons[one.place] and self.leaks.followed(one.place, varying))
-            found.relative_to = next(followed, None)
+            seen = (one for one in found.observations if found.everywhere(one) and not reasons[one.place])
+            found.relative_to = next((one.key for one in seen if self.leaks.followed(one.place, varying)), None)
         if (key := found.relative_to) is not None:
             found.control = control_dimensions({name: self.source.read(name).controls(key) for name in self.controls})
-        found.coincidences = (
-            *self.copies.notes(found.masks),
-            *self.leaks.notes(varying, {*found.leaks, f"obs/{key}"}),
-            *(note for place, jumps in self.jumps.items() for note in jumps.notes(place, *ends[place])),
-        )
+        lines = [
+            *copies(self.digests, found.masks), *self.leaks.notes(varying, {*found.leaks, f"obs/{key}"})
+        ]  # fmt: skip
+        for place, jumps in self.jumps.items():
+            low, high = found.fields[place].minimum, found.fields[place].maximum
+            lines += jumps.notes(place, low, high)
+            if any(turns := (tuple(jumps.angles(low, high)["2π"]), tuple(jumps.quaternions))):
+                found.turns[place] = turns
+        found.coincidences = tuple(lines)
 
     def _odd(self, dimensions: Sequence[ControlDimension]) -> dict[str, str]:
         """Names of demonstrations to exclude, and why.
@@ -344,10 +340,8 @@ class _Inspector:
         if len(others) <= most_few(len(self.found.lengths)):
             reasons |= dict.fromkeys(others, "all commands are the same")
         for dimension in dimensions:
-            for name in () if dimension.values else dimension.exceptions:
-                reasons.setdefault(
-                    name, f"control dimension {dimension.number} has further values there, and is a switch elsewhere"
-                )
+            why = f"control dimension {dimension.number} has further values there, and is a switch elsewhere"
+            reasons = {**dict.fromkeys(() if dimension.values else dimension.exceptions, why), **reasons}
         return reasons
 
     def _name_labels(self) -> None:
@@ -362,7 +356,7 @@ class _Inspector:
         """Read a demonstration; the places of its arrays."""
         demo = self.source.read(name)
         self.found.lengths[name], self.found.attributes[name] = len(demo), demo.attributes
-        self.copies.digests[name] = hashlib.sha256()
+        self.digests[name] = hashlib.sha256()
         arrays = demo.arrays()
         for place, array in arrays.items():
             field = self.found.fields.get(place) or Field(place, array.shape[1:], array.dtype, np.zeros(0), np.zeros(0))
@@ -378,16 +372,14 @@ class _Inspector:
 
     def _read_array(self, field: Field, array: Observed, name: str) -> None:
         """Feed an array to every statistic: in blocks, and whole if its steps are narrow."""
-        narrow = field.place == "actions" or math.prod(field.shape) <= WIDEST
+        narrow = field.place == "actions" or math.prod(field.shape) <= MOST_DIMENSIONS
         array, step, first = np.asarray(array) if narrow else array, 0, np.zeros((0, 0))
-        label, digest = field.place.startswith("labels/"), self.copies.digests[name]
-        if not label:
-            digest.update(field.place.encode())
+        label, digest = field.place.startswith("labels/"), self.digests[name]
+        digest.update(b"" if label else field.place.encode())
         for block in blocks(array):
             values = block.reshape(len(block), -1)
             first = first if step else values[:1].copy()
-            if not label:
-                digest.update(np.ascontiguousarray(values).tobytes())
+            digest.update(b"" if label else np.ascontiguousarray(values).tobytes())
             field.add(values, name, step, first)
             step += len(values)
         if label or not step or not isinstance(array, np.ndarray):
@@ -401,7 +393,7 @@ class _Inspector:
             self.leaks.add(field.place, values, self.controls[name].reshape(len(values), -1))
             clock = field.key.rpartition("/")[2] in CLOCKS and values.shape[1] == 1
             if clock and (fault := clock_fault(values[:, 0].astype(np.float64), GAP)):
-                self.found.clocks.setdefault(field.place, (name, fault))
+                self.found.clocks.setdefault(field.place, f"{field.place} {fault}, in {name}")
         if field.dtype.kind == "f" and values.shape[1] <= MOST_DIMENSIONS:
             self.jumps.setdefault(field.place, Jumps(values.shape[1])).add(values, name)
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import lru_cache, partial
 from itertools import islice
@@ -208,7 +208,9 @@ class LeRobot:
                 wrong = ~(np.abs(times - expected) < 0.5 / frequency)
                 if wrong.any():
                     at = int(wrong.argmax())
-                    usual = f"is {times[at]:.6g} in row {at}, not {expected[at]:.6g}; correct it, or fps in meta/info.json"
+                    usual = (
+                        f"is {times[at]:.6g} in row {at}, not {expected[at]:.6g}; correct it, or fps in meta/info.json"
+                    )
                     raise DemonstrationsError(f"{rows.path}: {rows.name}: {column} {clock_fault(times) or usual}")
 
     def _observation(self, rows: _Rows, key: str, index: int) -> Observed:

@@ -74,7 +74,12 @@ def open_minari(path: Path, actions: Sequence[str] = ()) -> Iterator[Source]:
         return Demonstration.stored(name, observations, control, {}, {"episode_index": index, **seed})
 
     files = tuple(sorted(path for path in folder.rglob("*") if path.is_file()))
-    yield Source(tuple(f"demo_{index}" for index in sorted(stored)), read, files, attributes={"dataset_id": str(storage.metadata.get("dataset_id", ""))})
+    yield Source(
+        tuple(f"demo_{index}" for index in sorted(stored)),
+        read,
+        files,
+        attributes={"dataset_id": str(storage.metadata.get("dataset_id", ""))},
+    )
 
 
 def _control(folder: Path, nested: Any, chosen: Sequence[str], where: str) -> np.ndarray:
