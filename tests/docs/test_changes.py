@@ -1,0 +1,141 @@
+"""The changes that docs/architecture.md promises: made in a copy of the library, each is a new file and one row."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+from scipy import stats
+
+ROOT = Path(__file__).parents[2]
+
+LAPLACE = '''
+"""A control whose dimensions have Laplace distributions: a ~ Laplace(μ, σ)."""
+import math
+from typing import ClassVar
+from ddco_pyro.model.emissions.gaussian import Gaussian, continuous_control
+
+class Laplace(Gaussian):
+    helpers: ClassVar = (continuous_control,)
+
+    @classmethod
+    def of(cls, part, numbers, parameters, log_scale, ends):
+        return cls(numbers, parameters[..., : len(part.dims)], log_scale)
+
+    def by_dimension(self, actions):
+        errors = (actions.unsqueeze(-2) - self.mean).abs() / self.std
+        return -errors - self.std.log() - self.log_scale - math.log(2)
+
+    def log_density(self, actions):
+        return self.by_dimension(actions).sum(-1)
+'''
+
+NETWORK = '''
+"""A linear network whose weights come in pairs of products."""
+import torch
+from torch import nn
+
+class Squared(nn.Module):
+    def __init__(self, shape, outputs, copies):
+        super().__init__()
+        self.size, self.weight = (copies, outputs), nn.Parameter(torch.randn(shape.vector, copies * outputs))
+
+    def forward(self, inputs):
+        return (inputs.vector @ self.weight.square()).unflatten(-1, self.size)
+'''
+
+NPZ = '''
+"""Demonstrations of equal length in an .npz file: ``place`` [N, T, D] and ``actions`` [N, T, A]."""
+from contextlib import contextmanager
+import numpy as np
+from ddco_pyro.data.demonstration import Demonstration
+from ddco_pyro.data.sources import Source
+
+@contextmanager
+def open_npz(path):
+    with np.load(path) as arrays:
+        each = dict(enumerate(zip(arrays["place"], arrays["actions"])))
+
+    def read(name):
+        place, actions = each[int(name.removeprefix("demo_"))]
+        return Demonstration.stored(name, {"place": place}, actions)
+
+    yield Source(tuple(f"demo_{n}" for n in each), read, (path,))
+'''
+
+CHANGES = {
+    "model/emissions/laplace.py": (LAPLACE, "spec/settings.py", '"student",', '"student", "laplace",'),
+    "../squared.py": (NETWORK, None, "", ""),  # a spec names a class wherever it lies
+    "data/sources/npz.py": (
+        NPZ,
+        "data/formats.py",
+        "FORMATS = {",
+        'FORMATS = {"npz": Format("npz:open_npz", lambda path, names: path.suffix == ".npz", "an .npz file"),',
+    ),
+}
+"""A new file, and the table with the row that names it: what stands there, and with the row."""
+
+SPEC = {
+    "demonstrations": {"path": "mine.hdf5"},
+    "observations": ["place"],
+    "control": {"kind": "laplace", "std": 0.5},
+    "hierarchy": {
+        "levels": [{"count": 2, "policy": {"network": "squared:Squared"}, "termination": {"network": "linear"}}],
+        "meta_policy": {"network": "linear"},
+    },
+    "training": {"epochs": 2, "optimizer": {"name": "adam"}},
+}
+
+
+@pytest.fixture(scope="module")
+def changed(tmp_path_factory):
+    """A folder with a copy of the library, in which every change has been made."""
+    folder = tmp_path_factory.mktemp("changed")
+    library = folder / "ddco_pyro"
+    shutil.copytree(ROOT / "ddco_pyro", library)  # with what is compiled of it
+    for name, (content, table, before, after) in CHANGES.items():
+        (library / name).write_text(content)
+        if table:
+            text = (library / table).read_text()
+            assert text.count(before) == 1
+            (library / table).write_text(text.replace(before, after))
+    return folder
+
+
+ALL = """
+import sys
+import torch
+from ddco_pyro.cli.app import main
+from ddco_pyro.model.emissions import KINDS
+for words in (
+    "import mine.npz --out mine.hdf5",
+    "fit spec.yaml --out run --allow-code",
+    "segment run mine.hdf5 --csv steps.csv --allow-code",
+):
+    sys.argv = ["ddco-pyro", *words.split()]
+    try:
+        main()
+    except SystemExit as ended:
+        assert not ended.code, words
+one = KINDS["laplace"](torch.ones(1, 2), torch.full((2,), 0.5), torch.zeros(2))
+print(one.log_density(torch.tensor([0.0, 3.0])).item())
+"""
+
+
+def test_a_distribution_a_network_and_formats_are_a_file_and_a_row_each(changed):
+    random = np.random.default_rng(0)
+    place = random.normal(size=(6, 10, 2))
+    np.savez(changed / "mine.npz", place=place, actions=2 * place + random.laplace(size=place.shape))
+    (changed / "spec.yaml").write_text(yaml.safe_dump(SPEC))
+    environment = {**os.environ, "PYTHONPATH": str(changed)}
+    done = subprocess.run([sys.executable, "-c", ALL], cwd=changed, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert float(done.stdout.split()[-1]) == pytest.approx(stats.laplace(1, 0.5).logpdf([0, 3]).sum())
+    assert len(pd.read_csv(changed / "steps.csv")) == 60
