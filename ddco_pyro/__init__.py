@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from ddco_pyro.fitting.fitted import Fit as Fit
     from ddco_pyro.fitting.fitted import load as load
     from ddco_pyro.inference.marginal import EliminatedAHMM as EliminatedAHMM
-    from ddco_pyro.segmenting import segment as segment
+    from ddco_pyro.segmenting.segments import segment as segment
     from ddco_pyro.selection import select as select
     from ddco_pyro.spec import Spec as Spec
     from ddco_pyro.spec import load_spec as load_spec
@@ -40,7 +40,7 @@ _PLACES = {
     "fit": "fitting.fit",
     "load": "fitting.fitted",
     "load_spec": "spec",
-    "segment": "segmenting",
+    "segment": "segmenting.segments",
     "select": "selection",
 }
 _ROOMS = ("encoding", "inference")

@@ -19,7 +19,7 @@ from typing import Annotated, Any
 
 import typer
 
-from ddco_pyro.cli import NARROW, demos, fits, label, runs, starting
+from ddco_pyro.cli import NARROW, checking, demos, fits, label, runs, starting
 from ddco_pyro.errors import BadInput, Failed, reason
 
 app = typer.Typer(
@@ -66,7 +66,7 @@ def top(
 
 
 for command, example in EXAMPLES.items():
-    app.command(example.partition(" ")[0], epilog=f"Example: ddco-pyro {example}")(command)
+    app.command(example.partition(" ")[0], epilog=f"Example: ddco-pyro {example}")(checking(command))
 
 
 def main() -> None:

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from ddco_pyro.cli import AllowCode, Overrides, SpecPath, out_file, written
-from ddco_pyro.data.files import Output, check_outputs, write_text
+from ddco_pyro.cli import AllowCode, Overrides, SpecPath, out_file, out_stream, written
+from ddco_pyro.data.files import write_text
 from ddco_pyro.data.formats import FORMATS
 from ddco_pyro.errors import BadInput, Failed, command
 from ddco_pyro.spec import Spec, SpecError, load_spec, parse_spec
@@ -44,7 +44,6 @@ def collect(
     from ddco_pyro.simulation.collect import collect as record
 
     file = out or loaded.demonstrations.file
-    check_outputs([Output("--out", file, "file")] if file else [], [spec])
     with console.Progress() as progress:
         print(record(loaded.demonstrated_task, loaded.demonstrations, file, progress, loaded.observed))
 
@@ -97,7 +96,7 @@ def _compare_annotators(first: Path, second: Path, tolerance: int, as_json: bool
 
 def init(
     file: SourcePath,
-    out: Annotated[Path, written(out_file, "Where to write the spec.")] = Path("spec.yaml"),
+    out: Annotated[Path, written(out_stream, "Where to write the spec.")] = Path("spec.yaml"),
     hold_out_by: Annotated[
         str | None,
         typer.Option(
@@ -138,7 +137,6 @@ def write_spec(
     from ddco_pyro.data.sources import refuse_foreign
     from ddco_pyro.data.starting import starting_spec
 
-    check_outputs([Output("--out", out)], [file])
     if out.exists() and not force:
         raise BadInput(f"{out}: exists; choose another --out, or replace it with --force")
     facts = look(file)
@@ -231,7 +229,6 @@ def import_(
 
     if labels is None and (fps or columns or unit):
         raise BadInput("--fps, --columns and --unit are about the table of --labels; give it, or --hz for another rate")
-    check_outputs([Output("--out", out, "file")], [source, *([labels] if labels else [])])
     size = (image_size, image_size) if image_size else None
     table = LabelTable(labels, _columns(columns), unit, fps) if labels else None
     choice = Choice(tuple(observations), mask, videos, size, hz, skip_broken, tuple(actions), table)
@@ -279,7 +276,6 @@ def encode(
     from ddco_pyro.cli import console
     from ddco_pyro.encoding import encode as write
 
-    check_outputs([Output("--out", out, "file")], [file])
     with console.Progress("encoding") as progress:
         about = write(file, out, observation, encoder, size, name, progress, allow_code).about
     of = f"{about.size} of {about.features} features, {about.explained:.1%} of their variance"

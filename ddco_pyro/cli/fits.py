@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ddco_pyro.cli import AllowCode, Overrides, SpecPath, out_folder, written
-from ddco_pyro.data.files import Output, check_outputs
 from ddco_pyro.errors import BadInput, Failed, command
 from ddco_pyro.events import Event, Log
 from ddco_pyro.jobs import Workers
@@ -122,7 +121,6 @@ def fit_and_report(
 
     if seeds is not None:
         check_seeds(loaded, seeds)
-    _check_folder(folder, spec, loaded)
     repeated = () if seeds is None else ("--seeds", str(seeds))
     more = [word for name in logs for word in ("--log", name)]
     logged = [Log(name, folder, loaded.model_dump(mode="json"), console.say) for name in logs]
@@ -176,7 +174,6 @@ def select(
     from ddco_pyro.cli import console
     from ddco_pyro.fitting.fit import fit as fitted_to
 
-    _check_folder(folder, spec, loaded)
     demos = selection.known_demonstrations(loaded)
     selection.check(loaded, demos)  # before anything is collected, trained or written
     again = command("select", folder / "spec.yaml", "--out", folder, "--resume", *_allowed(loaded))
@@ -195,12 +192,6 @@ def select(
     console.warnings(fitted)
     print(f"selection: {folder / 'selection.json'}")
     print(f"report: {write_report(fitted, fitted.demonstrations)}")
-
-
-def _check_folder(folder: Path, spec: Path, loaded: Spec) -> None:
-    """Check that the folder of a fit or a selection may be written."""
-    file = loaded.demonstrations.file
-    check_outputs([Output("--out", folder, "folder")], [spec, *([file] if file else [])])
 
 
 @contextmanager

@@ -3,25 +3,16 @@
 from __future__ import annotations
 
 import webbrowser
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from ddco_pyro.cli import AllowCode, Level, demos, out_file, runs, written
+from ddco_pyro.cli import AllowCode, Level, demos, out_file, written
 from ddco_pyro.cli.starting import refuse_other
 from ddco_pyro.data.files import Output, check_outputs
 from ddco_pyro.errors import BadInput
 from ddco_pyro.spec import load_spec
-
-if TYPE_CHECKING:
-    from ddco_pyro.fitting.fitted import Fit
-    from ddco_pyro.labelling.session import Exporter
-    from ddco_pyro.segmenting import Segmented
-
-SUFFIXES = {"--mimicgen": ".hdf5", "--isaac": ".hdf5"}
-"""Of the files of formats whose name says none."""
 
 
 def label(
@@ -68,7 +59,7 @@ def label(
             webbrowser.open(listening.address)
 
     with one_thread():  # a demonstration is inferred sooner so, and a refit has a core of its own
-        session = Session(load(run, allow_code), file, place, level, _exporters(run, file))
+        session = Session(load(run, allow_code), file, place, level)
         session.journal.at(listening.address)
         session.begin()
         print(serve(session, listening, ready))
@@ -92,22 +83,3 @@ def _fitted(file: Path) -> Path:
         with console.Progress() as progress:
             fit(load_spec(spec, ["compare_with=[]"]), None, run, progress)
     return run
-
-
-def _exporters(run: Path, file: Path) -> dict[str, Exporter]:
-    """What writes each format of an HDF5 file, but the copy with labels, which is saved anyway."""
-    offered = [option for option, form in runs.FORMATS.items() if option != "--out" and form.takes != "lerobot"]
-    return {option[2:]: partial(_export, option, run, file) for option in offered}
-
-
-def _export(option: str, run: Path, file: Path, segmented: Segmented, fit: Fit, folder: Path, level: str) -> Path:
-    from ddco_pyro.data.sources import open_source
-    from ddco_pyro.segmenting.formats import Asked
-
-    suffix = "" if runs.FORMATS[option].kind == "folder" else SUFFIXES.get(option, f".{option[2:]}")
-    place = folder / f"segments{suffix}"
-    with open_source(file) as source:
-        asked = Asked(option, place, fit, run, file, source, level)
-        runs.check_format(asked)
-        runs.write_format(asked, segmented)
-    return place

@@ -6,23 +6,20 @@ import shlex
 import sys
 import time
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
-from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ddco_pyro.cli import BRACKET, AllowCode, Overrides, RunPath, out_file, out_folder, written
+from ddco_pyro.cli import BRACKET, KINDS, AllowCode, Overrides, RunPath, out_folder, written
 from ddco_pyro.data.files import Output, check_outputs
 from ddco_pyro.errors import BadInput
+from ddco_pyro.segmenting.formats import FORMATS, check_format, write_format
 
 if TYPE_CHECKING:
     from ddco_pyro.data.sources import Source
     from ddco_pyro.exporting import Exported
     from ddco_pyro.fitting.fitted import Fit
-    from ddco_pyro.segmenting import Segmented
-    from ddco_pyro.segmenting.formats import Asked
 
 FILMED = 3
 """Episodes of each method that ``rollout --video`` films."""
@@ -51,7 +48,6 @@ def compare(
     from ddco_pyro.comparison import page
 
     folder = out or Path("runs") / time.strftime("compare-%Y%m%d-%H%M%S")
-    check_outputs([Output("--out", folder / name) for name in page.FILES], runs)
     compared = compare_runs(runs, allow_code)
     for table in (page.run_table(compared), page.agreement_table(compared), page.rollout_table(compared)):
         if table is not None:
@@ -116,60 +112,10 @@ def _check_run(run: Path, *names: str) -> None:
 # --- segment and export -----------------------------------------------------------------------------------------------
 
 
-class Format(NamedTuple):
-    """A format of segments.
-
-    :param write: its function in :mod:`ddco_pyro.segmenting.formats`, ``module:function``.
-    :param text: what is written, in words.
-    :param takes: the format of demonstrations that it copies; empty where it takes any.
-    :param check: the function that refuses demonstrations and places; empty where none does.
-    :param extra: of this project, where the format needs a package: a key of :data:`PACKAGES`.
-    """
-
-    kind: Literal["file", "folder", "stream"]
-    write: str
-    text: str
-    takes: Literal["", "robomimic", "lerobot"] = ""
-    check: str = ""
-    extra: str = ""
-
-
-PACKAGES = {"lerobot": "pyarrow", "rerun": "rerun"}
-
-FORMATS = {
-    "--html": Format("stream", "tables:write_html", "A page with the timeline of every demonstration."),
-    "--csv": Format("stream", "tables:write_csv", "A table with a row for each step."),
-    "--parquet": Format("stream", "tables:write_parquet", "The same table as Parquet.", extra="lerobot"),
-    "--out": Format(
-        "file", "labels:write", "A copy of the HDF5 file with labels for each step.", "robomimic", "labels:check"
-    ),
-    "--lerobot": Format(
-        "folder",
-        "lerobot:write_subtasks",
-        "A copy of a LeRobot dataset with subtasks.",
-        "lerobot",
-        "lerobot:check_bare",
-    ),
-    "--sarm": Format(
-        "folder", "lerobot:write_stages", "The same with the stages of SARM's reward model.", "lerobot", "lerobot:check"
-    ),
-    "--mimicgen": Format(
-        "file", "mimicgen:write", "A copy of a prepared file with MimicGen's signals.", "robomimic", "mimicgen:check"
-    ),
-    "--isaac": Format("file", "mimicgen:write", "The same for Isaac Lab Mimic.", "robomimic", "mimicgen:check"),
-    "--label-studio": Format("folder", "annotations:write_label_studio", "Predictions for Label Studio."),
-    "--elan": Format("folder", "annotations:write_elan", "ELAN's .eaf of each demonstration."),
-    "--rerun": Format("folder", "annotations:write_rerun", "Rerun's .rrd of each demonstration.", extra="rerun"),
-}
-"""Every format, by its option of ``segment``. A new one is a function, a row here and a parameter there."""
-
-TAKEN = {"robomimic": "HDF5 file in robomimic's layout", "lerobot": "LeRobot dataset"}
-
-
 def _to(option: str) -> Any:
     """The option of a format."""
     form = FORMATS[option]
-    parser = out_folder if form.kind == "folder" else out_file
+    (parser,) = (parser for parser, kind in KINDS.items() if kind == form.kind)
     return written(parser, form.text, rich_help_panel="Formats")
 
 
@@ -220,11 +166,10 @@ def segment(
 
     DEMOS is changed with --in-place only.
     """
-    paths = zip(
-        FORMATS, (html, csv, parquet, out, lerobot, sarm, mimicgen, isaac, label_studio, elan, rerun), strict=True
-    )
-    places = [Output(option, path, FORMATS[option].kind) for option, path in paths if path]
-    if not (places or in_place or baselines):
+    given = locals()
+    named = {option: given[option[2:].replace("-", "_")] for option in FORMATS} | {"--in-place": in_place and demos}
+    places = {option: path for option, path in named.items() if path}
+    if not (places or baselines):
         raise BadInput(
             "name what to write, such as --html PAGE or --csv FILE; labels for each step go to --out FILE (a copy) or "
             "with --in-place into DEMOS; --baselines measures agreement with labels"
@@ -232,16 +177,15 @@ def segment(
     if out and in_place:
         raise BadInput("--out and --in-place exclude each other; keep one")
     if in_place:
-        places.append(Output("--in-place", demos, "file"))
+        check_outputs([Output("--in-place", demos, "file")])
     from ddco_pyro.cli import console
     from ddco_pyro.data.sources import open_source
     from ddco_pyro.evaluation.agreement import agreement_table, tolerances
     from ddco_pyro.fitting.fitted import load
-    from ddco_pyro.segmenting import baseline_labels, beside_baselines, segments
     from ddco_pyro.segmenting.baselines import BASELINES, check_installed
-    from ddco_pyro.segmenting.formats import Asked
+    from ddco_pyro.segmenting.formats.asked import Asked
+    from ddco_pyro.segmenting.segments import baseline_labels, beside_baselines, segments
 
-    check_outputs(places, [run] if in_place else [run, demos])
     fit = load(run, allow_code)
     if level is not None and fit.names and level not in fit.names:
         raise BadInput(f"--level: there is no level {level!r} (there is: {', '.join(fit.names)})")
@@ -249,7 +193,8 @@ def segment(
         beside = baseline_labels(fit) if baselines else ()
         subtasks = level or next(iter(fit.names), "")
         asked = [
-            Asked(place.option, place.path, fit, run, demos, source, subtasks, beside, same_order) for place in places
+            Asked(option, path, fit, run, demos, source, subtasks, beside, same_order)
+            for option, path in places.items()
         ]
         if fit.names:  # without options, segments() refuses the run
             for each in asked:
@@ -276,38 +221,9 @@ def segment(
             print(write_format(each, segmented))
 
 
-def check_format(asked: Asked) -> None:
-    """Check, before anything is segmented, that a format can be written.
-
-    :raises BadInput: the format copies other demonstrations, its place is taken, or a package that it needs is missing.
-    """
-    form = format_of(asked.option)
-    if form.takes not in ("", asked.source.format):
-        raise BadInput(
-            f"{asked.demos}: is no {TAKEN[form.takes]}, which {asked.option} needs; name another format, such as --csv "
-            "or --html"
-        )
-    if form.extra and find_spec(PACKAGES[form.extra]) is None:
-        remedy = f"install it with: pip install 'ddco-pyro[{form.extra}]'"
-        raise BadInput(f"{asked.option} needs {PACKAGES[form.extra]}; {remedy}")
-    if form.check:
-        resolve_name(f"ddco_pyro.segmenting.formats.{form.check}")(asked)
-
-
-def write_format(asked: Asked, segmented: Segmented) -> str:
-    """Write segments in a format, and say what was written."""
-    said: str = resolve_name(f"ddco_pyro.segmenting.formats.{format_of(asked.option).write}")(asked, segmented)
-    return said
-
-
-def format_of(option: str) -> Format:
-    """The format of an option; ``--in-place`` writes what ``--out`` does."""
-    return FORMATS[option.replace("--in-place", "--out")]
-
-
 def _missing_labels(fit: Fit, source: Source) -> str:
     """What is missing to measure agreement, in words; empty where a demonstration has labels of the run's spec."""
-    from ddco_pyro.segmenting import chosen_names
+    from ddco_pyro.segmenting.segments import chosen_names
 
     names = fit.spec.demonstrations.label_names
     if not names:
@@ -343,8 +259,6 @@ def export(
 
     if not (out or lerobot):
         raise BadInput("name what to write: --out FOLDER or --lerobot FOLDER")
-    places = {"--out": out, "--lerobot": lerobot}
-    check_outputs([Output(option, path, "folder") for option, path in places.items() if path], [run])
     fit = load(run, allow_code)
     fit = fit.best if best else fit
     if lerobot:

@@ -13,7 +13,6 @@ from typing import Annotated
 import typer
 
 from ddco_pyro.cli import demos, fits, out_folder, runs, written
-from ddco_pyro.data.files import Output, check_outputs
 from ddco_pyro.errors import BadInput, Failed, command
 from ddco_pyro.spec import load_spec
 
@@ -34,7 +33,6 @@ def new(
     """
     folder = out or Path("runs") / file.stem
     spec, run, page = folder / "spec.yaml", folder / "run", folder / "segments.html"
-    check_outputs([Output("--out", folder, "folder")], [file])
     from ddco_pyro.cli import console
     from ddco_pyro.data.inspection import inspect
 
@@ -78,7 +76,6 @@ def demo(
     from ddco_pyro.data.planted import pick_and_place
     from ddco_pyro.simulation.task import find_task
 
-    check_outputs([Output("--out", out, "folder")])
     file = out / "pick_and_place.hdf5"
     try:
         find_task(TASK)

@@ -12,7 +12,7 @@ from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.inferred import runs
 from ddco_pyro.labelling.document import CONFIRM, FREE, OPEN, PAINT, Change, Document
 from ddco_pyro.labelling.proposals import Shown, first_wrong, labels_shown, sources_shown
-from ddco_pyro.segmenting import SOURCES
+from ddco_pyro.segmenting.segments import SOURCES
 
 LONGEST = 80
 """Characters of a name."""

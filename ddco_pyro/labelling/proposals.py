@@ -24,7 +24,7 @@ from ddco_pyro.labelling.document import CONFIRM, FREE, OPEN, PAINT, Change, Doc
 from ddco_pyro.model.recogniser import Windows
 from ddco_pyro.model.tables import NEVER, Tables
 from ddco_pyro.names import choice_names, label_name, option_name
-from ddco_pyro.segmenting import SOURCES, LevelLabels, Segmented, Segments, segments
+from ddco_pyro.segmenting.segments import SOURCES, LevelLabels, Segmented, Segments, segments
 from ddco_pyro.training.recognition import SHARES, learn
 
 RIDGE = 50.0

@@ -1,20 +1,19 @@
 """The local web server of ``ddco-pyro label``: a :class:`Session` over HTTP, and the page that shows it.
 
-It listens on this machine alone. The first part of every path is a random token; a foreign ``Host`` or ``Origin`` is
-refused.
+It listens on this machine alone. The first part of every path is a random token, and a foreign ``Host`` is refused.
 """
 
 from __future__ import annotations
 
-import json
 import secrets
 import shutil
 import socket
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from importlib.resources import files
+from json import JSONDecodeError
 from pathlib import Path
 from threading import Thread
 from typing import TYPE_CHECKING, Any
@@ -23,15 +22,14 @@ import uvicorn
 from starlette.applications import Starlette
 from starlette.background import BackgroundTask
 from starlette.concurrency import run_in_threadpool
-from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
+from starlette.middleware.base import BaseHTTPMiddleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from ddco_pyro.errors import BadInput, Failed, reason
 
@@ -39,9 +37,6 @@ if TYPE_CHECKING:
     from ddco_pyro.labelling.session import Session
 
 LOOPBACK = "127.0.0.1"
-
-MOST_BYTES = 64 * 2**10
-"""Bytes of a request's body."""
 
 PATIENCE = 2
 """Seconds that requests under way have when the server stops."""
@@ -74,32 +69,22 @@ class Listening:
 
         :raises Failed: the port is taken or not allowed.
         """
-        found = socket.socket()
         try:
-            found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            found.bind((LOOPBACK, port))
-            found.listen()
+            return cls(socket.create_server((LOOPBACK, port)))
         except (OSError, OverflowError) as error:
-            found.close()
             raise Failed(f"port {port}: {reason(OSError(*error.args))}; choose another one with --port") from error
-        return cls(found)
-
-    @property
-    def port(self) -> int:
-        """The port that is listened on."""
-        return int(self.socket.getsockname()[1])
 
     @property
     def address(self) -> str:
         """Where the page is; the token is part of it."""
-        return f"http://{LOOPBACK}:{self.port}/{self.token}/"
+        return f"http://{LOOPBACK}:{self.socket.getsockname()[1]}/{self.token}/"
 
 
 @contextmanager
 def running(session: Session, listening: Listening) -> Iterator[Thread]:
     """Serve a session in a thread while the context lasts."""
     settings = uvicorn.Config(
-        application(session, listening.token, listening.port),
+        application(session, listening.token),
         log_config=None, log_level="critical", lifespan="off", ws="none", server_header=False,
         timeout_graceful_shutdown=PATIENCE,
     )  # fmt: skip
@@ -129,49 +114,30 @@ def serve(session: Session, listening: Listening, ready: Callable[[], None] = la
         session.close()
 
 
-def application(session: Session, token: str, port: int) -> Starlette:
-    """The web application of a session, for requests to ``127.0.0.1:port/token/``."""
+def application(session: Session, token: str) -> Starlette:
+    """The web application of a session, for requests to ``/token/``."""
 
     async def canvas(request: Request) -> Response:
         return FileResponse(str(CANVAS))
 
+    async def headed(request: Request, answer: Callable[[Request], Awaitable[Response]]) -> Response:
+        found = await answer(request)
+        found.headers.update(HEADERS)
+        return found
+
+    async def refused(request: Request, error: Exception) -> Response:
+        status, text = (error.status_code, error.detail) if isinstance(error, HTTPException) else (500, reason(error))
+        return JSONResponse({"error": text}, status)
+
     page = Mount("/", StaticFiles(directory=str(PAGE), html=True))
-    routes = [*_answers(session), Route("/canvas.js", canvas), page]
-    guards = [
-        Middleware(Guard, token=token, port=port),
-        Middleware(TrustedHostMiddleware, allowed_hosts=[LOOPBACK, "localhost"]),
-    ]
     return Starlette(
-        routes=routes, middleware=guards, exception_handlers={HTTPException: _refused, ValueError: _refused}
+        routes=[Mount(f"/{token}", routes=[*_answers(session), Route("/canvas.js", canvas), page])],
+        middleware=[
+            Middleware(BaseHTTPMiddleware, dispatch=headed),
+            Middleware(TrustedHostMiddleware, allowed_hosts=[LOOPBACK, "localhost"]),
+        ],
+        exception_handlers={HTTPException: refused},
     )
-
-
-class Guard:
-    """Refuses requests of others, and gives every answer the headers that keep a browser from harm."""
-
-    def __init__(self, app: ASGIApp, token: str, port: int) -> None:
-        self.app, self.token = app, token
-        self.origins = [None, *(f"http://{host}:{port}" for host in (LOOPBACK, "localhost"))]
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request, or refuse it."""
-
-        async def headed(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                extra = [(name.lower().encode(), value.encode()) for name, value in HEADERS.items()]
-                message = {**message, "headers": [*message["headers"], *extra]}
-            await send(message)
-
-        if scope["type"] != "http":
-            return
-        first, slash, _ = scope["path"].removeprefix("/").partition("/")
-        if Headers(scope=scope).get("origin") not in self.origins:
-            app: ASGIApp = _error(403, "this address is not the page's")
-        elif not slash or not secrets.compare_digest(first.encode(), self.token.encode()):
-            app = _error(404, "there is nothing here")
-        else:
-            app, scope = self.app, {**scope, "root_path": f"/{first}"}
-        await app(scope, receive, headed)
 
 
 def _answers(session: Session) -> list[Route]:
@@ -206,10 +172,9 @@ def _answers(session: Session) -> list[Route]:
 
     def route(path: str, call: Callable[..., Any], method: str) -> Route:
         async def answer(request: Request) -> Response:
-            arguments = [request] if method == "GET" else [await _asked(request)]
             try:
-                found = await run_in_threadpool(call, *arguments)
-            except BadInput as error:
+                found = await run_in_threadpool(call, request if method == "GET" else await request.json())
+            except (BadInput, JSONDecodeError) as error:
                 raise HTTPException(400, reason(error)) from error
             except Exception as error:
                 raise HTTPException(500, reason(error)) from error
@@ -235,32 +200,3 @@ def _answers(session: Session) -> list[Route]:
         *(route(path, call, "GET") for path, call in gets.items()),
         *(route(path, call, "POST") for path, call in posts.items()),
     ]
-
-
-async def _asked(request: Request) -> dict[str, Any]:
-    """The object in a request's body."""
-    if request.headers.get("content-type") != "application/json":
-        raise HTTPException(415, "the body has to be application/json")
-    body = b""
-    async for chunk in request.stream():
-        body += chunk
-        if len(body) > MOST_BYTES:
-            raise HTTPException(413, f"the body is longer than {MOST_BYTES} bytes")
-    try:
-        found = json.loads(body)
-    except (ValueError, RecursionError) as error:
-        raise HTTPException(400, "the body is no JSON") from error
-    if not isinstance(found, dict):
-        raise HTTPException(400, "the body has to be a JSON object")
-    return found
-
-
-def _error(status: int, message: str, headers: Mapping[str, str] | None = None) -> Response:
-    return JSONResponse({"error": message}, status, headers)
-
-
-async def _refused(request: Request, error: Exception) -> Response:
-    """What is said of an error; starlette refuses numbers of thousands of digits by a ValueError."""
-    if isinstance(error, HTTPException):
-        return _error(error.status_code, error.detail, error.headers)
-    return _error(400, reason(error))

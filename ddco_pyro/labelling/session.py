@@ -41,7 +41,8 @@ from ddco_pyro.labelling.proposals import (
 )
 from ddco_pyro.labelling.refitting import refit
 from ddco_pyro.names import option_name
-from ddco_pyro.segmenting import Segmented
+from ddco_pyro.segmenting.formats import FORMATS, check_format, write_format
+from ddco_pyro.segmenting.formats.asked import Asked
 from ddco_pyro.segmenting.formats.labels import check_copy, check_labels, has_labels, write_labels
 
 NEAREST = 5
@@ -49,9 +50,6 @@ NEAREST = 5
 
 UNCERTAIN = 20
 """Boundaries that are named as the most uncertain ones."""
-
-Exporter = Callable[[Segmented, Fit, Path, str], Path]
-"""Writes segments in a format: gets them, the model, a folder and the level; gives the file or folder."""
 
 
 class Session:
@@ -63,7 +61,6 @@ class Session:
     :param path: an HDF5 file of demonstrations.
     :param out: the file of labels; the same as ``path`` to write into it.
     :param level: the lowest one by default.
-    :param exporters: what writes each format, by its name.
     :raises BadInput: the run has no options or no such level, ``out`` is something else, or another process labels it.
     """
 
@@ -73,10 +70,8 @@ class Session:
         path: Path,
         out: Path,
         level: str | None = None,
-        exporters: Mapping[str, Exporter] | None = None,
     ) -> None:
         fit.refuse_flat()
-        self.exporters = exporters or {}
         self.run, self.fit, self.path, self.out = fit, fit, path, out
         self.level = level or next(iter(fit.names))
         if self.level not in fit.names:
@@ -276,7 +271,7 @@ class Session:
             ]
             return {
                 "title": self.path.name,
-                "formats": [*self.exporters],
+                "formats": [*self.formats],
                 "uncertain": self.uncertain,
                 "level": self.level,
                 "levels": [*self.fit.names],
@@ -553,18 +548,30 @@ class Session:
             steps = sum(int(self.document.said(name).sum()) for name in self.demos.names)
             return f"{self.out}: labels/{self.level}, {steps} of {sum(self.document.lengths.values())} steps"
 
+    @cached_property
+    def formats(self) -> list[str]:
+        """Those of ``segment`` that the page offers: all that take the demonstrations, without the copy with labels."""
+        takes = ("", "robomimic")
+        return [option[2:] for option, form in FORMATS.items() if form.takes in takes and option != "--out"]
+
     def export(self, form: str, folder: Path) -> Path:
-        """Write the shown segments in one of ``segment``'s formats into a folder.
+        """Write the shown segments in one of :attr:`formats` into a folder.
 
         :returns: the file or folder that was written.
         :raises BadInput: there is no such format, or it does not fit the demonstrations.
         """
-        if form not in self.exporters:
-            raise BadInput(f"there is no format {form!r}; there is: {', '.join(self.exporters)}")
-        with self.lock, open_source(self.path) as source:
-            named = replace(self.fit, named={**self.fit.named, self.level: self.document.names})
-            segmented = shown_segments(self.fit, source, self.level, self.shown, self.document)
-        return self.exporters[form](segmented, named, folder, self.level)
+        if form not in self.formats:
+            raise BadInput(f"there is no format {form!r}; there is: {', '.join(self.formats)}")
+        about = FORMATS[f"--{form}"]
+        place = folder / f"segments{'' if about.kind == 'folder' else about.suffix or f'.{form}'}"
+        with open_source(self.path) as source:
+            with self.lock:
+                named = replace(self.fit, named={**self.fit.named, self.level: self.document.names})
+                segmented = shown_segments(self.fit, source, self.level, self.shown, self.document)
+            asked = Asked(f"--{form}", place, named, self.run.folder or Path(), self.path, source, self.level)
+            check_format(asked)
+            write_format(asked, segmented)
+        return place
 
     def close(self) -> None:
         """Save, end what is under way, and leave the labels to other processes."""

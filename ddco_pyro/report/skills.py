@@ -36,7 +36,7 @@ from ddco_pyro.names import numbered_name, option_name
 from ddco_pyro.report.inputs import deciding
 from ddco_pyro.report.options import agreeing
 from ddco_pyro.report.trajectories import Activity
-from ddco_pyro.segmenting import Segmented
+from ddco_pyro.segmenting.segments import Segmented
 from ddco_pyro.simulation.film import encoded
 from ddco_pyro.spec import PathSpec
 

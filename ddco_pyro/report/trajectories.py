@@ -22,7 +22,7 @@ from ddco_pyro.drawing.page import Picture
 from ddco_pyro.drawing.shown import LINES, MOST_STRETCHED, in_words, positions, spans, view
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.names import option_name
-from ddco_pyro.segmenting import Segmented, Segments, of_piece, of_run
+from ddco_pyro.segmenting.segments import Segmented, Segments, of_piece, of_run
 from ddco_pyro.spec import PathSpec
 
 

@@ -21,7 +21,7 @@ from ddco_pyro.drawing.words import NAT, duration, number, percent
 from ddco_pyro.evaluation.agreement import EXPLAINED, agreement_table, tolerances
 from ddco_pyro.evaluation.options import on_paths
 from ddco_pyro.names import label_name, numbered_name, option_name
-from ddco_pyro.segmenting import SOURCES, Segmented, Segments
+from ddco_pyro.segmenting.segments import SOURCES, Segmented, Segments
 from ddco_pyro.spec import PathSpec
 
 HOW = (

@@ -328,16 +328,6 @@ def clock(monkeypatch):
     return now
 
 
-def test_more_epochs_than_were_likely_are_not_counted_beyond_the_end(clock, capsys):
-    with console.Progress() as progress:
-        progress(TrainingBegan("ddco", 2))
-        for _ in range(5):
-            progress(EpochEnded(0, "level-1", 1, 1.25, -0.5))
-        progress(TrainingEnded("ddco"))
-    counted = [line.split(",")[0].split(": ")[1] for line in capsys.readouterr().err.splitlines()]
-    assert counted == ["2/2", "4/4", "done after 5"]
-
-
 def test_plain_lines_come_now_and_then_and_at_the_end(clock, capsys):
     with console.Progress() as progress:
         for done in range(1, 8):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import shutil
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,6 @@ from sklearn.metrics import normalized_mutual_info_score
 
 import ddco_pyro
 from ddco_pyro.data.planted import PHASES, pick_and_place
-from ddco_pyro.spec import load_spec
 from ddco_pyro.training.data import train_and_valid
 
 
@@ -33,19 +31,6 @@ def file(tmp_path_factory) -> Path:
 def quick(folder: Path, file: Path) -> None:
     folder.mkdir()
     shutil.copy(file.with_name("spec.yaml"), folder)
-
-
-def test_the_object_goes_to_the_goal() -> None:
-    demos = pick_and_place(5, seed=2)
-    for demo in demos:
-        observed, phase = demo.observations, demo.labels["phase"]
-        assert phase[np.flatnonzero(np.diff(phase, prepend=-1))].tolist() == [0, 1, 2, 3]
-        assert np.linalg.norm(observed["object"][-1] - observed["goal"][-1]) < 0.06
-        assert (observed["object"][phase < 2] == observed["object"][0]).all()
-        np.testing.assert_allclose(np.diff(observed["gripper"], axis=0), demo.actions[:-1, :3])
-        assert set(demo.actions[:, 3]) == {-1.0, 1.0}
-    np.testing.assert_array_equal(pick_and_place(5, seed=2)[3].actions, demos[3].actions)
-    assert not np.array_equal(pick_and_place(1, seed=3)[0].actions, demos[0].actions)
 
 
 def test_one_command_makes_what_four_make(file: Path, tmp_path: Path) -> None:
@@ -105,10 +90,6 @@ def test_a_folder_of_another_file_is_refused(file: Path, tmp_path: Path) -> None
     ended = call("new", tmp_path / "none.hdf5", "--out", tmp_path / "new")
     assert (ended.status, ended.err.count("\n")) == (2, 1)
     assert not (tmp_path / "new").exists()
-
-
-def test_the_demo_of_the_needle_task_has_its_spec() -> None:
-    assert load_spec(Path(str(files("ddco_tasks.needle") / "demo.yaml"))).task == "needle"
 
 
 @pytest.mark.slow

@@ -87,16 +87,6 @@ def test_undo_and_redo_walk_through_all_states(sequence):
         assert said(document) == state
 
 
-def test_what_is_in_a_file_is_named_or_minus_one():
-    document = empty()
-    document.edit([("paint", "demo_0", 1, 5, 2), ("paint", "demo_0", 2, 3, OPEN), ("cut", "demo_0", 4, True)])
-    assert document.labels["demo_0"].tolist() == [FREE, 2, OPEN, 2, 2, FREE]
-    assert document.in_file("demo_0").tolist() == [-1, 2, -1, 2, 2, -1]
-    assert document.said("demo_0").tolist() == [False, True, False, True, True, False]
-    assert document.in_file("demo_1").tolist() == [-1, -1, -1]
-    assert document.cuts == {"demo_0": {4}, "demo_1": set()}
-
-
 @QUICK
 @given(actions, st.data())
 def test_a_journal_torn_at_any_byte_gives_the_state_after_its_whole_lines(tmp_path, sequence, data):

@@ -83,14 +83,6 @@ def test_one_named_demonstration_numbers_the_options_of_the_others(order):
     assert proposals.options.tolist() == [0, 1, 2, 3]
 
 
-def test_a_short_correction_numbers_nothing_anew():
-    fit, demos, truth = planted(8, 40)
-    labels = free(demos)
-    typical = np.median([segment.steps for segment in fit.segment(demos)[0].segments])
-    labels["demo_0"][: int(typical / 2) - 1] = truth["demo_0"][0] % 3 + 1
-    assert Proposals(fit, demos, 1, labels, 3).options.tolist() == [0, 1, 2, 3]
-
-
 def test_another_model_keeps_the_numbers_that_were_shown():
     fit, demos, truth = planted(8, 40)
     before = {name: np.array([0, 3, 1, 2])[own] for name, own in truth.items()}
@@ -205,17 +197,6 @@ def test_labels_of_a_refit_stand_for_the_options_of_their_numbers():
     _, again = after(begun(demos, 3), demos, said, 4)
     assert again.options.tolist() == [0, 1, 2, 3, 4]
     assert right(again, mine, said) > 0.95
-
-
-def test_an_option_that_is_named_anew_wherever_it_would_occur_is_not_waited_for():
-    _, demos, truth = planted(8, 30)
-    mine = {name: np.array([0, 1, 2, 4])[own] for name, own in truth.items()}
-    said = {name: mine[name] if number < 3 else np.full(30, -1) for number, name in enumerate(demos.names)}
-    before = Proposals(begun(demos, 3), demos, 1, said, 3)  # option 4 was new after that
-    assert not before.waiting(said).size
-    again = refit(before.fit, LEVEL, 4, demos, said, free(demos))
-    proposals = Proposals(again, demos, 1, said, 4)
-    assert right(proposals, mine, said) > 0.95
 
 
 def test_a_model_of_several_levels_is_fitted_as_its_spec_says():

@@ -1,6 +1,5 @@
 """The server of ``label``: who may ask, what may be asked, and how it answers what it cannot do."""
 
-import json
 import re
 import socket
 import subprocess
@@ -12,7 +11,6 @@ from io import BytesIO
 from pathlib import Path
 from zipfile import ZipFile
 
-import anyio
 import httpx2
 import pytest
 from killing import HANGS
@@ -21,7 +19,7 @@ from starlette.testclient import TestClient
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.errors import Failed
 from ddco_pyro.labelling.background import Background
-from ddco_pyro.labelling.server import HEADERS, MOST_BYTES, Listening, application
+from ddco_pyro.labelling.server import HEADERS, Listening, application
 from ddco_pyro.labelling.session import Session
 
 TOKEN, PORT = "a-token", 4321
@@ -30,31 +28,16 @@ BASE = f"http://127.0.0.1:{PORT}"
 
 @pytest.fixture
 def session(run, file, tmp_path, monkeypatch):
-    """A session whose refits never end, and which writes two formats."""
+    """A session whose refits never end."""
     monkeypatch.setattr(Background, "_submit", lambda background, call: Future())
-    begun = Session(
-        replace(run, named={}), file, tmp_path / "labels.hdf5", exporters={"csv": one_file, "elan": a_folder}
-    )
+    begun = Session(replace(run, named={}), file, tmp_path / "labels.hdf5")
     yield begun
     begun.close()
 
 
-def one_file(segmented, fit, folder, level):
-    path = folder / "segments.csv"
-    path.write_text(f"{len(segmented.segments)} demonstrations\n")
-    return path
-
-
-def a_folder(segmented, fit, folder, level):
-    path = folder / "segments"
-    path.mkdir()
-    (path / "demo_0.eaf").write_text(f"{len(segmented.segments)} demonstrations\n")
-    return path
-
-
 @pytest.fixture
 def client(session):
-    return TestClient(application(session, TOKEN, PORT), base_url=BASE, follow_redirects=False)
+    return TestClient(application(session, TOKEN), base_url=BASE, follow_redirects=False)
 
 
 def post(client, path, body, **headers):
@@ -62,55 +45,20 @@ def post(client, path, body, **headers):
 
 
 @pytest.mark.parametrize(
-    "path", ["/", "//", "/state", "/another/state", "/a-toke/state", f"/{TOKEN}", f"/x/{TOKEN}/state"]
+    "path", ["/", "/state", "/another/state", "/a-toke/state", f"/{TOKEN}/../state", f"/{TOKEN}/..%2f..%2fserver.py"]
 )
-def test_without_the_token_there_is_nothing(client, path):
+def test_without_the_token_or_outside_the_page_there_is_nothing(client, path):
     answer = client.get(path)
-    assert (answer.status_code, answer.json()) == (404, {"error": "there is nothing here"})
+    assert (answer.status_code, [*answer.json()]) == (404, ["error"])
 
 
-def test_foreign_hosts_and_origins_are_refused_whatever_they_know(client, session):
+def test_foreign_hosts_are_refused_whatever_they_know(client, session):
     step = {"do": "split", "demo": 0, "step": 3}
-    foreign = [{"Host": "evil.example"}, {"Host": f"evil.example:{PORT}"}]
-    foreign += [
-        {"Origin": origin}
-        for origin in ("http://evil.example", "null", "http://127.0.0.1:1", f"https://127.0.0.1:{PORT}")
-    ]
-    for headers in foreign:
-        assert post(client, "edit", step, **headers).status_code in (400, 403), headers
-        assert client.get(f"/{TOKEN}/state", headers=headers).status_code in (400, 403), headers
+    assert post(client, "edit", step, Host="evil.example").status_code == 400
+    assert client.get(f"/{TOKEN}/state", headers={"Host": f"evil.example:{PORT}"}).status_code == 400
     assert not session.document.done
-    assert post(client, "edit", step, Host=f"localhost:{PORT}", Origin=f"http://localhost:{PORT}").status_code == 200
+    assert post(client, "edit", step, Host=f"localhost:{PORT}").status_code == 200
     assert len(session.document.done) == 1
-
-
-OUTSIDE = [
-    "../pyproject.toml", "../../../etc/passwd", "/etc/passwd", "static/app.js", "server.py", "../server.py",
-    "app.js/../../server.py", "page.css\0", "view/-1", "demo/0/picture/x", "demo/0/../0", "export/../state",
-    "export/..%2f",
-]  # fmt: skip
-
-
-@pytest.mark.parametrize("path", OUTSIDE)
-def test_a_path_outside_the_page_is_not_there(session, path):
-    """As it comes over the wire: clients resolve dots themselves."""
-    sent = []
-
-    async def asked():
-        async def receive():
-            return {"type": "http.request", "body": b"", "more_body": False}
-
-        async def send(message):
-            sent.append(message)
-
-        scope = {"type": "http", "method": "GET", "path": f"/{TOKEN}/{path}", "query_string": b"", "root_path": ""}
-        await application(session, TOKEN, PORT)(
-            {**scope, "headers": [(b"host", f"127.0.0.1:{PORT}".encode())]}, receive, send
-        )
-
-    anyio.run(asked)
-    assert sent[0]["status"] in (400, 404)
-    assert list(json.loads(b"".join(message.get("body", b"") for message in sent))) == ["error"]
 
 
 def test_the_page_asks_for_nothing_outside_its_table_and_every_answer_is_guarded(client):
@@ -125,7 +73,6 @@ def test_the_page_asks_for_nothing_outside_its_table_and_every_answer_is_guarded
         assert " style=" not in answer.text
     for answer in (
         client.get(f"/{TOKEN}/"),
-        client.get("/"),
         client.get(f"/{TOKEN}/view/99"),
         client.post(f"/{TOKEN}/state"),
     ):
@@ -135,36 +82,19 @@ def test_the_page_asks_for_nothing_outside_its_table_and_every_answer_is_guarded
     assert "default-src 'none'" in policy
 
 
-def test_methods_bodies_and_commands_are_checked(client, session):
-    assert client.post(f"/{TOKEN}/state").status_code == 405
-    assert client.get(f"/{TOKEN}/edit").status_code == 404
-    assert client.delete(f"/{TOKEN}/save").status_code == 405
-    long = json.dumps({"do": "new", "text": "x" * MOST_BYTES})
-    kind = {"Content-Type": "application/json"}
-    for body, headers, status in [
-        (long, kind, 413),
-        ((piece.encode() for piece in [long[:9], long[9:]]), kind, 413),
-        ("{", kind, 400),
-        ("[" * 60_000, kind, 400),
-        ("[]", kind, 400),
-        ("\xff".encode("latin1"), kind, 400),
-        ('{"do": "undo"}', {"Content-Type": "text/plain"}, 415),
-        ('{"do": "undo"}', kind, 400),
-        ('{"do": "fly"}', kind, 400),
-        ("{}", kind, 400),
-    ]:
-        answer = client.post(f"/{TOKEN}/edit", content=body, headers=headers)
-        assert answer.status_code == status, answer.text
+def test_bodies_and_commands_are_checked(client, session):
+    for body in ("{", '{"do": "undo"}', '{"do": "fly"}', "{}"):
+        answer = client.post(f"/{TOKEN}/edit", content=body)
+        assert answer.status_code == 400, answer.text
         assert "\n" not in answer.json()["error"]
     assert client.get(f"/{TOKEN}/view/99").status_code == 400
-    assert client.get(f"/{TOKEN}/view/{'9' * 6000}").status_code == 400
     assert client.get(f"/{TOKEN}/export/floppy").status_code == 400
     assert not session.document.done
 
 
 def test_a_failure_of_the_program_is_one_line(session):
     session.edit = lambda command: {}[0]
-    answer = post(TestClient(application(session, TOKEN, PORT), base_url=BASE), "edit", {"do": "undo"})
+    answer = post(TestClient(application(session, TOKEN), base_url=BASE), "edit", {"do": "undo"})
     assert (answer.status_code, answer.json()) == (500, {"error": "unexpected KeyError: 0"})
 
 
@@ -184,10 +114,11 @@ def test_what_a_session_says_arrives(client, session, tmp_path, monkeypatch):
     assert client.get(f"/{TOKEN}/state").json() == session.state()
     assert post(client, "save", {}).json() == {"message": session.save()}
     sent = client.get(f"/{TOKEN}/export/csv")
-    assert (sent.text, "segments.csv" in sent.headers["content-disposition"]) == ("6 demonstrations\n", True)
+    assert "segments.csv" in sent.headers["content-disposition"]
+    assert len(sent.text.splitlines()) == 1 + sum(session.demos.lengths)
     sent = client.get(f"/{TOKEN}/export/elan")
     assert "segments.zip" in sent.headers["content-disposition"]
-    assert ZipFile(BytesIO(sent.content)).read("demo_0.eaf") == b"6 demonstrations\n"
+    assert {*ZipFile(BytesIO(sent.content)).namelist()} >= {f"{name}.eaf" for name in session.demos.names}
     client.get(f"/{TOKEN}/export/floppy")
     assert not list(temporary.iterdir()), "an export leaves files behind"
     assert post(client, "refit", {}).status_code == 200
@@ -199,8 +130,8 @@ def test_a_port_that_is_taken_is_named_and_tokens_differ():
     try:
         assert first.socket.getsockname()[0] == "127.0.0.1"
         assert first.token != second.token
-        with pytest.raises(Failed, match=f"port {first.port}: .*in use.*--port"):
-            Listening.at(first.port)
+        with pytest.raises(Failed, match=f"port {first.socket.getsockname()[1]}: .*in use.*--port"):
+            Listening.at(first.socket.getsockname()[1])
         with pytest.raises(Failed, match="--port"):
             Listening.at(70000)
     finally:

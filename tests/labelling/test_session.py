@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from time_lines import unpacked
 
-from ddco_pyro.cli.label import _exporters, _fitted
+from ddco_pyro.cli.label import _fitted
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.labels import LABEL_NAMES, UNKNOWN
 from ddco_pyro.data.planted import pick_and_place
@@ -28,8 +28,8 @@ from ddco_pyro.labelling.document import FREE, OPEN
 from ddco_pyro.labelling.proposals import USUAL, Proposals, Shown
 from ddco_pyro.labelling.refitting import labelled, refit_spec
 from ddco_pyro.labelling.session import Session
-from ddco_pyro.segmenting import segments as segment_all
 from ddco_pyro.segmenting.formats.labels import write_labels
+from ddco_pyro.segmenting.segments import segments as segment_all
 from ddco_pyro.spec import parse_spec, with_overrides
 from ddco_pyro.training.labels import used
 
@@ -68,8 +68,7 @@ def begin(run, demos, tmp_path, monkeypatch):
     begun = []
 
     def one(out="out.hdf5"):
-        exporters = _exporters(tmp_path / "run", path)
-        begun.append(Session(replace(run, named={}), path, tmp_path / out, exporters=exporters))
+        begun.append(Session(replace(run, named={}), path, tmp_path / out))
         return begun[-1]
 
     yield one
@@ -154,18 +153,6 @@ def test_before_any_label_the_fit_proposes(begin, run, demos):
     assert [own["steps"] for own in state["demos"]] == [*demos.lengths]
     assert sorted(state["order"]) == [*range(len(demos))]
     assert (state["can_undo"], state["can_redo"], state["dirty"]) == (False, False, False)
-
-
-def test_the_segments_that_are_nearest_are_of_the_same_skill(begin, demos):
-    session = begin()
-    for index, demo in enumerate(demos):
-        label(session, index, demo.labels["phase"])
-    refitted(session)
-    for phase in range(COUNT):
-        found = session.nearest(0, int(np.flatnonzero(demos[0].labels["phase"] == phase)[0]))
-        (first, *_) = found
-        assert first["option"] == phase + 1
-        assert all(own["index"] != 0 and own["start"] < own["stop"] for own in found)
 
 
 # --- commands ---------------------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from ddco_pyro.drawing.colours import CONTROL, OPTIONS, option_rgb
 from ddco_pyro.drawing.diagrams import transition_graph, typical_paths
 from ddco_pyro.drawing.shown import projection
 from ddco_pyro.report.skills import Instance, film_of, instances, sheet_of, transitions
-from ddco_pyro.segmenting import LevelLabels, Segmented, Segments
+from ddco_pyro.segmenting.segments import LevelLabels, Segmented, Segments
 from ddco_pyro.simulation.episodes import Episode
 from ddco_pyro.simulation.film import FRAMES_PER_SECOND, captioned, write_film
 

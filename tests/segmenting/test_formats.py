@@ -18,15 +18,15 @@ import pyarrow.parquet as parquet
 import pytest
 from command_line import call
 
-from ddco_pyro.cli.runs import check_format, write_format
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.importing import import_demonstrations
 from ddco_pyro.data.planted import pick_and_place
 from ddco_pyro.data.sources import open_source
 from ddco_pyro.errors import BadInput
 from ddco_pyro.exporting.runner import Runner
-from ddco_pyro.segmenting import LevelLabels, Segmented, Segments
-from ddco_pyro.segmenting.formats import Asked
+from ddco_pyro.segmenting.formats import check_format, write_format
+from ddco_pyro.segmenting.formats.asked import Asked
+from ddco_pyro.segmenting.segments import LevelLabels, Segmented, Segments
 
 HERE = Path(__file__).parents[1]
 NAMES = ("control", "place", "reach", "grasp")

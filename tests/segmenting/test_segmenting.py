@@ -5,8 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import re
-import shutil
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -26,14 +24,13 @@ import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.importing import import_demonstrations
 from ddco_pyro.data.sources import open_source
-from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.agreement import agreement
 from ddco_pyro.fitting.fit import fit
-from ddco_pyro.segmenting import LevelLabels, Segmented, Segments, recorded, segments
 from ddco_pyro.segmenting.baselines import BASELINES, segment
-from ddco_pyro.segmenting.formats import Asked
+from ddco_pyro.segmenting.formats.asked import Asked
 from ddco_pyro.segmenting.formats.lerobot import write_subtasks
+from ddco_pyro.segmenting.segments import LevelLabels, Segmented, Segments, recorded, segments
 from ddco_pyro.spec import ObservationSpec, parse_spec
 from ddco_pyro.training.data import demonstrations
 from ddco_pyro.training.data import train_and_valid as split_in_parts
@@ -175,47 +172,6 @@ def test_the_page_shows_every_segment(toy_run, written):
     assert not re.search(r"<(link|iframe|img)|src=|@import|url\(\"?http", text)
 
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-
-COLOURS = """<script type="module">
-  dispatchEvent(new Event("beforeprint"));  // draws every demonstration, visible or not
-  const canvas = document.querySelector(".lanes canvas"), context = canvas.getContext("2d");
-  const { longest, tracks: [track] } = JSON.parse(document.querySelector(".timeline script").textContent);
-  const seen = Array.from({ length: track.steps }, (_, step) => {
-    const x = Math.round(74 + (canvas.width - 74) * (step + .85) / longest);
-    const numbers = [...context.getImageData(x, 18, 1, 1).data].slice(0, 3);
-    return "#" + numbers.map(one => one.toString(16).padStart(2, "0")).join("");
-  });
-  document.body.dataset.seen = seen.join();
-</script>"""
-"""Writes the colour that stands at the end of each step of the first demonstration, in its first lane."""
-
-
-@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
-def test_a_browser_draws_the_colour_of_each_steps_option(toy_run, written, tmp_path):
-    page = tmp_path / "segments.html"
-    page.write_text(written[1]["--html"].read_text().replace("</body>", COLOURS + "</body>"))
-    command = [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--window-size=1400,1600", "--dump-dom"]
-    command += ["--force-device-scale-factor=1", f"--user-data-dir={tmp_path / 'profile'}", page.as_uri()]
-    ended = subprocess.run(command, capture_output=True, text=True, check=True)
-    (seen,) = re.findall(r'data-seen="([^"]*)"', ended.stdout)
-    level = look(toy_run.folder, written[0]).segments[0].levels["option"]
-    assert seen.split(",") == [option_colour(option) for option in level.options]
-
-
-def test_numbers_follow_the_cursor(toy_run, written):
-    tracks = embedded(written[1]["--html"].read_text())["tracks"]
-    for demo, track in zip(demonstrations(toy_run.spec), tracks, strict=True):
-        numbers = track["n"]
-        values = np.array(unpacked(numbers["bytes"])).reshape(len(numbers["names"]), len(demo))
-        decoded = np.array(numbers["low"])[:, None] + np.array(numbers["span"])[:, None] * values / 255
-        known = {**demo.observations, "control": demo.actions}
-        for name, row, span in zip(numbers["names"], decoded, numbers["span"], strict=True):
-            key, _, place = name.removesuffix("]").partition("[")
-            expected = known[key].reshape(len(demo), -1)[:, int(place or 0)]
-            np.testing.assert_allclose(row, expected, atol=span / 255 + 1e-5)
-
-
 def test_intervals_are_those_of_the_posterior_draws(toy_run, file):
     """The very draws of ``Inferred.draws`` for a demonstration, and one interval for each segment."""
     with open_source(file) as source:
@@ -298,17 +254,6 @@ def test_baselines_stand_beside_the_options_and_are_written_as_they_are(toy_run,
         for row, (_, _, lanes) in enumerate(tracks(page.read_text()).values()):
             steps = [value for value, start, end in lanes[f"option_{name}"] for _ in range(start, end)]
             assert steps == (expected[row] + 1).tolist()
-
-
-def test_without_labels_nothing_is_said_of_agreement(toy_run, file, tmp_path):
-    with h5py.File(file, "r+") as opened:
-        for group in opened["data"].values():
-            del group["labels/phase"]
-    page = tmp_path / "segments.html"
-    ended = call("segment", toy_run.folder, file, "--baselines", "--gripper", 0, "--html", page)
-    assert "--baselines: the demonstrations have no labels/phase; no agreement is measured\n" in ended.out
-    assert "Agreement" not in page.read_text()
-    assert marked(page.read_text())
 
 
 def test_the_page_escapes_what_it_shows(toy_run, tmp_path, toy_spec):
@@ -512,14 +457,6 @@ def test_it_is_what_the_seed_says_and_looks_at_observations_alone_that_are_named
     named = segment(name, *more, 3, 5, observations=[ObservationSpec(key="place")])
     for one, other in zip(segment(name, train, valid, 3, 5), named, strict=True):
         np.testing.assert_array_equal(one, other)
-
-
-@pytest.mark.parametrize("name", BASELINES)
-def test_fewer_different_steps_than_kinds(name):
-    """Constant controls, two different steps, demonstrations of one step."""
-    demos = numbered(({"x": np.full((1 + n, 1), n % 2)}, np.ones((1 + n, 2))) for n in range(3))
-    found = segment(name, demos, demos, 5, 0)
-    assert [len(one) for one in found] == [1, 2, 3]
 
 
 def test_a_package_that_is_missing_is_a_line(monkeypatch):

@@ -1,4 +1,4 @@
-"""Writers of segments: functions in modules of their own; ``FORMATS`` of ``cli/runs.py`` lists them.
+"""The formats of segments, a row each: a function that writes, in a module of its own.
 
 ``write(asked, segmented)`` writes a file or folder, whole or not at all, and returns in words what was written.
 ``check(asked)`` of some formats refuses demonstrations or an existing place before anything is segmented.
@@ -6,71 +6,100 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
-from pathlib import Path
+from importlib.util import find_spec
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
-import numpy as np
+from ddco_pyro.errors import BadInput
 
-from ddco_pyro.data.labels import SOURCE, UNKNOWN
-from ddco_pyro.data.sources import Source
-from ddco_pyro.fitting.fitted import Fit
-from ddco_pyro.names import name_in_level
-from ddco_pyro.segmenting import SOURCES, Segmented, Segments
-
-Run = tuple[int, int, int]
-"""An option that stays active: (option, first step, step after the last)."""
+if TYPE_CHECKING:
+    from ddco_pyro.segmenting.formats.asked import Asked
+    from ddco_pyro.segmenting.segments import Segmented
 
 
-@dataclass(frozen=True)
-class Asked:
-    """The arguments of ``segment`` that a format uses.
+class Format(NamedTuple):
+    """A format of segments.
 
-    :param option: the option of ``segment`` that asks for the format, such as ``--csv``.
-    :param out: the file or folder to write.
-    :param demos: the path of the demonstrations; ``source`` is the same, open.
-    :param level: the level whose options are subtasks.
-    :param baselines: names of further labels, ``<level>_<baseline>``.
-    :param same_order: leave out demonstrations whose options follow another order than most, rather than refuse.
+    :param write: its function in this package, ``module:function``.
+    :param text: what is written, in words.
+    :param takes: the format of demonstrations that it copies; empty where it takes any.
+    :param check: the function that refuses demonstrations and places; empty where none does.
+    :param extra: of this project, where the format needs a package: a key of :data:`PACKAGES`.
+    :param suffix: of a file whose option does not name it.
     """
 
-    option: str
-    out: Path
-    fit: Fit
-    run: Path
-    demos: Path
-    source: Source
-    level: str
-    baselines: tuple[str, ...] = ()
-    same_order: bool = False
+    kind: Literal["file", "folder", "stream"]
+    write: str
+    text: str
+    takes: Literal["", "robomimic", "lerobot"] = ""
+    check: str = ""
+    extra: str = ""
+    suffix: str = ""
 
-    @cached_property
-    def names(self) -> list[str]:
-        """The subtask of each choice of the level, control (0) first."""
-        return self.names_of(self.level)
 
-    def names_of(self, level: str) -> list[str]:
-        """The name of each choice of a level, control (0) first."""
-        names = self.fit.names[level]
-        return [name_in_level(option, level, names) for option in range(len(names))]
+PACKAGES = {"lerobot": "pyarrow", "rerun": "rerun"}
 
-    def runs(self, demo: Segments) -> list[Run]:
-        """The subtasks of a demonstration: its level's options, where the same option chosen anew stays one run.
+FORMATS = {
+    "--html": Format("stream", "tables:write_html", "A page with the timeline of every demonstration."),
+    "--csv": Format("stream", "tables:write_csv", "A table with a row for each step."),
+    "--parquet": Format("stream", "tables:write_parquet", "The same table as Parquet.", extra="lerobot"),
+    "--out": Format(
+        "file", "labels:write", "A copy of the HDF5 file with labels for each step.", "robomimic", "labels:check"
+    ),
+    "--lerobot": Format(
+        "folder",
+        "lerobot:write_subtasks",
+        "A copy of a LeRobot dataset with subtasks.",
+        "lerobot",
+        "lerobot:check_bare",
+    ),
+    "--sarm": Format(
+        "folder", "lerobot:write_stages", "The same with the stages of SARM's reward model.", "lerobot", "lerobot:check"
+    ),
+    "--mimicgen": Format(
+        "file",
+        "mimicgen:write",
+        "A copy of a prepared file with MimicGen's signals.",
+        "robomimic",
+        "mimicgen:check",
+        suffix=".hdf5",
+    ),
+    "--isaac": Format(
+        "file", "mimicgen:write", "The same for Isaac Lab Mimic.", "robomimic", "mimicgen:check", suffix=".hdf5"
+    ),
+    "--label-studio": Format("folder", "annotations:write_label_studio", "Predictions for Label Studio."),
+    "--elan": Format("folder", "annotations:write_elan", "ELAN's .eaf of each demonstration."),
+    "--rerun": Format("folder", "annotations:write_rerun", "Rerun's .rrd of each demonstration.", extra="rerun"),
+}
+"""Every format, by its option of ``segment``. A new one is a function, a row here and a parameter there."""
 
-        There is none where a person left steps open.
-        """
-        return [run for run in demo.levels[self.level].runs(anew=False) if run[0] != UNKNOWN]
+TAKEN = {"robomimic": "HDF5 file in robomimic's layout", "lerobot": "LeRobot dataset"}
 
-    def said_by(self, demo: Segments, start: int, stop: int) -> str | None:
-        """Who says what steps of the level are, one of :data:`~ddco_pyro.segmenting.SOURCES`; None without a person."""
-        known = demo.baselines.get(self.level + SOURCE)
-        return None if known is None else SOURCES[known[start:stop].min()]
 
-    def order(self, segmented: Segmented) -> list[int]:
-        """The options that are active at all, by how far through a demonstration they are active on average."""
-        places: dict[int, list[float]] = {}
-        for demo in segmented.segments:
-            options = demo.levels[self.level].options
-            for option in np.unique(options[options != UNKNOWN]).tolist():
-                places.setdefault(option, []).append(float(np.flatnonzero(options == option).mean()) / len(options))
-        return sorted(places, key=lambda option: float(np.mean(places[option])))
+def format_of(option: str) -> Format:
+    """The format of an option; ``--in-place`` writes what ``--out`` does."""
+    return FORMATS[option.replace("--in-place", "--out")]
+
+
+def check_format(asked: Asked) -> None:
+    """Check, before anything is segmented, that a format can be written.
+
+    :raises BadInput: the format copies other demonstrations, its place is taken, or a package that it needs is missing.
+    """
+    form = format_of(asked.option)
+    if form.takes not in ("", asked.source.format):
+        raise BadInput(
+            f"{asked.demos}: is no {TAKEN[form.takes]}, which {asked.option} needs; name another format, such as --csv "
+            "or --html"
+        )
+    if form.extra and find_spec(PACKAGES[form.extra]) is None:
+        remedy = f"install it with: pip install 'ddco-pyro[{form.extra}]'"
+        raise BadInput(f"{asked.option} needs {PACKAGES[form.extra]}; {remedy}")
+    if form.check:
+        resolve_name(f"{__name__}.{form.check}")(asked)
+
+
+def write_format(asked: Asked, segmented: Segmented) -> str:
+    """Write segments in a format, and say what was written."""
+    said: str = resolve_name(f"{__name__}.{format_of(asked.option).write}")(asked, segmented)
+    return said

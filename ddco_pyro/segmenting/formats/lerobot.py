@@ -18,8 +18,8 @@ from ddco_pyro.data.files import whole_folder, write_text
 from ddco_pyro.data.sources.lerobot import ANNOTATIONS, SUBTASK, LeRobot
 from ddco_pyro.data.sources.metadata import inside
 from ddco_pyro.errors import BadInput
-from ddco_pyro.segmenting import Segmented
-from ddco_pyro.segmenting.formats import Asked, Run
+from ddco_pyro.segmenting.formats.asked import Asked, Run
+from ddco_pyro.segmenting.segments import Segmented
 
 PERSISTENT, EVENTS = "language_persistent", "language_events"
 ATOM = ("role", "content", "style", "timestamp", "tool_calls")

@@ -13,9 +13,9 @@ from ddco_pyro.data.files import whole_file
 from ddco_pyro.data.labels import BOUNDARY, SOURCE, UNKNOWN
 from ddco_pyro.drawing.shown import paths_of, stored_pictures
 from ddco_pyro.names import option_name
-from ddco_pyro.segmenting import SOURCES, Segmented, recorded
-from ddco_pyro.segmenting.formats import Asked
+from ddco_pyro.segmenting.formats.asked import Asked
 from ddco_pyro.segmenting.page import timelines, write_page
+from ddco_pyro.segmenting.segments import SOURCES, Segmented, recorded
 
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
 """First characters of a text that a spreadsheet may execute as a formula."""

@@ -1,0 +1,300 @@
+"""Segments of demonstrations: the most likely option of a run at each step."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from ddco_pyro.data.demonstration import check_fitted, needed
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.errors import DemonstrationsError
+from ddco_pyro.data.labels import label_names
+from ddco_pyro.data.likeness import Likeness
+from ddco_pyro.data.memory import INFERENCE, refuse_too_much
+from ddco_pyro.data.sources import Source, open_source
+from ddco_pyro.drawing.colours import option_colour
+from ddco_pyro.evaluation.agreement import agreement as scores_of
+from ddco_pyro.evaluation.agreement import of_equal_lengths
+from ddco_pyro.evaluation.inferred import Inferred, runs
+from ddco_pyro.events import BaselineSegmented, DemonstrationsDone, OnEvent, ignore
+from ddco_pyro.fitting.fitted import Fit
+from ddco_pyro.metrics import Scores
+from ddco_pyro.segmenting import baselines
+from ddco_pyro.training.data import train_and_valid
+
+SOURCES = ("open", "proposed", "accepted", "given")
+"""Who says what a step is: none, as a person left it open; the model; a person who accepts that; a person."""
+
+
+@dataclass(frozen=True)
+class LevelLabels:
+    """One level over one demonstration of T steps.
+
+    :param options: choices of the most likely path [T]: 1 to k, or 0 where the caller emits the control; -1 where
+        a person left the step open.
+    :param boundaries: whether the path makes a new choice at this step [T], which may be the same option; true at the
+        first step. Where options end after every step: whether the option differs from the step before.
+    :param probability: posterior probability of the chosen option at each step [T].
+    :param intervals: the 90 % interval of each segment's first step [segments, 2], of
+        :meth:`~ddco_pyro.evaluation.inferred.Inferred.intervals`; None where unknown.
+    """
+
+    options: np.ndarray
+    boundaries: np.ndarray
+    probability: np.ndarray
+    intervals: np.ndarray | None = None
+
+    def runs(self, anew: bool = True) -> list[tuple[int, int, int]]:
+        """Each segment as (option, first step, step after the last).
+
+        :param anew: whether a segment ends where the same option is chosen anew.
+        """
+        return runs(self.options, self.boundaries if anew else np.diff(self.options, prepend=-1))
+
+
+@dataclass(frozen=True)
+class Segments:
+    """One demonstration with its segments.
+
+    :param levels: by name, lowest first.
+    :param log_likelihood: log p(ξ) per step, nats.
+    :param held_out: whether the run's fit held the demonstration out.
+    :param labels: ground-truth labels in the file, name to [T].
+    :param baselines: labels of baselines, ``<level>_<baseline>`` to kinds from 1 on [T]; where a person labelled, also
+        ``<level>_source``, the place in :data:`SOURCES` [T].
+    """
+
+    name: str
+    levels: dict[str, LevelLabels]
+    log_likelihood: float
+    held_out: bool
+    labels: dict[str, np.ndarray] = field(default_factory=dict)
+    baselines: dict[str, np.ndarray] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(next(iter(self.levels.values())).options)
+
+
+@dataclass(frozen=True)
+class Segmented:
+    """All demonstrations of a source.
+
+    :param counts: the number of options of each level, by name.
+    :param frequency: steps per second (Hz); None where unknown.
+    :param truth: for each level, the name of the labels that the run's spec compares with it.
+    :param names: for each level, the name of each choice, control first.
+    :param label_names: for labels in the file, the names of labels 0, 1, ...
+    :param matched: for labels that the run's spec compares with a level, the option that each label is matched with
+        in the run's own table: of the lowest level, where labels are compared with several.
+    :param unlike: a line for each reason why demonstrations are unlike those of the fit.
+    """
+
+    segments: tuple[Segments, ...]
+    counts: dict[str, int]
+    frequency: float | None
+    truth: Mapping[str, str] = field(default_factory=dict)
+    names: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    label_names: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    matched: Mapping[str, Mapping[int, int]] = field(default_factory=dict)
+    unlike: Sequence[str] = ()
+
+    def __len__(self) -> int:
+        return len(self.segments)
+
+    def labelled(self, truth: str) -> dict[str, Sequence[Segments]]:
+        """The demonstrations that have these labels, by part in words: the held-out ones first, then the others."""
+        labelled = [demo for demo in self.segments if truth in demo.labels]
+        held_out, others = ([demo for demo in labelled if demo.held_out is held] for held in (True, False))
+        parts = {f"{len(held_out)} held out": held_out, f"{len(others)} {'others' if held_out else 'in all'}": others}
+        return {part: group for part, group in parts.items() if group}
+
+    @cached_property
+    def agreements(self) -> dict[str, dict[str, Scores | None]]:
+        """Agreement of each level that has labels: the measures of each kind of segments, by its name.
+
+        Parts of equal length stand beside the options. Other baselines are compared on the held-out demonstrations, or
+        on all where none is held out.
+        """
+        agreements: dict[str, dict[str, Scores | None]] = {}
+        for level, truth in self.truth.items():
+            groups = self.labelled(truth)
+            for part, group in groups.items():
+                options, labels = [demo.levels[level].options for demo in group], [demo.labels[truth] for demo in group]
+                scores = agreements.setdefault(level, {})
+                scores[f"options, {part}"] = scores_of(options, labels)
+                equal = f"{baselines.BASELINES[baselines.EQUAL]}, {part}"
+                scores[equal] = of_equal_lengths(labels, self.counts[level])
+            for part, group in [*groups.items()][:1]:
+                for name, words in (baselines.BASELINES | {baselines.RECOGNISER: baselines.RECOGNISED}).items():
+                    if f"{level}_{name}" in group[0].baselines and name != baselines.EQUAL:
+                        kinds = [demo.baselines[f"{level}_{name}"] for demo in group]
+                        agreements[level][f"{words}, {part}"] = scores_of(kinds, [demo.labels[truth] for demo in group])
+        return agreements
+
+    def label_colours(self, name: str) -> dict[int, str]:
+        """The colour of each label of this name: that of the option that it is matched with."""
+        return {label: option_colour(option) for label, option in self.matched.get(name, {}).items()}
+
+
+def segment(fit: Fit, path: str | Path) -> Segmented:
+    """The options of a run over every demonstration of a file or data set.
+
+    >>> segmented = ddco_pyro.segment(fit, "mine.hdf5")
+    >>> len(segmented), segmented.counts, segmented.segments[0].levels["option"].options.shape
+    (6, {'option': 2}, (10,))
+
+    :param path: an HDF5 file, or a Minari or LeRobot dataset.
+    :raises BadInput: the run has no options, or was fitted to other observations.
+    :raises DemonstrationsError: a demonstration cannot be used.
+    """
+    with open_source(path) as source:
+        return segments(fit, source)
+
+
+def segments(fit: Fit, source: Source, on_event: OnEvent = ignore, intervals: bool = False) -> Segmented:
+    """The segments of every demonstration of a source, except those that the run's spec excludes from its file.
+
+    :param intervals: with the intervals of their boundaries.
+    :raises BadInput: the run has no options.
+    :raises DemonstrationsError: a demonstration cannot be used, or lacks an observation of the run.
+    """
+    fit.refuse_flat()
+    chosen, known = chosen_names(source, fit), label_names(source.attributes)
+    labels: dict[str, dict[str, np.ndarray]] = {}
+    segmented: list[Segments] = []
+    likeness = Likeness()
+    for piece in fit.infer(_demonstrations(source, chosen, fit, labels, likeness)):
+        segmented += of_piece(fit, piece, labels, intervals)
+        on_event(DemonstrationsDone(len(segmented), len(chosen)))
+    nats = {demo.name: demo.log_likelihood for demo in segmented}
+    unlike = fit.unlike(likeness, nats, source.frequency)
+    return replace(of_run(fit, segmented, source.frequency, known), unlike=unlike)
+
+
+def of_run(
+    fit: Fit, segmented: Sequence[Segments], frequency: float | None, known: Mapping[str, Sequence[str]]
+) -> Segmented:
+    """These segments with what a run says of all: the number and the names of its options, and its labels.
+
+    :param known: for labels in the file, the names of labels 0, 1, ...
+    """
+    counts = {level.name: level.count for level in fit.spec.hierarchy.levels} if fit.spec.hierarchy else {}
+    names = fit.spec.demonstrations.labels_by_level(len(counts))
+    truth = dict(zip(counts, names, strict=bool(names)))
+    record, matched = fit.metrics.agreement, dict[str, dict[int, int]]()
+    for label, table in zip(record.labels, record.confusion, strict=True) if record else ():
+        pairs = zip(table.matched, table.options, strict=True)
+        matched.setdefault(label, {value: option for value, option in pairs if value is not None})
+    return Segmented(tuple(segmented), counts, frequency, truth, fit.names, known, matched)
+
+
+def baseline_labels(fit: Fit) -> tuple[str, ...]:
+    """The names of the labels of baselines: ``<level>_<baseline>``."""
+    names = [f"{level}_{name}" for level in fit.names for name in baselines.BASELINES]
+    own = fit.hierarchy.recogniser
+    return (*names, *([] if own is None else [f"{[*fit.names][own.level - 1]}_{baselines.RECOGNISER}"]))
+
+
+def beside_baselines(
+    segmented: Segmented, fit: Fit, source: Source, gripper: int = -1, on_event: OnEvent = ignore
+) -> Segmented:
+    """The same segments with the labels of every baseline, fitted to the run's training demonstrations.
+
+    The options that a run's recogniser alone finds stand beside them.
+
+    :param gripper: the control dimension whose changes divide demonstrations in the baseline ``gripper``.
+    :raises BadInput: there is no such control dimension, or a package is not installed.
+    """
+    train = train_and_valid(fit.spec, fit.demonstrations)["train"]
+    demos = Demonstrations(tuple(recorded(segmented, fit, source)))
+    found, total = {}, len(segmented.counts) * len(baselines.BASELINES)
+    for level, count in segmented.counts.items():
+        for name in baselines.BASELINES:
+            seed, observations, key = fit.spec.seed, fit.spec.observations, fit.spec.control.relative_to
+            found[f"{level}_{name}"] = baselines.segment(name, train, demos, count, seed, observations, gripper, key)
+            on_event(BaselineSegmented(name, total))
+    if fit.hierarchy.recogniser is not None:
+        found[baseline_labels(fit)[-1]] = [
+            row[:steps].numpy() - 1
+            for piece in fit.infer(demos)
+            for row, steps in zip(() if piece.recognised is None else piece.recognised, piece.lengths, strict=True)
+        ]
+    each = (
+        replace(demo, baselines={name: kinds[row] + 1 for name, kinds in found.items()})
+        for row, demo in enumerate(segmented.segments)
+    )
+    return replace(segmented, segments=tuple(each))
+
+
+def recorded(segmented: Segmented, fit: Fit, source: Source) -> Iterator[Demonstration]:
+    """The demonstrations of these segments in order, with the observations of the run's networks."""
+    return (_demonstration(source.read(demo.name), fit) for demo in segmented.segments)
+
+
+def chosen_names(source: Source, fit: Fit) -> list[str]:
+    """The demonstrations to segment: all except those that the spec excludes from its file."""
+    known = fit.spec.demonstrations
+    same = known.path is not None and Path(known.path).resolve() == source.files[0].resolve()
+    return [name for name in source.names if not (same and name in known.exclude)]
+
+
+FOUND = 40
+"""Bytes of one step's labels at one level."""
+
+
+def _demonstrations(
+    source: Source, names: Sequence[str], fit: Fit, labels: dict[str, dict[str, np.ndarray]], likeness: Likeness
+) -> Iterator[Demonstration]:
+    """Each demonstration as the run's networks observe it. Ground-truth labels go into ``labels``."""
+    before = 0  # steps whose labels are in memory
+    for name in names:
+        found = source.read(name)
+        seen = {key: array for key, array in found.observations.items() if key in fit.hierarchy.encoder.shapes}
+        inferred = INFERENCE * len(found) + FOUND * fit.hierarchy.depth * (before + len(found))
+        whole = needed([Demonstration.stored(name, seen, found.actions)]) + inferred
+        refuse_too_much(whole, f"{name}: segmenting its {len(found)} steps", "divide it, or the file")
+        labels[name] = {
+            key: values for key, values in found.labels.items() if values.dtype.kind in "iub" and values.ndim == 1
+        }
+        demo = _demonstration(found, fit)
+        likeness.add_all(demo, demo.observations)
+        before += len(demo)
+        yield demo
+
+
+def _demonstration(found: Demonstration, fit: Fit) -> Demonstration:
+    """A demonstration of a source with the observations of the run's networks."""
+    shapes = fit.hierarchy.encoder.shapes
+    check_fitted(found, shapes, fit.hierarchy.scaling.size)
+    return Demonstration(found.name, {key: found.observations[key] for key in shapes}, found.actions)
+
+
+def of_piece(
+    fit: Fit, piece: Inferred, labels: Mapping[str, dict[str, np.ndarray]], intervals: bool
+) -> Iterator[Segments]:
+    """The segments of each demonstration that was inferred.
+
+    :param labels: ground-truth labels of each demonstration, by its name.
+    :raises DemonstrationsError: no options explain a demonstration.
+    """
+    levels = fit.spec.hierarchy.levels if fit.spec.hierarchy else ()
+    for row, (name, steps) in enumerate(zip(piece.names, piece.lengths, strict=True)):
+        lasts, steps_of = [level.lasts for level in levels], np.arange(steps)
+        known = piece.intervals(row, lasts) if intervals else [None] * len(levels)
+        every = zip(levels, piece.segmented(row, lasts), piece.posterior.u, known, strict=True)
+        each = {  # rounding can exceed 1
+            level.name: LevelLabels(options, starts, np.minimum(u[row].numpy()[steps_of, options], 1.0), within)
+            for level, (options, starts), u, within in every
+        }
+        value = float(piece.log_likelihood[row])
+        if not math.isfinite(value):
+            raise DemonstrationsError(
+                f"{name}: its log-likelihood is {value}, so no options explain it; see its controls with ddco-pyro "
+                "inspect, and repair it or leave it out"
+            )
+        yield Segments(name, each, value / steps, fit.was_held_out(name, value), labels[name])
