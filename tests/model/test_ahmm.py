@@ -9,7 +9,7 @@ import numpy as np
 import pyro
 import pytest
 import torch
-from oracle import brute_force, paths, random_tables
+from oracle import brute_force, random_tables
 
 from ddco_pyro.inference import log_likelihood
 from ddco_pyro.inference.engines import known_controls
@@ -106,31 +106,6 @@ def test_what_is_sampled_has_the_probability_of_the_paper():
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("counts", [(2,), (2, 2)])
-@pytest.mark.parametrize(
-    "choices", [[[2, 0, 1], [2, 2, 0]], [[-1, 2, -1], [2, -1, 0]], [[-1, -1, 1], [-1, -1, -1]]]
-)  # the last of the second trajectory is past the end
-def test_a_clamped_level_has_the_choices_it_is_given_and_is_free_elsewhere(counts, choices):
-    tables = random_tables(counts, (True,) * len(counts), trajectories=2, steps=3, seed=11)
-    lengths, choices = torch.tensor([3, 2]), torch.tensor(choices)
-    for level in range(1, len(counts) + 1):
-        clamped = tables.clamp(level, choices)
-        assert tables.evidence == ()
-        for n, length in enumerate(lengths.tolist()):
-            given = choices[n, :length].tolist()
-            every = [(path, probability) for path, _, probability in paths(tables, n, length, [3] * len(counts))]
-            truth = sum(
-                probability
-                for path, probability in every
-                if all(known in (-1, h[level - 1]) for known, h in zip(given, path, strict=True))
-            )
-            share = truth / sum(probability for _, probability in every)
-            assert 0 < share < 0.9 or (set(given) == {-1} and share == 1)
-            for engine in ("fused", "enumerate"):
-                found = log_likelihood(clamped, lengths, engine)[n]
-                assert float(found) == pytest.approx(np.log(truth), abs=1e-9)
 
 
 @pytest.mark.parametrize("counts", [(2,), (2, 2)])

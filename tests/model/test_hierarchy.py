@@ -7,7 +7,6 @@ import pytest
 import torch
 from hierarchies import make_batch, make_hierarchy
 from oracle import brute_force
-from torch.distributions import Normal
 
 from ddco_pyro.inference import log_likelihood
 from ddco_pyro.model.batch import Batch
@@ -38,17 +37,6 @@ def test_gradient_is_the_papers_gradient_equation(emits):
     expected = torch.autograd.grad(surrogate, parameters)
     for ours, paper in zip(found, expected, strict=True):
         torch.testing.assert_close(ours, paper, atol=1e-9, rtol=1e-7)
-
-
-@pytest.mark.parametrize("counts", [(1,), ()])
-def test_one_option_or_none_is_flat_behaviour_cloning(counts):
-    """With k = 1 the latents say nothing, so the likelihood is the product of the option's Gaussians."""
-    hierarchy, batch = make_hierarchy(counts), make_batch()
-    mean = hierarchy(batch.inputs).emissions[0].mean[:, :, 0]
-    density = Normal(mean.double(), 0.7).log_prob(batch.actions.double()).sum(-1)
-    alive = torch.arange(4) < batch.lengths[:, None]
-    found = log_likelihood(hierarchy.tabulate(batch), batch.lengths)
-    torch.testing.assert_close(found, (density * alive).sum(1), atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize("counts", [(3,), (3, 2), (2, 3, 2)])

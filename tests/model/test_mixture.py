@@ -16,7 +16,7 @@ from ddco_pyro.inference import log_likelihood
 from ddco_pyro.inference.engines import compare_engines
 from ddco_pyro.model.tables import always_ends
 from ddco_pyro.selection.grid import candidates
-from ddco_pyro.spec import SpecError, parse_spec, with_overrides
+from ddco_pyro.spec import parse_spec
 from ddco_pyro.statistics import worth
 from ddco_pyro.training.networks import (
     Dimensions,
@@ -80,33 +80,6 @@ def test_a_grid_of_models_is_one_line():
     assert options - mixture == 2 * (4 + 1 + 1)  # two linear terminations of five numbers
     assert found[2].spec.hierarchy == spec.hierarchy
     assert all(one.spec.compare_with == () for one in found)
-
-
-def test_what_is_no_model_is_refused():
-    with pytest.raises(SpecError, match=r"^model: must be options, a baseline such as flat or mixture, .* got 3$"):
-        with_overrides(spec_of(), {"model": 3})
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"hierarchy": None, "baseline": "mixture", "compare_with": []}, "baseline: mixture takes its experts from"),
-        ({"hierarchy": None, "baseline": "flat", "compare_with": ["mixture"]}, "compare_with.0: mixture takes its"),
-        ({"compare_with": [{"kind": "mixture", "policy": {}}]}, "compare_with.0.policy: a mixture has the networks of"),
-        (
-            {"hierarchy": {"levels": [{"count": 2, "termination": "always"}]}, "compare_with": ["mixture"]},
-            "compare_with.0: the hierarchy is a mixture already",
-        ),
-        (
-            {"hierarchy": {"levels": [{"count": 2, "termination": "alway"}]}, "compare_with": []},
-            "hierarchy.levels.0.termination: must be a network, such as {network: linear}, or always, got 'alway'",
-        ),
-    ],
-)
-def test_what_does_not_fit_together_is_refused(changes, message):
-    with pytest.raises(SpecError) as refused:
-        spec_of(**changes)
-    assert str(refused.value).startswith(message)
 
 
 # --- training ---------------------------------------------------------------------------------------------------------

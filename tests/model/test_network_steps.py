@@ -1,17 +1,11 @@
-"""A step alone and in its trajectory give the same: every kind of network, LSTMs, and what is refused."""
+"""LSTMs, with and without windows, against torch's own with the same weights."""
 
 from __future__ import annotations
 
 import pytest
 import torch
-from stacked_networks import COPIES, SHAPE, answer, assert_close, make, make_inputs, random_inputs, refused, separate
+from stacked_networks import COPIES, SHAPE, answer, assert_close, make, make_inputs, random_inputs, separate
 from torch import nn
-
-from ddco_pyro.model.networks import CLASSES
-
-assert set(CLASSES) == {"linear", "constant", "mlp", "per_timestep", "conv", "lstm", "branches"}, (
-    "a new network belongs in every_kind"
-)
 
 
 def separate_memory(network, k):
@@ -55,33 +49,3 @@ def test_a_memory_with_a_horizon_is_made_afresh_for_each_window(horizon, start):
         outputs, state = answer(network, everything.part(slice(None), part), state)
         said.append(outputs[:, :, k])
     assert_close(torch.cat(said, dim=1), torch.cat(expected, dim=1))
-
-
-@pytest.mark.parametrize(
-    ("how", "message"),
-    [
-        ("alone", "has initial_state(N), which has to give a tuple of tensors [N, ...]; each call"),
-        ("list", "has initial_state(N), which has to give a tuple"),
-        ("without trajectories", "has initial_state(N), which has to give a tuple"),
-        ("other shape", "has initial_state(N), which has to give a tuple"),
-        ("forgets", "gives other outputs step by step than for a whole trajectory: its state has to hold all"),
-        ("looks ahead", "gives other outputs step by step than for a whole trajectory"),
-        ("over trajectories", "gives other outputs step by step than for a whole trajectory"),
-    ],
-)
-def test_a_state_that_does_not_go_on_is_refused_when_the_network_is_made(how, message):
-    said = refused(network="user_networks:Remembering", options={"how": how})
-    assert said.startswith(f"network 'user_networks:Remembering' {message}")
-
-
-MEMORIES = ["over time", "over trajectories", "differences", "later steps", "whole trajectory", "whole batch", "chance"]
-
-
-@pytest.mark.parametrize("zero", [False, True])
-@pytest.mark.parametrize("how", MEMORIES)
-def test_a_network_with_a_memory_is_refused_when_it_is_made(how, zero):
-    said = refused(network="user_networks:WithMemory", options={"how": how, "zero": zero})
-    assert said.startswith(
-        "network 'user_networks:WithMemory' gives a step alone other outputs than within its trajectory: it depends on "
-        "earlier steps"
-    )

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import get_args
-
 import pytest
 import torch
 from stacked_networks import (
@@ -24,8 +22,6 @@ from torch import nn
 
 from ddco_pyro.model.networks import Inputs, InputShape, ShapeError
 from ddco_pyro.model.networks.conv import POOLED
-from ddco_pyro.model.networks.perceptrons import StackedLinear
-from ddco_pyro.spec import Activation
 
 
 @pytest.mark.parametrize(
@@ -36,29 +32,6 @@ def test_stacked_networks_are_separate_networks(settings):
     read = inputs.vector[..., :0] if "constant" in settings.values() else inputs.vector
     expected = torch.stack([separate(network.layers, k)(read) for k in range(COPIES)], dim=2)
     assert_close(network(inputs)[0], expected)
-
-
-ACTIVATIONS = {
-    "relu": nn.functional.relu,
-    "leaky_relu": lambda x: nn.functional.leaky_relu(x, 0.01),
-    "elu": nn.functional.elu,
-    "tanh": torch.tanh,
-}
-
-
-@pytest.mark.parametrize("name", get_args(Activation))
-def test_an_activation_follows_every_convolution_and_every_hidden_layer(name):
-    layers, activation = [{"filters": 2, "kernel": 3}, {"filters": 3, "kernel": 3}], ACTIVATIONS[name]
-    settings = {"layers": layers, "pool": "flatten", "hidden": [5, 4], "activation": name}
-    shape = InputShape({}, {"camera": PIXELS})
-    network, inputs = make(shape, network="conv", **settings), random_inputs(shape, 2, LONGEST, 0)
-    values = inputs.images["camera"].flatten(0, 1).permute(0, 3, 1, 2) / 255
-    for layer, filters in zip(network.convolutions[0], (2, 3), strict=True):
-        values = activation(nn.functional.conv2d(values, layer.weight[:filters], layer.bias[:filters]))
-    first, second, last = (layer for layer in network.layers if isinstance(layer, StackedLinear))
-    values = activation(values.flatten(1) @ first.weight[0] + first.bias[0])
-    expected = activation(values @ second.weight[0] + second.bias[0]) @ last.weight[0] + last.bias[0]
-    assert_close(network(inputs)[0][:, :, 0].flatten(0, 1), expected)
 
 
 CONVOLUTION = [{"filters": 3, "kernel": 5, "stride": 2, "padding": 2}]
@@ -155,20 +128,26 @@ POOLS = {
 }
 
 
-@pytest.mark.parametrize("pool", POOLS)
-def test_several_convolutions_are_separate_networks(pool):
+ACTIVATIONS = {"relu": nn.ReLU(), "leaky_relu": nn.LeakyReLU(0.01), "elu": nn.ELU(), "tanh": nn.Tanh()}
+
+
+@pytest.mark.parametrize(
+    ("pool", "activation"), [("mean", "relu"), ("flatten", "leaky_relu"), ("spatial_softmax", "elu"), ("mean", "tanh")]
+)
+def test_several_convolutions_are_separate_networks(pool, activation):
+    """The activation follows every convolution and every hidden layer."""
     layers = [{"filters": 3, "kernel": 4, "stride": 2, "padding": 1}, {"filters": 2, "kernel": 3}]
-    shape = InputShape({}, {"camera": PIXELS})
-    network = make(shape, network="conv", layers=layers, pool=pool, hidden=[8])
+    shape, follows = InputShape({}, {"camera": PIXELS}), ACTIVATIONS[activation]
+    network = make(shape, network="conv", layers=layers, pool=pool, hidden=[8, 5], activation=activation)
     inputs = random_inputs(shape, 2, LONGEST, 0)
     pixels = inputs.images["camera"].flatten(0, 1).permute(0, 3, 1, 2) / 255
     first, second = network.convolutions[0]
     expected = []
     for k in range(COPIES):
         a, b = slice(3 * k, 3 * (k + 1)), slice(2 * k, 2 * (k + 1))
-        maps = nn.functional.conv2d(pixels, first.weight[a], first.bias[a], stride=2, padding=1).relu()
-        maps = nn.functional.conv2d(maps, second.weight[b], second.bias[b]).relu()
-        expected.append(separate(network.layers, k)(POOLS[pool](maps)).unflatten(0, inputs.batch))
+        maps = follows(nn.functional.conv2d(pixels, first.weight[a], first.bias[a], stride=2, padding=1))
+        maps = follows(nn.functional.conv2d(maps, second.weight[b], second.bias[b]))
+        expected.append(separate(network.layers, k, follows)(POOLS[pool](maps)).unflatten(0, inputs.batch))
     assert_close(network(inputs)[0], torch.stack(expected, dim=2))
 
 
@@ -218,19 +197,31 @@ def test_a_network_of_ones_own():
     assert_close(network(inputs)[0][:, :, 3, 1], 2 * inputs.vector.sum(-1))
 
 
+SHOULD = "it has to be a tensor [N, T, copies, outputs], here"
+STATE = "has initial_state(N), which has to give a tuple of tensors [N, ...]; each call"
+BY_STEPS = "gives other outputs step by step than for a whole trajectory: its state has to hold all"
+ALONE = "gives a step alone other outputs than within its trajectory: it depends on earlier steps"
+MEMORIES = ["over time", "over trajectories", "differences", "later steps", "whole trajectory", "whole batch", "chance"]
+
+
 @pytest.mark.parametrize(
-    ("how", "message"),
+    ("network", "how", "message"),
     [
-        ("swapped", "gives shape [2, 3, 2, 4]; it has to be a tensor [N, T, copies, outputs], here [2, 3, 4, 2]"),
-        ("squeezed", "gives shape [1, 4, 2]; it has to be a tensor [N, T, copies, outputs], here [1, 1, 4, 2]"),
-        ("time first", "gives shape [3, 2, 4, 2]; it has to be a tensor [N, T, copies, outputs], here [2, 3, 4, 2]"),
-        ("list", "gives a list; it has to be a tensor [N, T, copies, outputs], here [2, 3, 4, 2]"),
-        ("fails", "fails for random observations, N = 2, T = 3: "),
+        ("Wrong", "swapped", f"gives shape [2, 3, 2, 4]; {SHOULD} [2, 3, 4, 2]"),
+        ("Wrong", "squeezed", f"gives shape [1, 4, 2]; {SHOULD} [1, 1, 4, 2]"),
+        ("Wrong", "time first", f"gives shape [3, 2, 4, 2]; {SHOULD} [2, 3, 4, 2]"),
+        ("Wrong", "list", f"gives a list; {SHOULD} [2, 3, 4, 2]"),
+        ("Wrong", "fails", "fails for random observations, N = 2, T = 3: "),
+        *(("Remembering", how, STATE) for how in ("alone", "list", "without trajectories", "other shape")),
+        *(("Remembering", how, BY_STEPS) for how in ("forgets", "looks ahead", "over trajectories")),
+        *(("WithMemory", how, ALONE) for how in MEMORIES),
+        *(("WithMemoryAndZeros", how, ALONE) for how in MEMORIES),
     ],
 )
-def test_an_output_of_another_shape_is_refused_when_the_network_is_made(how, message):
-    said = refused(network="user_networks:Wrong", options={"how": how})
-    assert said.startswith(f"network 'user_networks:Wrong' {message}")
+def test_a_network_of_ones_own_is_tried_when_it_is_made(network, how, message):
+    """Its shapes and its state; a step alone and in its trajectory give the same."""
+    said = refused(network=f"user_networks:{network}", options={"how": how})
+    assert said.startswith(f"network 'user_networks:{network}' {message}")
 
 
 @pytest.mark.parametrize(

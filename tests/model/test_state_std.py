@@ -14,7 +14,6 @@ import ddco_pyro
 from ddco_pyro.inference.engines import compare_engines
 from ddco_pyro.model.controls import INITIAL_STD
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.spec import SpecError
 
 OF_STATE = {"learn": True, "per_state": True}
 OF_OPTION = {"learn": True, "per_option": True}
@@ -150,37 +149,4 @@ def test_it_is_counted_saved_and_decomposed(fitted):
     assert sum(each.by_dimension) == pytest.approx(fit.metrics.log_likelihood_per_step.valid, rel=1e-5)
 
 
-def test_without_skill_options_lead_by_their_sigma_alone():
-    """Options that each have a σ beat a flat policy with one σ, but not one whose σ depends on the state."""
-    demos, _ = noisy()
-    spec = flat_spec(
-        control={"std": OF_OPTION, "scale": "none", "kind": "gaussian"},
-        baseline=None,
-        hierarchy={"levels": [{"count": 2, "policy": LINEAR}], "meta_policy": LINEAR},
-        compare_with=[{"kind": "flat", "policy": LINEAR}, {"kind": "flat", "policy": LINEAR, "std": OF_STATE}],
-    )
-    found = ddco_pyro.fit(spec, demos).metrics.comparison
-    one, of_state = (found[name].difference for name in ("flat", "flat_2"))
-    assert one.nats_per_step > 3 * one.standard_error > 0
-    assert of_state.nats_per_step < -3 * of_state.standard_error < 0
-
-
 # --- what is refused --------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"control": {"std": OF_OPTION | OF_STATE}}, "control.std.per_option: per_state gives each option its own σ"),
-        ({"baseline": {"kind": "flat", "std": OF_STATE}}, "baseline.std: is for baselines in compare_with"),
-        (
-            {"control": {"std": 0.1}, "compare_with": [{"kind": "flat", "std": OF_STATE}]},
-            "compare_with.0.std: no σ in control is learned; say control.std: {learn: true}",
-        ),
-    ],
-)
-def test_what_does_not_fit_together_is_one_line(changes, message):
-    with pytest.raises(SpecError) as refused:
-        flat_spec(**changes)
-    (said,) = refused.value.problems
-    assert said.startswith(message)

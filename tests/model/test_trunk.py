@@ -9,7 +9,6 @@ from planted import LINEAR, small_spec
 
 from ddco_pyro.inference import log_likelihood
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.spec import SpecError
 from ddco_pyro.training.stages import plan
 
 SEES = {"network": "mlp", "hidden": [5], "activation": "tanh"}
@@ -74,15 +73,3 @@ def test_it_is_trained_with_the_lowest_level_and_with_all():
     trained = {stage.name: [name for name in names if name.startswith(stage.trained)] for stage in plan(spec, 2)}
     assert [name for name, own in trained.items() if "trunk.layers.0.weight" in own] == ["vq-1", "level-1", "joint"]
     assert trained["joint"] == [name for name in names if not name.startswith(("encoder.", "scaling."))]
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"network": SEES, "meta": {"network": "lstm"}}, "hierarchy.meta_policy.network: reads the trunk: use one of"),
-        ({"network": LINEAR | {"inputs": ["state"]}}, "hierarchy.levels.0.policy.inputs: the trunk reads the obs"),
-    ],
-)
-def test_what_cannot_read_it_is_refused(changes, message):
-    with pytest.raises(SpecError, match=rf"(?m)^{message}"):
-        spec_of(**{"network": LINEAR, "trunk": SEES} | changes)

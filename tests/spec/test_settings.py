@@ -129,50 +129,30 @@ def of_studies() -> Iterator[tuple[str, str]]:
 
 
 def literal(node: ast.AST) -> Any:
-    """Plain data of an expression: what is computed is ``{}``."""
-    if isinstance(node, ast.Constant):
-        return node.value
-    if isinstance(node, ast.JoinedStr):
-        return "".join(str(part.value) if isinstance(part, ast.Constant) else "{}" for part in node.values)
-    if isinstance(node, ast.List | ast.Tuple):
-        return [literal(item) for item in node.elts]
+    """Plain data of a mapping or a text: what is computed is 0."""
     if isinstance(node, ast.Dict):
-        pairs = [(literal(key), literal(value)) for key, value in zip(node.keys, node.values, strict=True) if key]
-        return {key: value for key, value in pairs if isinstance(key, str)}
-    return "{}"
-
-
-def only_of(data: dict[str, Any]) -> list[type[Model]]:
-    """The model that alone has all keys of a mapping; none where several have them."""
-    if isinstance(data.get("network"), str):
-        return [SETTINGS.get(data["network"], UserNetworkSpec)]
-    having = [model for model in MODELS if data and data.keys() <= fields(model).keys()]
-    return having if len(having) == 1 else []
-
-
-def of_python(path: Path) -> Iterator[tuple[str, str]]:
-    """Key paths, their values, whole specs, and mappings whose keys one part of a spec alone has."""
-    tree = ast.parse(path.read_text())
-    parts = {part for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in node.values}
-    for node in (node for node in ast.walk(tree) if node not in parts):
-        data = literal(node) if isinstance(node, ast.Constant | ast.JoinedStr | ast.Dict) else None
-        found: list[str] = []
-        if isinstance(data, dict):
-            found += said(data, [Spec]) if "observations" in data else said(data, only_of(data))
-            for key, value in data.items() if any("." in key for key in data) else ():
-                found += said_at(key, value)
-        elif isinstance(data, str) and "\nobservations:" in data:
-            found += said(yaml.safe_load(data), [Spec])
-        elif isinstance(data, str) and "." in data and (match := PATH.fullmatch(data)):
-            found += said_at(match[1], None)
-        for one in found:
-            yield one, path.relative_to(ROOT).as_posix()
+        pairs = zip(node.keys, node.values, strict=True)
+        return {key.value: literal(value) for key, value in pairs if isinstance(key, ast.Constant)}
+    if isinstance(node, ast.JoinedStr):
+        return "".join(str(literal(part)) for part in node.values)
+    return node.value if isinstance(node, ast.Constant) else 0
 
 
 def of_scripts() -> Iterator[tuple[str, str]]:
-    for folder in ("notebooks", "studies", "benchmarks"):
-        for path in sorted((ROOT / folder).glob("*.py")):
-            yield from of_python(path)
+    """Key paths, their values, mappings whose keys one part of a spec alone has, and whole specs."""
+    for path in sorted(path for folder in ("notebooks", "studies") for path in (ROOT / folder).glob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            data, found = literal(node), []
+            if isinstance(data, dict):
+                having = [model for model in MODELS if data and data.keys() <= fields(model).keys()]
+                found += said(data, having) if len(having) == 1 else []
+                found += [one for item in data.items() if "." in "".join(data) for one in said_at(*item)]
+            elif isinstance(node, ast.JoinedStr) and "\nobservations:" in data:
+                found += said(yaml.safe_load(data), [Spec])
+            elif match := PATH.fullmatch(str(data)):
+                found += said_at(match[1], None) if "." in match[1] else []
+            for one in found:
+                yield one, path.relative_to(ROOT).as_posix()
 
 
 def of_init(folder: Path) -> Iterator[tuple[str, str]]:

@@ -254,6 +254,9 @@ def refusal(overrides: dict[str, Any]) -> str:
     return str(caught.value)
 
 
+OF_STATE = {"learn": True, "per_state": True}
+TWO_LEVELS = [{"count": 2}, {"name": "above", "count": 2, "policy": {"emits": ["control"]}}]
+SEGMENTS = {"training.layerwise": "segments"}
 REFUSED: list[tuple[dict[str, Any], str]] = [
     (
         {"compare_with": ["flat", {"kind": "per_timestep", "policy": {"network": "lstm"}}]},
@@ -276,10 +279,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         "demonstrations.hold_out_by: stands",
     ),
     ({"hierarchy.trunk": {"network": "constant"}}, "hierarchy.trunk.network: a constant has no features for others"),
-    (
-        {"hierarchy.meta_policy": {"network": "constant", "inputs": ["a"]}},
-        "hierarchy.meta_policy.inputs: a constant re",
-    ),
+    ({"hierarchy.meta_policy": {"network": "constant", "inputs": ["a"]}}, "hierarchy.meta_policy.inputs: a constant"),
     ({"hierarchy.meta_policy": {"network": "linear", "hidden": [8]}}, "hierarchy.meta_policy.hidden: unknown key"),
     ({"control.parts": [{"name": "jaw", "dims": [0], "kind": "binary", "std": 1}]}, "control.parts.0.std: does"),
     ({"observations": ["state", {"key": "step", "differences": True}]}, "observations.1.differences: does not apply"),
@@ -313,6 +313,28 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"training.optimizer.lr": float("inf")}, "training.optimizer.lr: must be a finite number, got inf"),
     ({"training.layerwise": "yes"}, "training.layerwise: must be true, false, or segments, got 'yes'"),
     ({"seed": 2**32}, "seed: must be at most 4294967295, got 4294967296"),
+    ({"model": 3}, "model: must be options, a baseline such as flat or mixture, a list of levels, or a"),
+    ({"hierarchy": None, "baseline": "mixture"}, "baseline: mixture takes its experts from"),
+    ({"hierarchy": None, "baseline": "flat", "compare_with": ["mixture"]}, "compare_with.0: mixture takes its experts"),
+    ({"compare_with": [{"kind": "mixture", "policy": {}}]}, "compare_with.0.policy: a mixture has the networks of"),
+    ({"hierarchy.levels.0.termination": "always", "compare_with": ["mixture"]}, "compare_with.0: the hierarchy is a"),
+    ({"hierarchy.levels.0.termination": "alway"}, "hierarchy.levels.0.termination: must be a network, such as"),
+    ({"control.std": {**OF_STATE, "per_option": True}}, "control.std.per_option: per_state gives each option its own"),
+    ({"hierarchy": None, "baseline": {"kind": "flat", "std": OF_STATE}}, "baseline.std: is for baselines in"),
+    ({"compare_with": [{"kind": "flat", "std": OF_STATE}]}, "compare_with.0.std: no σ in control is learned"),
+    (
+        {"hierarchy.trunk": {}, "hierarchy.meta_policy": {"network": "lstm"}},
+        "hierarchy.meta_policy.network: reads the trunk: use one of",
+    ),
+    (
+        {"hierarchy.trunk": {}, "hierarchy.levels.0.policy": {"inputs": ["pose"]}},
+        "hierarchy.levels.0.policy.inputs: the trunk reads the observations",
+    ),
+    (
+        {"hierarchy.levels": TWO_LEVELS, **SEGMENTS},
+        "hierarchy.levels.1.policy.emits: training.layerwise: segments needs",
+    ),
+    ({"hierarchy.meta_policy.emits": ["control"], **SEGMENTS}, "hierarchy.meta_policy.emits: training.layerwise: segm"),
 ]
 
 

@@ -40,7 +40,10 @@ def random_inputs(shape, trajectories, steps, start):
     return Inputs(vectors, images, torch.arange(start, start + steps))
 
 
-def separate(layers, k):
+RELU = nn.ReLU()
+
+
+def separate(layers, k, activation=RELU):
     """The k-th of the stacked perceptrons as an ordinary torch network with the same weights."""
     found = []
     for layer in layers:
@@ -50,8 +53,8 @@ def separate(layers, k):
                 linear.weight.copy_(layer.weight[k].T)
                 linear.bias.copy_(layer.bias[k, 0])
             found.append(linear)
-        elif isinstance(layer, nn.ReLU):
-            found.append(nn.ReLU())
+        elif not isinstance(layer, nn.Dropout):
+            found.append(activation)
     return nn.Sequential(*found)
 
 

@@ -48,7 +48,6 @@ class Wrong(Own):
         return {
             "swapped": lambda: found.transpose(2, 3),
             "squeezed": lambda: found.squeeze(0),
-            "joined": lambda: found.flatten(2),
             "time first": lambda: found.transpose(0, 1),
             "fails": lambda: found @ torch.ones(7),
         }[self.how]()
@@ -89,14 +88,11 @@ class NotANetwork:
 class WithMemory(nn.Module):
     """A network of one's own whose output at a step is not that of the step alone."""
 
-    def __init__(self, shape, outputs, copies, how, zero=False):
+    def __init__(self, shape, outputs, copies, how):
         super().__init__()
         self.how, self.size = how, (copies, outputs)
         self.lstm = nn.LSTM(shape.vector, 16, batch_first=how != "over trajectories")
         self.head = nn.Linear(16 if how in ("over time", "over trajectories") else shape.vector, copies * outputs)
-        if zero:
-            nn.init.zeros_(self.head.weight)
-            nn.init.zeros_(self.head.bias)
 
     def forward(self, inputs):
         features = {
@@ -109,3 +105,12 @@ class WithMemory(nn.Module):
             "chance": lambda x: nn.functional.dropout(x, 0.5, training=True),
         }[self.how](inputs.vector)
         return self.head(features).unflatten(-1, self.size)
+
+
+class WithMemoryAndZeros(WithMemory):
+    """The same whose outputs are 0 at first."""
+
+    def __init__(self, *arguments, **options):
+        super().__init__(*arguments, **options)
+        for parameter in self.head.parameters():
+            nn.init.zeros_(parameter)

@@ -28,7 +28,7 @@ from ddco_pyro.model.batch import Batch, encode
 from ddco_pyro.model.emissions import KINDS, Information
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.outputs import bounded
-from ddco_pyro.spec import RidgeSpec, SpecError, parse_spec, with_overrides
+from ddco_pyro.spec import RidgeSpec, parse_spec, with_overrides
 from ddco_pyro.training import em
 from ddco_pyro.training.em import Expectation, is_linear
 from ddco_pyro.training.networks import Dimensions
@@ -419,12 +419,6 @@ def test_a_flat_policy_for_each_time_step_is_least_squares_at_that_step():
     dims = batch.actions.shape[-1]
     truth = -0.5 * residual / batch.steps - 0.5 * dims * np.log(2 * np.pi)
     assert last == pytest.approx(truth, abs=1e-6)
-
-
-def test_a_spec_that_em_would_not_follow_is_refused():
-    for key, value in (("training.average", 0.9), ("training.optimizer.schedule", "cosine")):
-        with pytest.raises(SpecError, match=f"{key}: em"):
-            with_overrides(em_spec(), {key: value})
 
 
 def test_linear_networks_are_trained_by_em_unless_the_spec_asks_for_gradient_steps():

@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 import torch
 from oracle import paths, random_tables
-from planted import make_spec
 from sklearn.metrics import normalized_mutual_info_score
 
 from ddco_pyro.inference import segment
-from ddco_pyro.spec import SpecError, with_overrides
 from ddco_pyro.training import upper
 from ddco_pyro.training.upper import Constants, expected, fitted, improved
 
@@ -150,12 +148,3 @@ def test_labels_say_which_option_is_which():
 
 
 # --- the spec ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("place", ["hierarchy.levels.1.policy.emits", "hierarchy.meta_policy.emits"])
-def test_segments_need_callers_that_select(place):
-    spec = make_spec((2, 2), layerwise="segments")
-    assert with_overrides(spec, {place: ["options", "control"]}).training.layerwise == "segments"
-    with pytest.raises(SpecError, match=f"{place}: training.layerwise: segments needs options here") as caught:
-        with_overrides(spec, {place: ["control"]})
-    assert len(caught.value.problems) == 1
