@@ -1,6 +1,6 @@
 """Files that robomimic, LeRobot and Minari themselves wrote, imported: every number is there.
 
-How ``fixtures/`` was made: ``fixtures/write_robomimic.py`` and ``fixtures/write_lerobot.py``.
+``fixtures/README.md`` says how these files were made.
 """
 
 from __future__ import annotations

@@ -11,7 +11,6 @@ import pytest
 import torch
 from oracle import brute_force, random_tables
 
-from ddco_pyro.inference import log_likelihood
 from ddco_pyro.inference.engines import known_controls
 from ddco_pyro.model.ahmm import ahmm
 from ddco_pyro.model.tables import NEVER, Tables, complete
@@ -43,26 +42,6 @@ def repeated(tables, times):
 
 
 # --- samples ----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("hybrid", [(True, True), (False, True), (True, False), (False, False)])
-def test_samples_keep_to_the_rules(hybrid):
-    steps = 12
-    tables = random_tables((3, 2), hybrid, trajectories=400, steps=steps, seed=3)
-    h, b = latents(run_forward(tables, torch.full((400,), steps)), 2, steps)
-    before, now, ends = h[:, :-1], h[:, 1:], b[:, 1:]
-    assert not (ends[..., 1] > ends[..., 0]).any(), "a level ended above one that did not"
-    kept = ends == 0
-    assert 0 < int(kept.sum()) < kept.numel()
-    assert torch.equal(now[kept], before[kept])
-    called = h[..., 1] == 0
-    assert (h[..., 0][called] == 0).all(), "something is chosen below a choice 0"
-    assert bool(called.any()) == hybrid[1]
-    lowest_control = (h[..., 0] == 0) & ~called
-    assert bool(lowest_control.any()) == hybrid[0]
-    assert (ends[..., 0][before[..., 0] == 0] == 1).all(), "control by the caller lasts longer than one step"
-    assert set(h[..., 0].unique().tolist()) >= {1, 2, 3}
-    assert set(h[..., 1].unique().tolist()) >= {1, 2}
 
 
 @pytest.mark.parametrize(
@@ -106,28 +85,3 @@ def test_what_is_sampled_has_the_probability_of_the_paper():
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("counts", [(2,), (2, 2)])
-def test_the_gradient_where_some_choices_are_known_is_that_of_finite_differences(counts):
-    tables = random_tables(counts, (True,) * len(counts), trajectories=2, steps=3, seed=14)
-    lengths, choices = torch.tensor([3, 2]), torch.tensor([[-1, 2, -1], [1, -1, 0]])
-    leaves = [table.clone().requires_grad_() for table in tables.leaves()]
-
-    def value(*leaves):
-        return log_likelihood(Tables.of(len(counts), leaves).clamp(1, choices), lengths)
-
-    assert torch.autograd.gradcheck(value, leaves)
-
-
-def test_a_trajectory_alone_is_what_it_is_among_others():
-    tables = random_tables((2, 3), (True, False), trajectories=3, steps=4, seed=13)
-    lengths = torch.tensor([4, 2, 3])
-    choices = torch.tensor([[1, 2, 2, 1], [2, 1, 0, 0], [1, 1, 2, 0]])
-    for whole in (tables, tables.clamp(1, choices)):
-        for n, length in enumerate(lengths.tolist()):
-            alone = whole.trajectory(n, length)
-            assert alone.selection[0].shape == (1, length, 3, 3)
-            assert torch.equal(alone.control[0][0], whole.control[0][n, :length])
-            found = log_likelihood(alone, torch.tensor([length]))
-            torch.testing.assert_close(found[0], log_likelihood(whole, lengths)[n], atol=1e-12, rtol=0)

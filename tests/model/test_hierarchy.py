@@ -66,3 +66,26 @@ def test_a_learned_deviation_keeps_its_floor_and_is_shared_by_the_level():
     with torch.no_grad():
         hierarchy.levels[0].policy.std.raw[:] = -100.0
     np.testing.assert_allclose(hierarchy.levels[0].policy.std().detach(), [0.2, 0.2], rtol=1e-6)
+
+
+def test_a_second_derivative_is_never_left_out_in_silence():
+    """A gradient penalty: a sum of something that has a second derivative and of the refused one."""
+    batch = make_batch()
+    outputs = make_hierarchy((2,))(batch.inputs)
+    (ending,) = outputs.termination_logits
+    value = log_likelihood(outputs.tables(batch.actions), batch.lengths).sum()
+    (gradient,) = torch.autograd.grad(value, ending, create_graph=True)
+    with pytest.raises(RuntimeError, match="cannot differentiate again"):
+        torch.autograd.grad(gradient.square().sum() + ending.square().sum(), ending)
+
+
+def test_controls_that_want_a_gradient_get_it():
+    """Through the tables: the gradient of a log-density with respect to the controls (a distribution's value)."""
+    batch = make_batch()
+    tables = make_hierarchy((2,))(batch.inputs).tables(batch.actions.requires_grad_())
+    found, expected = (
+        torch.autograd.grad(log_likelihood(tables, batch.lengths, engine).sum(), batch.actions, retain_graph=True)[0]
+        for engine in ("fused", "enumerate")
+    )
+    assert found.abs().max() > 0.1
+    torch.testing.assert_close(found, expected)

@@ -335,7 +335,7 @@ def rows_of(folder):
 
 
 def test_subtasks_are_written_as_lerobot_writes_them(tmp_path):
-    """Beside what LeRobot's own annotation writer made of the same subtasks (``fixtures/write_lerobot_language.py``).
+    """Beside what LeRobot's own annotation writer made of the same subtasks (``fixtures/README.md``).
 
     ``fixtures/read_formats.py`` has LeRobot read what is written here; 0.6.1 did.
     """

@@ -27,7 +27,6 @@ from ddco_pyro.report import write_report
 from ddco_pyro.spec import SpecError
 from ddco_pyro.training.checkpoint import Progress
 from ddco_pyro.training.initialization import Clusters
-from ddco_pyro.training.labels import Labels
 from ddco_pyro.training.loop import backward
 from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.objective import Objective
@@ -112,15 +111,6 @@ def test_the_label_wins_over_the_cluster():
 
 
 # --- which labels are used --------------------------------------------------------------------------------------------
-
-
-def test_labels_of_demonstrations_to_train_and_to_tune_with_are_used():
-    train, tune = random_demonstrations().split(0.2, 0)
-    labels = Labels.of(labelled(), train, tune)
-    assert labels.demonstrations == tuple(name for name in (*train.names, *tune.names) if name != "demo_3")
-    for part, tensor in ((train, labels.train), (tune, labels.tune)):
-        for demo, row in zip(part, tensor.tolist(), strict=True):
-            assert row == options(demo.labels["phase"].tolist())
 
 
 @pytest.mark.parametrize(
