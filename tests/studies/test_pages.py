@@ -16,7 +16,7 @@ from scipy import stats
 from ddco_pyro.errors import BadInput
 from studies import page
 from studies.__main__ import main
-from studies.statistics import COLUMNS, estimate, verdicts
+from studies.statistics import COLUMNS
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -128,27 +128,6 @@ def test_verdicts_of_a_page_are_those_that_holm_leaves(rendered):
     own = "{hand.csv: two - base; goals; 10; show=verdict}"
     assert "holds" in rendered(own)
     assert "inconclusive" in rendered(own + "{hand.csv: two - base; goals; 20}")
-
-
-@pytest.mark.parametrize(
-    ("values", "said"),
-    [
-        ({"one": [3, 4, 5, 4]}, ["holds"]),
-        ({"one": [-3, -4, -5, -4]}, ["does not hold"]),
-        ({"one": [1, 2, 3, 1]}, ["holds"]),
-        ({"one": [-1, -2, -3, -1]}, ["does not hold"]),
-        ({"one": [1, 2, 3, 1], "two": [-1, -2, -3, -1]}, ["inconclusive"] * 2),  # 2 × 0.018 > 0.025 on either side
-        ({"one": [-1, -2, -3, -1], "two": [-1, -2, -3, -1]}, ["inconclusive"] * 2),
-        ({"one": [1, 1, 1, 1]}, ["not tested"]),
-        ({}, []),
-    ],
-)
-def test_both_sides_of_a_verdict_have_holms_correction(values, said):
-    family = [
-        estimate(pd.Series({("", str(seed)): float(value) for seed, value in enumerate(own)})).p_value(0.0)
-        for own in values.values()
-    ]
-    assert [verdict for verdict, _ in verdicts(family)] == said
 
 
 def test_a_fixed_sequence_goes_on_beside_equivalence(rendered, tmp_path):
@@ -309,35 +288,35 @@ def difference(ours, theirs, form):
     return f"{paired.mean():{form}} [{low:{form}}, {high:{form}}]".replace("-", "−")
 
 
+def of(table, *methods, **named):
+    """The values by seed of each method in a table."""
+    return [rows(table, method=method, **named) for method in methods]
+
+
 def test_numbers_of_readme_are_those_of_the_tables_by_pandas_alone():
-    results = "docs/results/{}.csv".format
     text = (ROOT / "README.md").read_text().replace("**", "")
-    peers = {name: rows(results("peers"), study="peers", method=name, demonstrations="10", measure="success")
-             for name in ("options", "flow", "lstm")}  # fmt: skip
-    hidden = {name: rows(results("hidden"), study="hidden", method=name, demonstrations="40", measure="success")
-              for name in ("options", "flow", "lstm", "mixture", "flat")}  # fmt: skip
-    for named, known in (("six tasks of Meta-World | 10", peers), ("a goal shown once | 40", hidden)):
-        means = [known[name].groupby("task").mean().mean() for name in ("options", "flow", "lstm")]
-        assert f"| {named} | {' | '.join(f'{mean:.0%}' for mean in means)} |" in text
-    several = difference(hidden["mixture"], hidden["flat"], "+.0%")
-    lasting = difference(hidden["options"], hidden["mixture"], "+.0%")
-    assert f"| a goal shown once | 40 | success | {several} | {lasting} | 10 |" in text
-    needle = {name: rows(results(table), study="needle", method=name, demonstrations="100", measure=measure)
-              for name, table, measure in (("ddco", "needle", "success"), ("flat", "needle", "success"),
-                                           ("mixture", "memory", "success, acting by marginal"))}  # fmt: skip
-    several = difference(needle["mixture"], needle["flat"], "+.0%")
-    lasting = difference(needle["ddco"], needle["mixture"], "+.0%")
-    assert f"| needle | 100 | success | {several} | {lasting} | 10 |" in text
-    frozen = [rows("studies/frozen.csv", method=name, demonstrations="10", measure="success")
-              for name in ("options", "mixture")]  # fmt: skip
-    assert f"27 tasks | 10 | success | – | {difference(*frozen, '+.0%')} | 3 |" in text
-    again = [rows("studies/frozen_again.csv", method=name, demonstrations="10", measure="success")
-             for name in ("options", "mixture")]  # fmt: skip
-    assert f"26 tasks | 10 | success | – | {difference(*again, '+.0%')} | 3 |" in text
-    arena = [rows("studies/arena_em.csv", study="arena_em", method=name, demonstrations="50", measure="nmi")
-             for name in ("options", "mixture")]  # fmt: skip
-    assert f"Meta-World, 9 tasks | 50 | NMI | – | {difference(*arena, '+.2f')} | 3 |" in text
+    results, own, names = "docs/results/{}.csv".format, {"measure": "success"}, ("options", "flow", "lstm")
+    for named, study, count in (("six tasks of Meta-World", "peers", "10"), ("a goal shown once", "hidden", "40")):
+        known = of(results(study), *names, study=study, demonstrations=count, **own)
+        means = " | ".join(f"{one.groupby('task').mean().mean():.0%}" for one in known)
+        assert f"| {named} | {count} | {means} |" in text
+    flat, mixture, options = of(
+        results("hidden"), "flat", "mixture", "options", study="hidden", demonstrations="40", **own
+    )
+    marginal = {"study": "needle", "demonstrations": "100", "measure": "success, acting by marginal"}
+    needle = of(results("needle"), "flat", "ddco", study="needle", demonstrations="100", **own)
+    needle.insert(1, *of(results("memory"), "mixture", **marginal))
+    for named, count, known in (("a goal shown once", 40, (flat, mixture, options)), ("needle", 100, needle)):
+        parts = [difference(known[n + 1], known[n], "+.0%") for n in range(2)]
+        assert f"| {named} | {count} | success | {' | '.join(parts)} | 10 |" in text
+    for named, table, form, of_study in (
+        ("27 tasks | 10 | success", "frozen", "+.0%", {"demonstrations": "10", **own}),
+        ("26 tasks | 10 | success", "frozen_again", "+.0%", {"demonstrations": "10", **own}),
+        ("9 tasks | 50 | NMI", "arena_em", "+.2f", {"study": "arena_em", "demonstrations": "50", "measure": "nmi"}),
+    ):
+        known = of(f"studies/{table}.csv", "options", "mixture", **of_study)
+        assert f"{named} | – | {difference(*known, form)} | 3 |" in text
+    people = {"study": "surgeon", "measure": "accuracy"}
     for named, task in (("knot tying", "Knot_Tying"), ("suturing", "Suturing")):
-        folds = [rows(results("people"), study="surgeon", task=task, method=f"{name}, 3 labelled", measure="accuracy")
-                 for name in ("options", "recogniser, transitions")]  # fmt: skip
-        assert f"| {named}, right steps | {' | '.join(difference(own, 0 * own, '.2f') for own in folds)} |" in text
+        folds = of(results("people"), "options, 3 labelled", "recogniser, transitions, 3 labelled", task=task, **people)
+        assert f"| {named}, right steps | {' | '.join(difference(one, 0 * one, '.2f') for one in folds)} |" in text

@@ -124,6 +124,21 @@ def test_holm_gives_what_hand_computation_gives():
 @pytest.mark.parametrize(
     ("p_values", "said"),
     [
+        ([0.018], ["holds"]),
+        ([0.982], ["does not hold"]),
+        ([0.018, 0.982], ["inconclusive"] * 2),  # 2 × 0.018 > 0.025 on either side
+        ([0.982, 0.982], ["inconclusive"] * 2),
+        ([float("nan")], ["not tested"]),
+        ([], []),
+    ],
+)
+def test_both_sides_of_a_verdict_have_holms_correction(p_values, said):
+    assert [verdict for verdict, _ in verdicts(p_values)] == said
+
+
+@pytest.mark.parametrize(
+    ("p_values", "said"),
+    [
         ([0.01, 0.02, 0.3, 0.001], ["holds", "holds", "inconclusive", "not reached"]),
         ([0.02, 0.02, 0.02], ["holds"] * 3),  # Holm's first would be 0.06
         ([0.99, 0.001], ["does not hold", "not reached"]),
