@@ -1,4 +1,4 @@
-"""The changes that docs/architecture.md promises: made in a copy of the library, each is a new file and one row."""
+"""The changes that docs/architecture.md promises, made in a copy of the library: a new file each, and its row."""
 
 from __future__ import annotations
 
@@ -70,17 +70,43 @@ def open_npz(path):
     yield Source(tuple(f"demo_{n}" for n in each), read, (path,))
 '''
 
+COUNTS = '''
+"""How many segments each demonstration has."""
+from ddco_pyro.data.files import whole_file
+
+def write(asked, segmented):
+    with whole_file(asked.out) as temporary:
+        temporary.write_text("".join(f"{demo.name} {len(asked.runs(demo))}\\n" for demo in segmented.segments))
+    return str(asked.out)
+'''
+
 CHANGES = {
-    "model/emissions/laplace.py": (LAPLACE, "spec/settings.py", '"student",', '"student", "laplace",'),
-    "../squared.py": (NETWORK, None, "", ""),  # a spec names a class wherever it lies
+    "model/emissions/laplace.py": (LAPLACE, {"spec/settings.py": ('"student",', '"student", "laplace",')}),
+    "../squared.py": (NETWORK, {}),  # a spec names a class wherever it lies
     "data/sources/npz.py": (
         NPZ,
-        "data/formats.py",
-        "FORMATS = {",
-        'FORMATS = {"npz": Format("npz:open_npz", lambda path, names: path.suffix == ".npz", "an .npz file"),',
+        {
+            "data/formats.py": (
+                "FORMATS = {",
+                'FORMATS = {"npz": Format("npz:open_npz", lambda path, names: path.suffix == ".npz", ".npz"),',
+            )
+        },
+    ),
+    "segmenting/formats/counts.py": (
+        COUNTS,
+        {
+            "segmenting/formats/__init__.py": (
+                "FORMATS = {",
+                'FORMATS = {"--counts": Format("stream", "counts:write", "Counts."),',
+            ),
+            "cli/runs.py": (
+                "    html: Annotated",
+                '    counts: Annotated[Path | None, _to("--counts")] = None,\n    html: Annotated',
+            ),
+        },
     ),
 }
-"""A new file, and the table with the row that names it: what stands there, and with the row."""
+"""A new file, and its rows: in a file what stands there, and the same with the row."""
 
 SPEC = {
     "demonstrations": {"path": "mine.hdf5"},
@@ -100,9 +126,9 @@ def changed(tmp_path_factory):
     folder = tmp_path_factory.mktemp("changed")
     library = folder / "ddco_pyro"
     shutil.copytree(ROOT / "ddco_pyro", library)  # with what is compiled of it
-    for name, (content, table, before, after) in CHANGES.items():
+    for name, (content, rows) in CHANGES.items():
         (library / name).write_text(content)
-        if table:
+        for table, (before, after) in rows.items():
             text = (library / table).read_text()
             assert text.count(before) == 1
             (library / table).write_text(text.replace(before, after))
@@ -117,7 +143,7 @@ from ddco_pyro.model.emissions import KINDS
 for words in (
     "import mine.npz --out mine.hdf5",
     "fit spec.yaml --out run --allow-code",
-    "segment run mine.hdf5 --csv steps.csv --allow-code",
+    "segment run mine.hdf5 --csv steps.csv --counts counts.txt --allow-code",
 ):
     sys.argv = ["ddco-pyro", *words.split()]
     try:
@@ -138,4 +164,8 @@ def test_a_distribution_a_network_and_formats_are_a_file_and_a_row_each(changed)
     done = subprocess.run([sys.executable, "-c", ALL], cwd=changed, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert float(done.stdout.split()[-1]) == pytest.approx(stats.laplace(1, 0.5).logpdf([0, 3]).sum())
-    assert len(pd.read_csv(changed / "steps.csv")) == 60
+    steps = pd.read_csv(changed / "steps.csv")
+    assert len(steps) == 60
+    changes = steps.groupby("demonstration").option.apply(lambda options: int(options.diff().ne(0).sum()))
+    counts = dict(line.split() for line in (changed / "counts.txt").read_text().splitlines())
+    assert {name: int(number) for name, number in counts.items()} == changes.to_dict()
