@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import pad
+from torch.nn.functional import adaptive_avg_pool2d, pad
 
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.networks import Inputs, InputShape
@@ -122,20 +122,15 @@ class Recogniser(nn.Module):
 
 def observed(inputs: Inputs) -> Tensor:
     """All vectors, and the block means of all pictures, [N, T, F] float64."""
-    return torch.cat(list(_observed(inputs)), dim=1) if inputs.images else inputs.vector.double()
+    parts = inputs.chunks(FRAMES_AT_ONCE // inputs.batch[0]) if inputs.images else [inputs]
+    return torch.cat([_observed(part.loaded()) for part in parts], dim=1)
 
 
-def _observed(inputs: Inputs) -> Iterator[Tensor]:
-    for part in inputs.chunks(FRAMES_AT_ONCE // inputs.batch[0]):
-        loaded = part.loaded()
-        means = [torch.stack([block_means(frames) for frames in image]) for image in loaded.images.values()]
-        yield torch.cat([loaded.vector, *means], dim=-1).double()
+def _observed(loaded: Inputs) -> Tensor:
+    means = [torch.stack([_block_means(frames) for frames in image]) for image in loaded.images.values()]
+    return torch.cat([loaded.vector, *means], dim=-1).double()
 
 
-def block_means(frames: Tensor) -> Tensor:
+def _block_means(frames: Tensor) -> Tensor:
     """Pictures uint8 [T, H, W, C] averaged over POOLED × POOLED blocks, in [0, 1], [T, C · POOLED²]."""
-    pooled = [
-        torch.nn.functional.adaptive_avg_pool2d(block.permute(0, 3, 1, 2).float() / 255, POOLED).flatten(1)
-        for block in frames.split(FRAMES_AT_ONCE)
-    ]
-    return torch.cat(pooled)
+    return adaptive_avg_pool2d(frames.permute(0, 3, 1, 2).float() / 255, POOLED).flatten(1)

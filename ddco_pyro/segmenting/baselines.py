@@ -18,7 +18,7 @@ from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.errors import BadInput, nearest
 from ddco_pyro.evaluation.agreement import equal_lengths
 from ddco_pyro.model.encoder import ObservationEncoder
-from ddco_pyro.model.recogniser import block_means
+from ddco_pyro.model.recogniser import observed
 from ddco_pyro.spec import ObservationSpec
 from ddco_pyro.training.initialization import distinct, joined
 
@@ -83,19 +83,10 @@ def _rows_of(
     varying = spread > 1e-9 * np.maximum(np.abs(controls).max(0), 1e-9)
 
     def rows(demo: Demonstration) -> np.ndarray:
-        vector = encoder.scaled(encoder.features(demo.observations))
-        images = [
-            torch.cat(
-                [
-                    block_means(torch.as_tensor(block))
-                    for block in transform.seen(demo.observations[key], slice(0, len(demo)))
-                ]
-            )
-            for key, transform in encoder.transforms.items()
-        ]
-        seen = np.concatenate([vector, *(image.double().numpy() for image in images)], axis=1)
+        (seen,) = observed(encoder.inputs([demo.observations]))
         scaled = (demo.controls(relative_to) - middle)[:, varying] / spread[varying]
-        return joined(seen, scaled) if varying.any() else seen
+        both = joined(seen, torch.as_tensor(scaled)) if varying.any() else seen
+        return both.numpy()
 
     return rows
 

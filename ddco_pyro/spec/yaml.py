@@ -12,9 +12,8 @@ from typing import Any
 import yaml
 
 from ddco_pyro.errors import path_of
-from ddco_pyro.spec.base import TASKS, Model, SpecError, show
-from ddco_pyro.spec.networks import UserNetworkSpec
-from ddco_pyro.spec.spec import Spec, parse_spec, plain, with_overrides
+from ddco_pyro.spec.base import TASKS, SpecError, show
+from ddco_pyro.spec.spec import Spec, parse_spec, plain
 
 
 class _Loader(yaml.SafeLoader):
@@ -157,27 +156,27 @@ def user_code(spec: Spec) -> dict[str, str]:
 
     Tasks registered by installed packages are not user code.
     """
-    tasks, registered = {"task": spec.task, "demonstrations.task": spec.demonstrations.task}, entry_points(group=TASKS)
-    names = {place: name for place, name in tasks.items() if name and ":" in name and name not in registered.names}
-    return names | dict(_user_networks(spec, ""))
+    return dict(_code_in(spec.model_dump(exclude={"selection"}), ""))
 
 
-def _user_networks(part: Any, place: str) -> Iterator[tuple[str, str]]:
-    if isinstance(part, UserNetworkSpec):
-        yield f"{place}.network", part.network
-    elif isinstance(part, Model | Mapping | tuple):
-        for key, below in enumerate(part) if isinstance(part, tuple) else dict(part).items():
-            yield from _user_networks(below, f"{place}.{key}" if place else str(key))
+def _code_in(data: Any, place: str) -> Iterator[tuple[str, str]]:
+    """Key paths, and the names there, of code in plain data at a key path of a spec."""
+    if isinstance(data, Mapping | list | tuple):
+        for key, below in data.items() if isinstance(data, Mapping) else enumerate(data):
+            yield from _code_in(below, f"{place}.{key}" if place else str(key))
+    elif place.rpartition(".")[2] in ("task", "network") and ":" in str(data) and not _is_registered(data):
+        yield place, data
+
+
+def _is_registered(name: str) -> bool:
+    return name in entry_points(group=TASKS).names
 
 
 def _refuse_user_code(spec: Spec, path: str | Path) -> None:
     """Refuse a spec that names user code, in its grid included."""
-    places = user_code(spec)
-    for key, values in spec.selection.grid.items():
-        for value in values:
-            candidate = with_overrides(spec, {"selection.grid": {}, key: value})
-            places |= {f"selection.grid.{key}": name for name in user_code(candidate).values()}
-    if places:
+    tried = ((key, value) for key, values in spec.selection.grid.items() for value in values)
+    grid = {f"selection.grid.{key}": name for key, value in tried for _, name in _code_in(value, key)}
+    if places := user_code(spec) | grid:
         raise SpecError(
             *(
                 f"{path}: {place}: would import user code ({name}); pass --allow-code if you trust it "

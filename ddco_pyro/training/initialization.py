@@ -22,7 +22,7 @@ from torch import Tensor
 
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import BYTES_AT_ONCE
-from ddco_pyro.model.recogniser import FRAMES_AT_ONCE, block_means, window_means
+from ddco_pyro.model.recogniser import observed, window_means
 from ddco_pyro.spec import Start
 
 if TYPE_CHECKING:
@@ -60,11 +60,11 @@ class Clusters:
         window: int = 0,
     ) -> None:
         self._controls, self._read, self._window = controls, read, window
-        most = most_rows(next(self._blocks(batch)).shape[1])
+        most = most_rows(next(self._trajectories(batch)).shape[1])
         chosen = np.ones(batch.steps, dtype=bool)
         chosen[np.random.default_rng(seed).permutation(batch.steps)[most:]] = False
         left, found = chosen, []
-        for block in self._blocks(batch):
+        for block in self._trajectories(batch):
             here, left = np.split(left, [len(block)])
             found.append(block[here])
         rows = np.concatenate(found)
@@ -86,30 +86,20 @@ class Clusters:
     def choices(self, batch: Batch) -> Tensor:
         """The cluster of each step, [N, T], 1 to k; 0 where there is padding."""
         choices = torch.zeros(batch.inputs.batch, dtype=torch.long)
-        clusters = [self._namer.predict(rows) for rows in self._blocks(batch)]
+        clusters = [self._namer.predict(rows) for rows in self._trajectories(batch)]
         choices[_alive(batch)] = torch.as_tensor(np.concatenate(clusters), dtype=torch.long) + 1
         return choices
 
-    def _blocks(self, batch: Batch) -> Iterator[np.ndarray]:
-        """The features of consecutive steps [B, F], trajectory after trajectory."""
+    def _trajectories(self, batch: Batch) -> Iterator[np.ndarray]:
+        """The features of every step [T, F] of each trajectory."""
         for row, length in enumerate(batch.lengths.tolist()):
-            blocks = self._of_trajectory(batch, row, length)
-            if not self._window:
-                yield from blocks
-                continue
-            rows = torch.from_numpy(np.concatenate(list(blocks)))
-            yield window_means(rows.unsqueeze(0), torch.tensor([length]), self._window, self._window)[0].numpy()
-
-    def _of_trajectory(self, batch: Batch, row: int, length: int) -> Iterator[np.ndarray]:
-        alone, first = batch.inputs.part(torch.tensor([row]), slice(0, length)), 0
-        for inputs in alone.chunks(FRAMES_AT_ONCE if alone.images else length):
-            loaded = inputs.loaded()
-            read = loaded.select(self._read) if self._read else loaded
-            pooled = [block_means(image[0]) for image in read.images.values()]
-            seen = torch.cat([read.vector[0], *pooled], dim=-1).double().numpy()
-            last = first + len(seen)
-            yield joined(seen, batch.actions[row, first:last].double().numpy()) if self._controls else seen
-            first = last
+            inputs = batch.inputs.part(torch.tensor([row]), slice(0, length))
+            rows = observed(inputs.select(self._read) if self._read else inputs)
+            if self._controls:
+                rows = joined(rows, batch.actions[row : row + 1, :length].double())
+            if self._window:
+                rows = window_means(rows, torch.tensor([length]), self._window, self._window)
+            yield rows[0].numpy()
 
 
 def most_rows(numbers: int) -> int:
@@ -117,9 +107,9 @@ def most_rows(numbers: int) -> int:
     return max(1, BYTES_AT_ONCE // (8 * max(1, numbers)))
 
 
-def joined(seen: np.ndarray, actions: np.ndarray) -> np.ndarray:
-    """Observations [steps, F] and controls [steps, A], standardised, as [steps, F + A] with equal weight on either."""
-    return np.concatenate([seen, np.sqrt(seen.shape[1] / actions.shape[1]) * actions], axis=1)
+def joined(seen: Tensor, actions: Tensor) -> Tensor:
+    """Observations [..., F] and controls [..., A], standardised, as [..., F + A] with equal weight on either."""
+    return torch.cat([seen, (seen.shape[-1] / actions.shape[-1]) ** 0.5 * actions], dim=-1)
 
 
 def equal_parts(batch: Batch, options: int) -> Tensor:

@@ -123,8 +123,12 @@ class Inputs:
         return torch.cat(vectors, -1) if vectors else torch.zeros(*self.batch, 0, device=self.time.device)
 
     def select(self, names: Sequence[str]) -> Inputs:
-        """These observations alone, in this order."""
-        return Inputs(_of(self.vectors, names), _of(self.images, names), self.time)
+        """These observations alone, in this order; nothing is read."""
+        if isinstance(self.images, Frames):
+            images: Mapping[str, Tensor] = replace(self.images, arrays=_of(self.images.arrays, names))
+        else:
+            images = _of(self.images, names)
+        return Inputs(_of(self.vectors, names), images, self.time)
 
     def chunks(self, steps: int) -> Iterator[Inputs]:
         """Consecutive parts of at most ``steps`` steps, and of at least one."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from operator import itemgetter
 from typing import Any
 
 import torch
@@ -27,15 +26,15 @@ def try_network(name: str, network: Network, shape: InputShape) -> None:
 
     :raises ShapeError: the network fails, gives another shape than [N, T, K, features], or the two differ.
     """
-    inputs = _random_inputs(shape)
+    inputs = _random_inputs(shape, TRAJECTORIES, STEPS)
     with _evaluating(network), torch.no_grad():
         _output(name, network, inputs)  # lazy modules have parameters from here on
         with _without_zeros(network):
             whole = _output(name, network, inputs)[0].double()
             rows = []
-            for steps in _trajectories(inputs):
+            for trajectory in range(TRAJECTORIES):
                 state: State | None = None
-                for step in steps:
+                for step in inputs.part(slice(trajectory, trajectory + 1), slice(None)).chunks(1):
                     row, state = _output(name, network, step, state)
                     rows.append(row.double())
             alone = torch.cat(rows, dim=1).reshape(whole.shape)
@@ -89,27 +88,15 @@ def _shapes(state: Any) -> list[torch.Size]:
     return [tensor.shape for tensor in state]
 
 
-def _random_inputs(shape: InputShape) -> Inputs:
-    """Vectors between 0 and 1, and images."""
-    generator, batch = torch.Generator().manual_seed(0), (TRAJECTORIES, STEPS)
-    vectors = {key: torch.rand(*batch, size, generator=generator) for key, size in shape.vectors.items()}
+def _random_inputs(shape: InputShape, trajectories: int, steps: int, dtype: torch.dtype = torch.float32) -> Inputs:
+    """Vectors between 0 and 1, images, and numbers of steps that a network has parameters for."""
+    generator, batch = torch.Generator().manual_seed(0), (trajectories, steps)
+    vectors = {key: torch.rand(*batch, size, generator=generator, dtype=dtype) for key, size in shape.vectors.items()}
     images = {
         key: torch.randint(256, (*batch, *image), generator=generator, dtype=torch.uint8)
         for key, image in shape.images.items()
     }
-    return Inputs(vectors, images, _times(shape, STEPS))
-
-
-def _times(shape: InputShape, steps: int) -> Tensor:
-    """Numbers of steps that a network has parameters for."""
-    return torch.arange(steps).clamp(max=shape.steps - 1)
-
-
-def _trajectories(inputs: Inputs) -> Iterator[list[Inputs]]:
-    """Every step of each trajectory as inputs of their own, N = T = 1."""
-    for trajectory in range(TRAJECTORIES):
-        places = [(slice(trajectory, trajectory + 1), slice(step, step + 1)) for step in range(STEPS)]
-        yield [inputs.map(itemgetter(place), inputs.time[place[1]]) for place in places]
+    return Inputs(vectors, images, torch.arange(steps).clamp(max=shape.steps - 1))
 
 
 @contextmanager
@@ -159,14 +146,10 @@ def _one_more(network: Network) -> tuple[int, int]:
 
 def _kept(network: Network, shape: InputShape, trajectories: int, steps: int) -> int:
     """Bytes of all tensors, parameters included, that torch keeps for the gradient."""
-    batch = (trajectories, steps)
     dtype = next((parameter.dtype for parameter in network.parameters()), torch.float32)
-    if network.trunk_size is None:
-        vectors = {key: torch.zeros(*batch, size, dtype=dtype) for key, size in shape.vectors.items()}
-        images = {key: torch.zeros(*batch, *image, dtype=torch.uint8) for key, image in shape.images.items()}
-        seen: Inputs | Tensor = Inputs(vectors, images, _times(shape, steps))
-    else:
-        seen = torch.zeros(*batch, *network.trunk_size, dtype=dtype)
+    seen: Inputs | Tensor = _random_inputs(shape, trajectories, steps, dtype)
+    if network.trunk_size is not None:
+        seen = torch.zeros(trajectories, steps, *network.trunk_size, dtype=dtype)
     storages: dict[int, int] = {}
 
     def keep(tensor: Tensor) -> Tensor:
