@@ -3,42 +3,48 @@
 from __future__ import annotations
 
 import torch
+from planted import LINEAR, small_spec
 
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs
-from ddco_pyro.spec import parse_spec
 
 SHAPES = {"state": (3,)}
 
 
-def make_hierarchy(counts=(3,), emits=("options",), network="mlp", seed=0, trunk=None, memoryless=(), **control):
+def make_hierarchy(
+    counts=(3,),
+    emits=("options",),
+    network="mlp",
+    seed=0,
+    memoryless=(),
+    ends=LINEAR,
+    lowest=None,
+    parts=None,
+    steps=4,
+    **control,
+):
     """A random hierarchy over 3 features and 2 control dimensions; ``counts`` lowest level first.
 
+    :param network: of all policies; ``lowest`` are those that act, ``ends`` terminations, if they are others.
     :param memoryless: numbers of the levels, 1 the lowest, whose options end after every step.
     """
     reads = network if isinstance(network, dict) else {"network": network}
-    levels = [{"name": f"level-{d}", "count": k, "policy": dict(reads)} for d, k in enumerate(counts, 1)]
-    for number in memoryless:
-        levels[number - 1]["termination"] = "always"
-    for level in levels if trunk else ():
-        level["trunk"] = trunk
-    for level in levels[1:]:
-        level["policy"]["emits"] = list(emits)
-    spec = parse_spec(
+    caller, whole = reads | {"emits": list(emits)}, {"control": {"std": 0.7, **control}}
+    levels = [
         {
-            "demonstrations": {"path": "unused.hdf5"},
-            "observations": ["state"],
-            "control": {"std": 0.7, **control},
-            **(
-                {"hierarchy": {"levels": levels, "meta_policy": {**reads, "emits": list(emits)}}}
-                if counts
-                else {"baseline": "flat"}
-            ),
+            "name": f"level-{d}",
+            "count": k,
+            "policy": caller if d > 1 else lowest or reads,
+            "termination": "always" if d in memoryless else ends,
         }
-    )
+        for d, k in enumerate(counts, 1)
+    ]
+    if counts:
+        whole["hierarchy"] = {"levels": levels, "meta_policy": caller}
+    spec = small_spec(counts, lowest or reads, **whole)
     torch.manual_seed(seed)
-    return Hierarchy(spec, SHAPES, 2, steps=4)
+    return Hierarchy(spec, SHAPES, 2, steps, parts=parts)
 
 
 def varied(hierarchy):

@@ -9,7 +9,7 @@ import pytest
 import torch
 import yaml
 from bimanual import bimanual
-from hierarchies import SHAPES, make_batch
+from hierarchies import make_batch, make_hierarchy
 from planted import LINEAR, make_spec, make_trainer, small_spec
 from random_demonstrations import demonstrations
 from scipy import optimize, stats
@@ -25,8 +25,7 @@ from ddco_pyro.data.starting import starting_spec
 from ddco_pyro.evaluation import effort, verdicts
 from ddco_pyro.inference import log_likelihood, segment
 from ddco_pyro.model.batch import Batch, encode
-from ddco_pyro.model.emissions import KINDS, Information
-from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.emissions import KINDS
 from ddco_pyro.model.outputs import bounded
 from ddco_pyro.spec import RidgeSpec, parse_spec, with_overrides
 from ddco_pyro.training import em
@@ -75,16 +74,7 @@ def linear(counts, parts=None, emits=("options",), memoryless=(), above=LINEAR, 
 
     ``lowest`` are the policies that act, ``above`` all other networks.
     """
-    caller, whole = above | {"emits": list(emits)}, {"control": {"std": 0.7} | control}
-    if counts:
-        ends = ["always" if d in memoryless else above for d in range(1, 1 + len(counts))]
-        levels = [
-            {"name": f"level-{d}", "count": count, "policy": caller if d else lowest, "termination": end}
-            for d, (count, end) in enumerate(zip(counts, ends, strict=True))
-        ]
-        whole["hierarchy"] = {"levels": levels, "meta_policy": caller}
-    torch.manual_seed(0)
-    return Hierarchy(small_spec(counts, lowest, **whole), SHAPES, 2, steps=9, parts=parts)
+    return make_hierarchy(counts, emits, above, 0, memoryless, above, lowest, parts, steps=9, **control)
 
 
 def score(tables, piece, rows=None):
@@ -268,18 +258,6 @@ def test_levels_are_discovered_under_a_uniform_meta_policy(discovering):
 def _at_floor(model, name):
     caller = model.get_submodule(name.rsplit(".std.", 1)[0])
     return bool((caller.std() < caller.std.floor + 2e-4).any())
-
-
-def test_the_information_of_logits_is_at_least_fishers():
-    """Its difference to diag(p) - pp^T has no negative eigenvalue; of two choices, no smaller one will do."""
-    logits, weight = 3 * torch.randn(4, 6, 2, 5, dtype=torch.float64), torch.rand(4, 6, 2, dtype=torch.float64)
-    for some in (logits, logits[..., :2]):
-        p = some.softmax(-1)
-        bound = Information.of_logits(slice(0, 5), weight, p).weight
-        fisher = weight[..., None, None] * (p.diag_embed() - p.unsqueeze(-1) * p.unsqueeze(-2))
-        assert torch.linalg.eigvalsh(bound.diag_embed() - fisher).min() > -1e-12
-    apart = torch.tensor([1.0, -1.0], dtype=torch.float64)
-    torch.testing.assert_close((bound * apart.square()).sum(-1), fisher @ apart @ apart)
 
 
 def rows_of(batch):
