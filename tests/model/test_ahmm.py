@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -62,26 +61,6 @@ def test_latents_are_as_frequent_as_the_sum_over_paths_says(counts, hybrid, step
         for name, p in expected.items():
             error = np.sqrt(p * (1 - p) / SAMPLES)
             assert (np.abs(found[name].numpy() - p) <= 4.5 * error + 1e-12).all(), (name, d, found[name], p)
-
-
-def test_what_is_sampled_has_the_probability_of_the_paper():
-    """By hand: h_0 by η, then ended by ψ and selected again by η (or kept by 1 − ψ); the densities of the controls."""
-    eta, psi, density = 0.7, 0.2, (1.5, -0.5)
-    selection = torch.tensor([0.0, eta, 1 - eta]).double().log().expand(1, 2, 1, 3)
-    termination = torch.tensor([1 - psi, psi]).double().log().expand(1, 2, 2, 2)
-    control = torch.tensor([density]).double().expand(1, 2, 2)
-    tables = Tables((selection,), (termination,), (control, torch.full((1, 2, 1), NEVER)))
-    seen = Counter()
-    for seed in range(60):
-        trace = run_forward(tables, torch.tensor([2]), seed)
-        h, b = latents(trace, 1, 2)
-        (first, second), ended = h[0, :, 0].tolist(), int(b[0, 1, 0])
-        chosen = {1: eta, 2: 1 - eta}
-        expected = chosen[first] * (psi * chosen[second] if ended else 1 - psi)
-        expected_log = np.log(expected) + density[first - 1] + density[second - 1]
-        assert float(trace.log_prob_sum()) == pytest.approx(expected_log, abs=1e-6)
-        seen[first, ended, second] += 1
-    assert len(seen) >= 4
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------

@@ -132,21 +132,15 @@ def test_a_planted_sigma_of_the_state_is_found(fitted):
     assert other.log_likelihood_per_step.valid == pytest.approx(constant, abs=0.02)
     assert other.difference.nats_per_step > 10 * other.difference.standard_error > 0
     assert fit.metrics.engine_check.gradient < 1e-6
+    assert fit.metrics.parameters == 2 * 4 + 4  # two means and two y of two observations
+    assert fit.baselines["flat_2"].metrics.parameters == 2 * 2 + 2 + 2
+    np.testing.assert_array_equal(ddco_pyro.load(fit.folder).log_likelihood(demos), fit.log_likelihood(demos))
+    assert sum(fit.metrics.log_likelihood_by_dimension.valid.by_dimension) == pytest.approx(found, rel=1e-5)
 
 
 def _rows(demos):
     states = np.concatenate([demo.observations["state"] for demo in demos])
     return np.column_stack([states, np.ones(len(states))]), np.concatenate([demo.actions for demo in demos])
-
-
-def test_it_is_counted_saved_and_decomposed(fitted):
-    fit, demos, _ = fitted
-    assert fit.metrics.parameters == 2 * 4 + 4  # two means and two y of two observations
-    assert fit.baselines["flat_2"].metrics.parameters == 2 * 2 + 2 + 2
-    again = ddco_pyro.load(fit.folder)
-    np.testing.assert_array_equal(again.log_likelihood(demos), fit.log_likelihood(demos))
-    each = fit.metrics.log_likelihood_by_dimension.valid
-    assert sum(each.by_dimension) == pytest.approx(fit.metrics.log_likelihood_per_step.valid, rel=1e-5)
 
 
 # --- what is refused --------------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ import yaml
 from command_line import call, with_set
 
 import ddco_pyro
-from ddco_pyro.spec import SpecError, load_spec, parse_spec, user_code, with_overrides
+from ddco_pyro.spec import SpecError, user_code, with_overrides
 from ddco_pyro.training.data import demonstrations
 
 MODULE = """
@@ -141,14 +141,6 @@ def test_what_is_built_in_or_registered_is_no_user_code(toy_spec: Any) -> None:
     assert user_code(toy_spec) == {}
     assert user_code(with_overrides(toy_spec, {"task": "needle"})) == {}
     assert user_code(with_overrides(toy_spec, {"task": "toy_task:task"})) == {"task": "toy_task:task"}
-
-
-def test_in_python_code_is_allowed_by_name(spec: Path, imported: Path) -> None:
-    with pytest.raises(SpecError, match=r"task: would import user code \(careless:task\)"):
-        load_spec(spec, [PLACES[0][0]])
-    assert load_spec(spec, [PLACES[0][0]], allow_code=True).task == TASK
-    assert not imported.exists()
-    assert parse_spec(yaml.safe_load(toy_task.SPEC.replace("task: toy", f"task: {TASK}"))).task == TASK
 
 
 @pytest.mark.slow

@@ -399,27 +399,28 @@ def test_a_flat_policy_for_each_time_step_is_least_squares_at_that_step():
     assert last == pytest.approx(truth, abs=1e-6)
 
 
-def test_linear_networks_are_trained_by_em_unless_the_spec_asks_for_gradient_steps():
-    level, mlp = {"count": 2, "policy": LINEAR}, {"network": "mlp", "hidden": [4]}
-    own = {"levels": [level], "meta_policy": LINEAR}
+MLP = {"network": "mlp", "hidden": [4]}
+LEVEL = {"count": 2, "policy": LINEAR}
 
-    def chosen(counts=(2,), **sections):
-        return small_spec(counts, **sections).training.optimizer.name
 
-    constant = own | {"meta_policy": CONSTANT, "levels": [level | {"termination": CONSTANT}]}
-    assert chosen(hierarchy=constant) == "em"
-    assert chosen() == chosen(()) == chosen(training={"optimizer": {"ridge": {"policy": 2}}}) == "em"
-    for asked in ({"optimizer": {"lr": 0.1}}, {"optimizer": {"name": "adam"}}, {"average": 0.9}):
-        assert chosen(training=asked) == "adam"
-    for changed in (
-        {"meta_policy": mlp},
-        {"trunk": mlp},
-        {"levels": [level | {"trunk": mlp}]},
-        {"levels": [level | {"termination": mlp}]},
-    ):
-        assert chosen(hierarchy=own | changed) == "adam"
-    assert chosen((), baseline={"kind": "per_timestep", "policy": LINEAR}) == "adam"
-    assert chosen(training={"optimizer": {"name": "em"}}, hierarchy=own | {"meta_policy": mlp}) == "em"
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("em", {}),
+        ("em", {"hierarchy": {"levels": [LEVEL | {"termination": CONSTANT}], "meta_policy": CONSTANT}}),
+        ("em", {"hierarchy": None, "baseline": {"kind": "flat", "policy": LINEAR}}),
+        ("em", {"training.optimizer.ridge.policy": 2}),
+        ("em", {"training.optimizer.name": "em", "hierarchy.meta_policy": MLP}),
+        ("adam", {"hierarchy": None, "baseline": {"kind": "per_timestep", "policy": LINEAR}}),
+        *(("adam", {f"training.{key}": value}) for key, value in (("optimizer.lr", 0.1), ("average", 0.9))),
+        ("adam", {"training.optimizer.name": "adam"}),
+        *(("adam", {f"hierarchy.{key}": MLP}) for key in ("trunk", "meta_policy", "levels.0.trunk")),
+        ("adam", {"hierarchy.levels.0.termination": MLP}),
+    ],
+)
+def test_linear_networks_are_trained_by_em_unless_the_spec_asks_for_gradient_steps(name, changes):
+    data = {"task": "toy", "observations": ["state"], "hierarchy": {"levels": [LEVEL], "meta_policy": LINEAR}}
+    assert parse_spec(data, changes).training.optimizer.name == name
 
 
 def test_tuning_demonstrations_decide_nothing_before_the_last_stage():

@@ -410,33 +410,26 @@ def test_a_run_says_for_which_labels_its_options_stand(files):
 # --- labels of several levels -----------------------------------------------------------------------------------------
 
 
-def demonstrations():
-    random, phase = np.random.default_rng(0), np.repeat([0, 1, 2, 3], 4)
-    labels = {"phase": phase, "half": np.where(np.arange(16) == 8, -1, phase // 2)}
-    places = (phase[:, None] + 0.1 * random.normal(size=(16, 1)) for _ in range(6))
-    return numbered(({"state": place}, random.normal(size=(16, 1)), labels) for place in places)
-
-
 @pytest.mark.parametrize(("labels", "names"), [(["phase", "half"], ["phase", "half"]), ("half", ["half", "half"])])
-def test_each_level_is_measured_with_its_own_labels(tmp_path, monkeypatch, labels, names):
-    monkeypatch.chdir(tmp_path)
-    demonstrations().write(tmp_path / "demos.hdf5")
+def test_each_level_is_measured_with_its_own_labels(tmp_path, labels, names):
+    random, phase = np.random.default_rng(0), np.repeat([0, 1, 2, 3], 4)
+    own = {"phase": phase, "half": np.where(np.arange(16) == 8, -1, phase // 2)}
+    places = (phase[:, None] + 0.1 * random.normal(size=(16, 1)) for _ in range(6))
+    demos = numbered(({"state": place}, random.normal(size=(16, 1)), own) for place in places)
     files = {"path": "demos.hdf5", "labels": labels, "valid_fraction": 0.34}
     spec = small_spec((3, 2), demonstrations=files, training={"epochs": 3, "layerwise": False})
-    fit = ddco_pyro.fit(spec, out=tmp_path / "run")
-    metrics = fit.metrics.agreement
+    fit = ddco_pyro.fit(spec, demos, out=tmp_path / "run")
+    metrics, valid = fit.metrics.agreement, demos.select([row.name for row in fit.metrics.valid])
     assert metrics.labels == names
-    valid = demonstrations().select([row.name for row in fit.metrics.valid])
     measured = zip(fit.segment(valid), names, metrics.valid, metrics.confusion, strict=True)
     for level, name, found, table in measured:
         truth = [demo.labels[name] for demo in valid]
         assert found == agreement(level, truth)
         assert np.sum(table.steps) == sum((one >= 0).sum() for one in truth)
-    if labels == "half":
-        return
-    page = write_report(ddco_pyro.load(tmp_path / "run"), fit.demonstrations).read_text()
+    page = write_report(fit, demos).read_text()
     for level, name in zip(("level-1", "level-2"), names, strict=True):
         assert f"Where each label’s steps lie: level “{level}”, label “{name}”" in page
-    assert call("segment", "run", "demos.hdf5", "--html", "page.html").status == 0
+    demos.write(tmp_path / "demos.hdf5")
+    assert call("segment", fit.folder, tmp_path / "demos.hdf5", "--html", tmp_path / "page.html").status == 0
     shown = (tmp_path / "page.html").read_text()
     assert [shown.count(f"Agreement with the label “{name}”") for name in names] == [names.count(one) for one in names]

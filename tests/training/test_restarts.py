@@ -101,7 +101,7 @@ def test_em_that_is_interrupted_begins_its_restart_again_and_gives_the_same_bits
 
 
 class Scripted:
-    """Restarts whose objectives were written down before: after the first epochs, and at the end."""
+    """Restarts whose objectives were written down before: after the first epochs, and at the end; −∞ diverged."""
 
     def __init__(self, sounded, ends):
         self.sounded, self.ends = sounded, ends
@@ -113,7 +113,8 @@ class Scripted:
         now.done = until is None
         if now.done:
             now.objective, now.best, now.ended = self.ends[now.restart], 0.0, [ENDED]
-        restart.states = {"best": data.hierarchy(now.restart).state_dict()}
+            now.diverged = "why" if now.objective == -np.inf else None
+        restart.states = {} if now.diverged else {"best": data.hierarchy(now.restart).state_dict()}
         return restart
 
 
@@ -247,16 +248,7 @@ def test_a_restart_that_diverges_ends_there_and_is_not_the_best(demos, tmp_path,
 
 
 def test_where_those_that_are_left_diverge_the_stopped_ones_go_on(demos, tmp_path, monkeypatch):
-    def train(data, restart, until, checkpoint=None, on_event=None):
-        now = restart.progress
-        now.epoch, now.sounded, now.done = 1, [0.0, -1.0, -2.0][now.restart], until is None
-        if until is None:
-            now.diverged = "why" if now.restart == 0 else None
-            now.objective, now.ended = (-np.inf if now.restart == 0 else -1.0 * now.restart), [ENDED]
-        restart.states = {} if now.diverged else {"best": data.hierarchy(now.restart).state_dict()}
-        return restart
-
-    monkeypatch.setattr(restarting, "train", train)
+    monkeypatch.setattr(restarting, "train", Scripted([0.0, -1.0, -2.0], [-np.inf, -1.0, -2.0]))
     trainer = make_trainer(diverging(1, starts=["random"] * 3), demos, tmp_path)
     trainer.run()
     assert trainer.best == 1

@@ -134,17 +134,4 @@ def test_a_planted_level_is_found(seed):
     np.testing.assert_allclose(constants.termination[0] * (1 - constants.selection[1][0]), 0.1, atol=0.04)
 
 
-def test_labels_say_which_option_is_which():
-    """A label at one step of each names both options above, whichever way the search would have named them."""
-    tables, above = planted_pairs()
-    lengths = torch.full((20,), 40)
-    for numbers in ([1, 2], [2, 1]):
-        truth = torch.tensor(numbers)[torch.tensor(above)]
-        labels = torch.full((20, 40), -1)
-        labels[:3] = truth[:3]
-        constants = fitted([(tables.clamp(2, labels), lengths)], seed=0)
-        segments = segment(constants.within(tables), lengths)[1]
-        assert (segments == truth)[3:].double().mean() > 0.85
-
-
 # --- the spec ---------------------------------------------------------------------------------------------------------
