@@ -1,4 +1,4 @@
-"""The contents of ``metrics.json`` (:class:`Metrics`), and reading JSON and CSV files of a run.
+"""The contents of ``metrics.json`` (:class:`Metrics`), how its numbers are shown (:data:`METRICS`), and reading files.
 
 Log-likelihoods are in nats.
 """
@@ -10,14 +10,12 @@ import io
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from operator import not_
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Generic, TypeVar
+from typing import Annotated, Any, ClassVar, Generic, NamedTuple, TypeVar
 
 from pydantic import (
     BaseModel,
     ConfigDict,
-    Discriminator,
     Field,
-    Tag,
     TypeAdapter,
     ValidationError,
     model_validator,
@@ -34,6 +32,39 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 AtLeastOne = Annotated[int, Field(ge=1)]
 LeftOut = Annotated[T, Field(exclude_if=not_)]
 """A field that is left out of the file where it is empty."""
+
+
+class Metric(NamedTuple):
+    """How a number of a run is called and shown, by console, report, comparison and studies alike.
+
+    Over training seeds it is a mean with its 95 % t interval.
+
+    :param unit: of a difference; ``scale`` times the number has it.
+    :param digits: after the point.
+    """
+
+    name: str
+    unit: str = ""
+    scale: float = 1.0
+    digits: int = 2
+
+
+METRICS: Mapping[str, Metric] = {
+    "log_likelihood": Metric("held-out nats/step", "nats per step"),
+    "success": Metric("Success", "points of success", 100, 0),
+    "nmi": Metric("NMI"),
+    "ari": Metric("ARI"),
+    "boundary_f1_1": Metric("boundary F1 ±1"),
+    "boundary_f1_3": Metric("boundary F1 ±3"),
+    "boundary_f1_5": Metric("boundary F1 ±5"),
+    "accuracy": Metric("accuracy"),
+    "iou": Metric("IoU"),
+    "f1_10": Metric("F1@10"),
+    "f1_25": Metric("F1@25"),
+    "f1_50": Metric("F1@50"),
+    "edit": Metric("edit"),
+}
+"""Every metric of a run, by its field; a task's own measures are called as the task calls them."""
 
 
 class Record(BaseModel):
@@ -236,16 +267,6 @@ class Below(Record):
     objective: Finite
     nats: Finite
 
-    CLOSE: ClassVar[float] = 0.01
-    """An objective that is lower by less is as high."""
-    NEAR: ClassVar[float] = 0.05
-    """The same of the log-likelihood, which training raises only where controls count fully."""
-
-    @property
-    def told(self) -> bool:
-        """Whether the hierarchy ended in a worse optimum."""
-        return self.objective > self.CLOSE or self.nats > self.NEAR
-
 
 class Against(Record):
     """Successes of two methods from the same initial states (McNemar's test)."""
@@ -256,21 +277,16 @@ class Against(Record):
     p_value: Finite
 
 
-class Parts(Record, Generic[T]):
-    """The parts of the hierarchy's advantage (:mod:`ddco_pyro.statistics`), and the flat baseline's name."""
+class Worth(Record, Generic[T]):
+    """The parts of the hierarchy's advantage (:mod:`ddco_pyro.statistics`), and the flat baseline's name.
+
+    In nats per step a part is a :class:`Difference`, in success :class:`Against`.
+    """
 
     memory: T
     experts: LeftOut[T | None] = None
     total: LeftOut[T | None] = None
     flat: LeftOut[str | None] = None
-
-
-class Worth(Parts[Difference]):
-    """The parts in nats per step."""
-
-
-class SuccessWorth(Parts[Against]):
-    """The parts in success."""
 
 
 class Seeds(Record):
@@ -406,11 +422,7 @@ class Mean(Record):
     interval: tuple[Finite, Finite] | None
 
 
-def _kind(measure: Any) -> str:
-    return "[Rate]" if isinstance(measure, Rate) or (isinstance(measure, dict) and "rate" in measure) else "[Mean]"
-
-
-Measure = Annotated[Annotated[Rate, Tag("[Rate]")] | Annotated[Mean, Tag("[Mean]")], Discriminator(_kind)]
+Measure = Rate | Mean
 """A measure of episodes."""
 
 
@@ -435,7 +447,7 @@ class Rollouts(Record):
     seed: int
     episodes: AtLeastOne
     methods: dict[str, Method]
-    worth: LeftOut[SuccessWorth | None] = None
+    worth: LeftOut[Worth[Against] | None] = None
     seeds: LeftOut[SuccessOfSeeds | None] = None
 
     @property
@@ -555,7 +567,7 @@ class Metrics(Record, frozen=False):
     valid: list[HeldOut]
     demonstrations_by_likelihood: list[Listed]
     comparison: dict[str, Compared]
-    worth: LeftOut[Worth | None] = None
+    worth: LeftOut[Worth[Difference] | None] = None
     below: LeftOut[dict[str, Below]] = {}
     """By the name of each mixture among the baselines that the hierarchy contains."""
     branches: LeftOut[list[BranchUse]] = []

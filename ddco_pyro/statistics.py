@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ddco_pyro.metrics import Difference, SuccessWorth, Worth
+from ddco_pyro.metrics import Against, Difference, Worth
 from ddco_pyro.names import FLAT, MIXTURE
 
 CONFIDENCE = 0.95
@@ -106,7 +106,7 @@ def paired(ours: np.ndarray, theirs: np.ndarray, lengths: np.ndarray) -> Differe
     return Difference(nats_per_step=mean, standard_error=error)
 
 
-def worth(ours: str, values: Mapping[str, np.ndarray], lengths: Sequence[int]) -> Worth | None:
+def worth(ours: str, values: Mapping[str, np.ndarray], lengths: Sequence[int]) -> Worth[Difference] | None:
     """The parts of a hierarchy's advantage in held-out log-likelihood per step, as paired differences.
 
     ``memory`` is hierarchy − mixture: both have the same policies and gate, and in the hierarchy alone options last.
@@ -119,16 +119,16 @@ def worth(ours: str, values: Mapping[str, np.ndarray], lengths: Sequence[int]) -
     """
     steps = np.array(lengths, dtype=float)
     parts = _parts(ours, values, lambda one, other: paired(one, other, steps))
-    return Worth(**parts) if parts else None
+    return Worth[Difference](**parts) if parts else None
 
 
-def success_worth(ours: str, successes: Mapping[str, Sequence[float]]) -> SuccessWorth | None:
+def success_worth(ours: str, successes: Mapping[str, Sequence[float]]) -> Worth[Against] | None:
     """The same parts for success in rollouts (:func:`ddco_pyro.statistics.paired_difference`).
 
     :param successes: success (1) or not (0) of each episode, by method.
     """
     parts = _parts(ours, successes, paired_difference)
-    return SuccessWorth(**parts) if parts else None
+    return Worth[Against](**parts) if parts else None
 
 
 def _parts(ours: str, values: Mapping[str, Any], difference: Callable[[Any, Any], Any]) -> dict[str, Any]:

@@ -54,7 +54,7 @@ figures = needle.folder / "figures"
 # Each colour is an option of the most likely path, along the way of the gripper:
 
 # %%
-Image(figures / "trajectories.png")
+SVG(figures / "trajectories.svg")
 
 # %% [markdown]
 # ## How are they used?

@@ -83,7 +83,7 @@ Markdown(verdicts.verdict(mine.metrics))
 # The way of the hand, coloured by the most likely option; the report beside it has the options over time:
 
 # %%
-Image(mine.folder / "figures" / "trajectories.png")
+SVG(mine.folder / "figures" / "trajectories.svg")
 
 # %%
 agreement = mine.metrics.agreement

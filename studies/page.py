@@ -19,7 +19,6 @@ from ddco_pyro.data.files import write_text
 from ddco_pyro.drawing import words
 from ddco_pyro.drawing.page import Table
 from ddco_pyro.errors import BadInput, nearest
-from ddco_pyro.evaluation.agreement import MATCHED, UNMATCHED, measure_names
 from studies import statistics
 from studies.cells import ROOT, Folder, State
 from studies.declaration import NATS, Study
@@ -33,9 +32,7 @@ SETTING = re.compile(r"(study|task|seed|form|show|times|by)=(.*)")
 
 def name_of(measure: str) -> str:
     """The name of a measure in tables."""
-    if measure in (*UNMATCHED, *MATCHED):
-        return measure_names([measure])[0]
-    return "held-out nats/step" if measure == NATS else words.measure(measure) if measure.islower() else measure
+    return words.measure("log_likelihood" if measure == NATS else measure) if measure.islower() else measure
 
 
 def shown(known: Estimate, form: str = ".2f") -> str:

@@ -16,8 +16,8 @@ from ddco_pyro.drawing import words
 from ddco_pyro.drawing.figures import Interval, Panel, interval_plot, save, style
 from ddco_pyro.drawing.page import Block, Cell, Page, Picture, Section, Table, Text, note
 from ddco_pyro.evaluation import effort, verdicts
-from ddco_pyro.evaluation.agreement import EXPLAINED, UNMATCHED, measure_names
-from ddco_pyro.metrics import Rate
+from ddco_pyro.evaluation.agreement import EXPLAINED, UNMATCHED
+from ddco_pyro.metrics import METRICS, Rate
 from ddco_pyro.names import HIERARCHY, method
 from ddco_pyro.report.likelihood import SHOWN
 from ddco_pyro.segmenting.page import anchor
@@ -81,7 +81,7 @@ def agreement_table(compared: Comparison) -> Table | None:
         [row["run"], row["level"], row["labels"], *(words.number(row[measure], 3) for measure in measures)]
         for row in compared.agreement
     ]
-    head = ["run", "level", "labels", *measure_names(measures)]
+    head = ["run", "level", "labels", *(METRICS[measure].name for measure in measures)]
     return Table(head, rows, {0, 1, 2}, "agreement with labels, held out") if rows else None
 
 
@@ -117,11 +117,11 @@ def verdict(compared: Comparison) -> str:
     models = verdicts.Models(each, train, steps, kinds, compared.marginal)
     told = [" ".join(doubt) for name in each for doubt in models.doubts(name)]
     leads = {row.name: models.lead(best.name, row.name) for row in others}
-    told.append(verdicts.explains(best.name, leads, len(steps)))
+    told.append(models.explains(best.name, leads))
     runs = [row.model for row in compared.rows]
     alone = {row.model: each[row.name] for row in compared.rows if runs.count(row.model) == 1}
     if models.sound() and (found := worth(HIERARCHY, alone, compared.steps)):
-        told.append(verdicts.lasting(found, len(steps)))
+        told.append(models.lasting(found.memory))
         told += [] if compared.rollouts else [verdicts.said("success", "few")]
     rising = effort.rising(row.name for row in compared.rows if not row.training.converged)
     return f"{' '.join(told)}{rising}"

@@ -86,6 +86,7 @@ class Decided(NamedTuple):
     :param window: ``training.window``; 0 for none.
     :param why: the length of segments that came of it, in words.
     :param heavy: control dimensions for one Student t.
+    :param moved: the observation that is drawn as a path in space; empty for none.
     """
 
     power: float = 0.5
@@ -93,6 +94,7 @@ class Decided(NamedTuple):
     window: int = 0
     why: str = "times the control's log-density counts: less makes options last longer, as init --segment 2s does"
     heavy: tuple[int, ...] = ()
+    moved: str = ""
 
 
 class Starting(NamedTuple):

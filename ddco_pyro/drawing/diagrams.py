@@ -157,6 +157,28 @@ def typical_paths(paths: Sequence[np.ndarray], segments: Sequence[tuple[int, int
     return svg(width, height, "Trajectories of typical segments", parts)
 
 
+MOST_PATHS = 40
+"""Demonstrations in a drawing of all."""
+
+
+def paths_of_options(paths: Sequence[np.ndarray], options: Sequence[np.ndarray]) -> Markup:
+    """Whole demonstrations, each step in the colour of its option; a circle is a first step.
+
+    :param paths: of demonstrations in the plane [P, T, 2]; at most :data:`MOST_PATHS` of them are drawn, evenly spread.
+    :param options: the most likely options of each [T].
+    """
+    rows = np.unique(np.linspace(0, len(paths) - 1, min(len(paths), MOST_PATHS)).round().astype(int))
+    parts: list[str] = []
+    for row, placed in zip(rows, fitted([paths[row] for row in rows], WIDTH, WIDTH / 2), strict=True):
+        starts = np.flatnonzero(np.diff(options[row], prepend=-1))
+        for place, path in enumerate(placed):
+            looks = {"stroke_width": 1.5, "stroke_dasharray": DASHES[LINES[place % len(LINES)]]}
+            for start, end in zip(starts, [*starts[1:], len(path) - 1], strict=True):
+                parts.append(line(path[start : end + 1], stroke=option_colour(int(options[row][start])), **looks))
+            parts.append('<circle cx="{:.1f}" cy="{:.1f}" r="3" fill="white" stroke="#222222"/>'.format(*path[0]))
+    return svg(WIDTH, WIDTH / 2, "Trajectories coloured by option", parts)
+
+
 def curves(values: Mapping[str, Sequence[np.ndarray]], colour: str) -> Markup:
     """A panel for each name: lines over the steps since the onset.
 

@@ -14,12 +14,6 @@ from ddco_pyro.spec import PathSpec
 LEAST_OBLIQUE = 15.0
 """Degrees between the view and an axis, at least; a view along an axis hides the axis' scale."""
 
-SLOW = 0.1
-"""A step is a movement from this part of the root mean square step on."""
-
-UNEXPLAINED = 0.2
-"""Weight of movement that controls do not explain, beside movement that they explain."""
-
 MOST_STRETCHED = 4.0
 """Axes whose ranges differ by more than this factor are not drawn to one scale."""
 
@@ -31,12 +25,6 @@ MOST_SKIPPED = 4
 
 
 # --- paths in space ---------------------------------------------------------------------------------------------------
-
-
-def paths_of(named: Sequence[PathSpec] | None, demos: Demonstrations) -> tuple[PathSpec, ...]:
-    """The paths that are drawn of each demonstration: the named ones, else that of :func:`position_key`."""
-    key = None if named else position_key(demos)
-    return tuple(named or ()) if key is None else (PathSpec(key=key),)
 
 
 def positions(demo: Demonstration, paths: Sequence[PathSpec]) -> np.ndarray:
@@ -58,76 +46,6 @@ def in_words(paths: Sequence[PathSpec], demos: Demonstrations) -> str:
 
 LINES = ("solid", "dashed", "dotted")
 """Of several paths, in turn."""
-
-
-def position_key(demos: Demonstrations) -> str | None:
-    """The vector that controls :func:`move <movement>` most, of three numbers or more, or else of two; None without.
-
-    An object that the hand moves later may move more than the hand, but controls say less of where the object goes.
-    """
-    shapes, controls = demos.observation_shapes, [demo.actions.astype(float) for demo in demos]
-    for keys in (
-        [key for key, shape in shapes.items() if len(shape) == 1 and shape[0] >= 3],
-        [key for key, shape in shapes.items() if shape == (2,)],
-    ):
-        moves = {}
-        for key in keys:
-            values = [np.asarray(demo.observations[key]) for demo in demos]
-            if moved := movement(values):
-                moves[key] = moved * (UNEXPLAINED + (1 - UNEXPLAINED) * _explained(values, controls))
-        if moves:
-            return max(moves, key=moves.__getitem__)
-    return None
-
-
-def movement(values: Sequence[np.ndarray]) -> float:
-    """How much the first three of n numbers [T, n] move like a position, 0 to 1. The product of four factors:
-
-    - Standard deviation within demonstrations over the total one: 0 for a goal that is constant in a demonstration.
-    - Diagonal of the box around a demonstration over the length of T steps of its root mean square step: 1 along a
-      straight line at one speed, near 0 for a velocity or noise.
-    - The share of the numbers that is drawn, 3 / n, or 1 of two.
-    - The share of the steps that move by at least a tenth of the root mean square step: low for what moves late.
-
-    It is 0 for numbers of constant norm, such as a sine and a cosine, or a quaternion.
-    """
-    norms = np.concatenate([np.linalg.norm(array.astype(float), axis=1) for array in values])
-    if np.ptp(norms) <= 1e-3 * norms.max():
-        return 0.0
-    points = [array[:, :3].astype(float) for array in values]
-    reach = float(np.mean([_reach(path) for path in points]))
-    if reach == 0:
-        return 0.0
-    within = np.mean([path.var(0).sum() for path in points])
-    between = np.array([path.mean(0) for path in points]).var(0).sum()
-    steps = [np.square(np.diff(path, axis=0)).sum(1) for path in points]
-    moves = float(np.mean([np.mean(each > SLOW**2 * each.mean()) if len(each) else 0.0 for each in steps]))
-    return float(np.sqrt(within / (within + between))) * reach * moves * points[0].shape[1] / values[0].shape[1]
-
-
-def _explained(values: Sequence[np.ndarray], controls: Sequence[np.ndarray]) -> float:
-    """The share, 0 to 1, of the changes of the first three numbers [T, n] that controls [T, A] explain linearly.
-
-    Of these changes from step to step, the part counts that the numbers themselves do not explain. A control may be a
-    velocity or a target.
-    """
-    before = np.concatenate([array[:-1, :3].astype(float) for array in values])
-    changes = np.concatenate([np.diff(array[:, :3].astype(float), axis=0) for array in values])
-    commands = np.concatenate([control[:-1] for control in controls])
-
-    def left(*by: np.ndarray) -> float:
-        rows = np.column_stack([np.ones(len(changes)), *by])
-        return float(np.square(changes - rows @ np.linalg.lstsq(rows, changes, rcond=None)[0]).sum())
-
-    alone = left(before)
-    return 1 - left(before, commands) / alone if alone > 0 else 0.0
-
-
-def _reach(points: np.ndarray) -> float:
-    """The diagonal of the box around positions [T, 3], over T - 1 times the root mean square of their steps."""
-    steps = np.diff(points, axis=0)
-    length = np.sqrt(np.square(steps).sum() * len(steps))
-    return float(np.linalg.norm(np.ptp(points, axis=0)) / length) if length > 0 else 0.0
 
 
 def view(points: np.ndarray, span: np.ndarray) -> tuple[float, float]:

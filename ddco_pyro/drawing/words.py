@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from ddco_pyro.metrics import Against, Difference, Rate
+from ddco_pyro.metrics import METRICS, Against, Difference, Rate
 from ddco_pyro.names import HIERARCHY, METHODS, method
 from ddco_pyro.statistics import mean_interval
 
@@ -75,7 +75,9 @@ def rate(result: Rate, of: str = "") -> str:
 
 
 def measure(name: str) -> str:
-    """``accuracy_mm`` as ``Accuracy (mm)``."""
+    """A measure as people read it: ``nmi`` is ``NMI``, and a task's own ``accuracy_mm`` is ``Accuracy (mm)``."""
+    if name in METRICS:
+        return METRICS[name].name
     base, _, unit = name.rpartition("_")
     units = {"mm", "cm", "m", "s", "rad", "deg", "steps"}
     text = f"{base} ({unit})" if base and unit in units else name
@@ -86,20 +88,20 @@ def capital(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
-def mean_and_interval(values: Sequence[float], scale: float = 1, digits: int = 2) -> str:
-    """``+1.00 [0.50 to 1.50]``: the mean of a few values with its 95 % t interval."""
+def over_seeds(name: str, values: Sequence[float]) -> str:
+    """``+1.00 [0.50 to 1.50]``: the mean of differences over training seeds with its 95 % t interval.
+
+    :param name: of :data:`~ddco_pyro.metrics.METRICS`.
+    """
+    _, _, scale, digits = METRICS[name]
     return f"{signed(scale * float(np.mean(values)), digits)} [{interval(mean_interval(values), scale, digits)}]"
-
-
-def more_successes(pair: Against) -> str:
-    return signed(pair.only_ours - pair.only_theirs, 0)
 
 
 def of_episodes(pair: Against | None) -> str:
     """A difference in successes with McNemar's exact p-value; a dash for None."""
     if pair is None:
         return "–"
-    return f"{more_successes(pair)} (p = {p_value(pair.p_value)})".replace("= <", "<")
+    return f"{signed(pair.only_ours - pair.only_theirs, 0)} (p = {p_value(pair.p_value)})".replace("= <", "<")
 
 
 def spread(values: Sequence[float]) -> tuple[str, str, str]:

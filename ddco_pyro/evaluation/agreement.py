@@ -11,7 +11,7 @@ option anew is no boundary.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,7 +22,7 @@ from ddco_pyro.data.sources import open_source
 from ddco_pyro.drawing.page import Table
 from ddco_pyro.drawing.words import duration, number
 from ddco_pyro.errors import BadInput
-from ddco_pyro.metrics import Confusion, Matched, Scores
+from ddco_pyro.metrics import METRICS, Confusion, Matched, Scores
 from ddco_pyro.names import label_name
 from ddco_pyro.statistics import edit_score
 
@@ -247,24 +247,6 @@ EXPLAINED = (
 )
 
 
-def measure_names(keys: Iterable[str]) -> list[str]:
-    """The names of measures as heads of columns.
-
-    >>> measure_names(["nmi", "boundary_f1_1", "boundary_f1_3", "accuracy", "f1_10", "f1_25"])
-    ['NMI', 'boundary F1 ±1', '±3', 'accuracy', 'F1@10', '@25']
-    """
-    names, before = [], ""
-    for key in keys:
-        base, _, parameter = key.rpartition("_")
-        if base:
-            prefix = {"boundary_f1": "boundary F1 ±", "f1": "F1@"}[base]
-            names.append((prefix[-1] if base == before else prefix) + parameter)
-        else:
-            names.append({"nmi": "NMI", "ari": "ARI", "iou": "IoU"}.get(key, key))
-        before = base
-    return names
-
-
 def tolerances(frequency: float | None) -> str:
     """A sentence on the seconds of the tolerances of boundary F1; empty where the frequency (Hz) is not known."""
     each = "; ".join(f"±{duration(frequency, steps)}" for steps in TOLERANCES)
@@ -273,7 +255,8 @@ def tolerances(frequency: float | None) -> str:
 
 def agreement_table(scores: Mapping[str, Scores | None], title: str | None = None) -> Table:
     """Two rows for each name of segments, one for each way to match options with labels."""
-    head = ["Segments", *measure_names(UNMATCHED), "matching", *measure_names(MATCHED)]
+    unmatched, matched = ([METRICS[key].name for key in keys] for keys in (UNMATCHED, MATCHED))
+    head = ["Segments", *unmatched, "matching", *matched]
     rows = []
     for name, known in scores.items():
         if known is None:

@@ -24,12 +24,13 @@ from ddco_pyro.drawing.words import (
     with_error,
 )
 from ddco_pyro.evaluation.effort import rising
-from ddco_pyro.metrics import Difference, Marginal, Metrics, Segments, SuccessWorth, Worth
+from ddco_pyro.metrics import METRICS, Against, Difference, Marginal, Metrics, Segments
 from ddco_pyro.names import FLAT, HIERARCHY, MIXTURE, method
 from ddco_pyro.statistics import paired, t_quantile, wider_interval
 
 SMALLEST = 0.01
-"""The smallest useful difference in nats per step: each step's control is exp(0.01) times as probable, 1 % more."""
+"""The smallest difference that counts, in nats per step and control dimension: a control is exp(0.01) times as
+probable, 1 % more."""
 
 LOST = 1.0
 """Nats per step and control dimension, from training to held-out demonstrations, from which on a model may have fallen
@@ -121,6 +122,11 @@ class Models:
         train = {name: one.log_likelihood_per_step.train for name, one in metrics.methods.items()}
         return cls(held_out, train, steps, {name: name for name in names}, metrics.marginal)
 
+    @property
+    def controls(self) -> int:
+        """Control dimensions that vary; 1 where unknown."""
+        return self.marginal.controls if self.marginal else 1
+
     def per_step(self, name: str) -> float:
         """Held-out log-likelihood, nats per step."""
         return float(self.held_out[name].sum() / self.steps.sum())
@@ -131,14 +137,16 @@ class Models:
 
     def loss(self, name: str) -> float:
         """Nats per step and control dimension that a model loses from training to held-out demonstrations."""
-        return (self.train[name] - self.per_step(name)) / (self.marginal.controls if self.marginal else 1)
+        return (self.train[name] - self.per_step(name)) / self.controls
 
     def below_marginal(self, name: str) -> bool:
         """Whether a density without observations predicts the held-out controls better."""
         known = self.marginal
-        return known is not None and known.valid is not None and (
-            known.valid - self.per_step(name) > SMALLEST * known.controls
-        )  # fmt: skip
+        return known is not None and known.valid is not None and self.counts(known.valid - self.per_step(name))
+
+    def counts(self, nats: float) -> bool:
+        """Whether a difference in nats per step is more than the smallest that counts."""
+        return nats > SMALLEST * self.controls
 
     def apart(self, name: str) -> bool:
         """Whether a model fell apart on held-out demonstrations.
@@ -149,8 +157,16 @@ class Models:
         others = [other for other in self.held_out if other != name]
         if not len(self.steps) or self.loss(name) <= LOST or (others and self._best == name):
             return False
-        behind = (direction(self.lead(name, other), len(self.steps)) == "worse" for other in others)
+        behind = (self.direction(self.lead(name, other)) == "worse" for other in others)
         return self.below_marginal(name) or (bool(others) and all(behind))
+
+    def direction(self, lead: Difference) -> Direction:
+        """The direction of a difference over held-out demonstrations, by its 95 % interval."""
+        held_out = len(self.steps)
+        if held_out < FEWEST or lead.standard_error is None:
+            return "few"
+        half = lead.standard_error * t_quantile(held_out - 1)
+        return _direction(lead.nats_per_step - half, lead.nats_per_step + half, SMALLEST * self.controls)
 
     @property
     def _best(self) -> str:
@@ -165,7 +181,7 @@ class Models:
         called = capital(method(name)) if self.kinds[name] == name else name
         if self.apart(name):
             values = {"valid": number(self.per_step(name)), "train": number(self.train[name])}
-            values |= {"loss": number(self.loss(name)), "controls": str(self.marginal.controls if self.marginal else 1)}
+            values |= {"loss": number(self.loss(name)), "controls": str(self.controls)}
             advice = "held out" if self.kinds[name] in (HIERARCHY, MIXTURE) else "baseline"
             yield said("held out", "worse", name=called, **values), ADVICE[advice]
         elif len(self.steps) and self.below_marginal(name) and self.marginal:
@@ -176,10 +192,41 @@ class Models:
         if flats and len(self.steps):
             flat = max(flats, key=self.per_step)
             lead, other = self.lead(name, flat), self._called(flat)
-            if direction(lead, len(self.steps)) == "worse":
+            if self.direction(lead) == "worse":
                 by, are = f"{number(-lead.nats_per_step)} ± {number(lead.standard_error)}", verb(called, "are", "is")
                 text = said("flat", "worse", name=called, are=are, other=other, by=by)
                 yield text, ADVICE["flat"].format(other=other)
+
+    def explains(self, name: str, leads: Mapping[str, Difference]) -> str:
+        """One sentence on the lead of a model over others on held-out demonstrations.
+
+        Its ± is over these demonstrations, for one fit of each model; fits from other seeds vary, too.
+
+        :param leads: the paired difference by the other model's name.
+        """
+        clauses, held_out = [], len(self.steps)
+        for other, lead in leads.items():
+            way = self.direction(lead)
+            by = number(abs(lead.nats_per_step)) + (f" ± {number(lead.standard_error)}" if way != "few" else "")
+            sign: Direction = "better" if lead.nats_per_step > 0 else "worse"
+            known: Direction = "unclear" if way in ("unclear", "same") else sign
+            clauses.append(said("model", known, by=by, other=other, lead=with_error(lead)))
+        text = f"{name} {verb(name, 'explain', 'explains')} held-out demonstrations {listed(clauses)}"
+        if held_out < FEWEST:
+            held = "1 held-out demonstration is" if held_out == 1 else f"{held_out} held-out demonstrations are"
+            return f"{text} ({held} too few for an error; one fit of each model)."
+        return f"{text} (± is one standard error over {held_out} held-out demonstrations, for one fit of each model)."
+
+    def lasting(self, memory: Difference, brief: str = "") -> str:
+        """The test of one fit: options that last against the mixture.
+
+        :param memory: options minus the mixture.
+        :param brief: a sentence where the options are too short for skills; else empty.
+        """
+        way = self.direction(memory)
+        known = with_error(memory) if way != "few" else signed(memory.nats_per_step)
+        text = _lasting(way, f"{known} nats per step", len(self.steps), brief)
+        return f"{text} One fit of each model is no verdict; repeat it with --seeds 5."
 
     def _called(self, name: str) -> str:
         """A model in words, or the name of a run."""
@@ -190,14 +237,6 @@ def said(measure: str, way: Direction, **values: str) -> str:
     """A sentence of :data:`SENTENCES`."""
     over = OVER["several" if "seeds" in values else "one"].format(**values)
     return SENTENCES[measure, way].format(over=over, **values)
-
-
-def direction(lead: Difference, held_out: int) -> Direction:
-    """The direction of a difference over held-out demonstrations, by its 95 % interval."""
-    if held_out < FEWEST or lead.standard_error is None:
-        return "few"
-    half = lead.standard_error * t_quantile(held_out - 1)
-    return _direction(lead.nats_per_step - half, lead.nats_per_step + half, SMALLEST)
 
 
 def _direction(low: float, high: float, smallest: float = 0.0) -> Direction:
@@ -211,11 +250,13 @@ def _direction(low: float, high: float, smallest: float = 0.0) -> Direction:
 
 def doubts(metrics: Metrics) -> list[tuple[str, str]]:
     """What is doubtful about the model of a run, and what to do; its baselines' faults are :func:`faults`."""
-    ours, found = method(metrics.model), list(Models.of(metrics).doubts(metrics.model))
+    ours, models = method(metrics.model), Models.of(metrics)
+    found = list(models.doubts(metrics.model))
     for name, one in metrics.below.items():
-        if one.told:
-            by = number(max(one.objective, one.nats))
-            text = said("contained", "worse", name=ours, are=verb(ours, "are", "is"), other=method(name), by=by)
+        if models.counts(gap := max(one.objective, one.nats)):
+            text = said(
+                "contained", "worse", name=ours, are=verb(ours, "are", "is"), other=method(name), by=number(gap)
+            )
             found.append((text, ADVICE["contained"]))
     count = metrics.demonstrations.train
     if found and metrics.demonstrations.left_out and count < FEW:
@@ -250,30 +291,10 @@ def explained(metrics: Metrics) -> str:
     if not metrics.comparison:
         give, value = verb(name, "give", "gives"), number(per_step.valid)
         return f"{name} {give} held-out demonstrations {value} nats per step; no baseline was trained to compare with."
-    text = explains(name, {method(other): one.difference for other, one in metrics.comparison.items()}, held_out)
+    leads = {method(other): one.difference for other, one in metrics.comparison.items()}
+    text = Models.of(metrics).explains(name, leads)
     left_out = "Every demonstration trains the model; each is held out from a fit without it."
     return f"{text} {left_out}" if metrics.demonstrations.left_out else text
-
-
-def explains(name: str, differences: Mapping[str, Difference], held_out: int) -> str:
-    """One sentence on the lead of a model over others on held-out demonstrations.
-
-    Its ± is over these demonstrations, for one fit of each model; fits from other seeds vary, too.
-
-    :param differences: the paired difference by the other model's name.
-    """
-    clauses = []
-    for other, lead in differences.items():
-        way = direction(lead, held_out)
-        by = number(abs(lead.nats_per_step)) + (f" ± {number(lead.standard_error)}" if way != "few" else "")
-        sign: Direction = "better" if lead.nats_per_step > 0 else "worse"
-        known: Direction = "unclear" if way in ("unclear", "same") else sign
-        clauses.append(said("model", known, by=by, other=other, lead=with_error(lead)))
-    text = f"{name} {verb(name, 'explain', 'explains')} held-out demonstrations {listed(clauses)}"
-    if held_out < FEWEST:
-        held = "1 held-out demonstration is" if held_out == 1 else f"{held_out} held-out demonstrations are"
-        return f"{text} ({held} too few for an error; one fit of each model)."
-    return f"{text} (± is one standard error over {held_out} held-out demonstrations, for one fit of each model)."
 
 
 def tested(metrics: Metrics) -> str:
@@ -281,32 +302,36 @@ def tested(metrics: Metrics) -> str:
 
     Empty without a mixture, or where either of them fell apart.
     """
-    found, seeds, held_out = metrics.worth, metrics.seeds, len(metrics.valid)
-    if not Models.of(metrics).sound() or not (found or (seeds and "memory" in seeds.worth)):
+    found, seeds, models = metrics.worth, metrics.seeds, Models.of(metrics)
+    over = seeds.worth.get("memory") if seeds else None
+    if not models.sound() or not (found or over):
         return ""
     short = twitches(metrics.segments, metrics.control_frequency) if all(own.brief for own in metrics.segments) else ""
-    if seeds and "memory" in seeds.worth:
-        memory = seeds.worth["memory"]
+    if seeds and over:
+        held_out = len(metrics.valid)
         errors = [error for error in seeds.standard_error["memory"] if error is not None]
-        low, high = wider_interval(memory, float(np.mean(errors)) if errors else 0.0, held_out)
-        way = "few" if held_out < FEWEST else _direction(low, high, SMALLEST)
-        lead = f"{signed(float(np.mean(memory)))}{f' [{interval((low, high))}]' * (way != 'few')} nats per step"
+        error = float(np.mean(errors)) if errors else 0.0
+        way, lead = _over_seeds("log_likelihood", over, error, held_out, SMALLEST * models.controls)
         text = _lasting(way, lead, held_out, short, len(seeds.training_seeds))
     else:
         assert found
-        text = lasting(found, held_out, short)
+        text = models.lasting(found.memory, short)
     return f"{text} {success(metrics)}".strip()
 
 
-def lasting(found: Worth, held_out: int, brief: str = "") -> str:
-    """The test of one fit: options that last against the mixture.
+def _over_seeds(
+    name: str, values: Sequence[float], error: float, trials: int, smallest: float = 0.0
+) -> tuple[Direction, str]:
+    """The direction of a difference over training seeds, and its mean with the wider of two intervals, in words.
 
-    :param brief: a sentence where the options are too short for skills; else empty.
+    :param name: of :data:`~ddco_pyro.metrics.METRICS`.
+    :param error: over so many trials, as in :func:`~ddco_pyro.statistics.wider_interval`.
     """
-    way = direction(found.memory, held_out)
-    known = with_error(found.memory) if way != "few" else signed(found.memory.nats_per_step)
-    text = _lasting(way, f"{known} nats per step", held_out, brief)
-    return f"{text} One fit of each model is no verdict; repeat it with --seeds 5."
+    metric, few = METRICS[name], trials < FEWEST
+    low, high = wider_interval(values, error, trials)
+    mean = signed(metric.scale * float(np.mean(values)), metric.digits)
+    within = "" if few else f" [{interval((low, high), metric.scale, metric.digits)}]"
+    return "few" if few else _direction(low, high, smallest), f"{mean}{within} {metric.unit}"
 
 
 def _lasting(way: Direction, lead: str, held_out: int, brief: str, seeds: int = 1) -> str:
@@ -345,17 +370,15 @@ def success(metrics: Metrics) -> str:
     found, seeds = metrics.rollouts.worth, metrics.rollouts.seeds
     if found is None:
         return told
-    return f"{told} {_succeeds(found, () if seeds is None else seeds.worth['memory'])}"
+    return f"{told} {_succeeds(found.memory, () if seeds is None else seeds.worth['memory'])}"
 
 
-def _succeeds(found: SuccessWorth, memory: Sequence[float]) -> str:
+def _succeeds(pair: Against, memory: Sequence[float]) -> str:
     """The test by success: of one fit by McNemar's test, or over training seeds, with the error over episodes."""
-    pair = found.memory
     lead = pair.only_ours - pair.only_theirs
     if not memory:
         way: Direction = "unclear" if pair.p_value >= 0.05 else "better" if lead > 0 else "worse"
         return said("success", way, lead=f"{of_episodes(pair)} of {pair.trials} episodes")
     error = math.sqrt(pair.only_ours + pair.only_theirs - lead**2 / pair.trials) / pair.trials
-    low, high = wider_interval(memory, error, pair.trials)
-    points = f"{signed(100 * float(np.mean(memory)), 0)} [{interval((low, high), 100, 0)}] points of success"
-    return said("success", _direction(low, high), seeds=str(len(memory)), lead=points)
+    way, points = _over_seeds("success", memory, error, pair.trials)
+    return said("success", way, seeds=str(len(memory)), lead=points)

@@ -11,7 +11,7 @@ from typing import Any
 from ddco_pyro.data.arrays import Observed
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.sources import open_source
-from ddco_pyro.drawing.shown import frames, jpeg, paths_of, stored_pictures
+from ddco_pyro.drawing.shown import frames, jpeg, stored_pictures
 from ddco_pyro.drawing.timeline import following
 from ddco_pyro.errors import BadInput
 from ddco_pyro.spec import PathSpec
@@ -28,7 +28,7 @@ class Following:
     """
 
     def __init__(self, path: Path, demos: Demonstrations, trajectory: Sequence[PathSpec] | None) -> None:
-        self.path, self.demos, self.paths, self.opened = path, demos, paths_of(trajectory, demos), ExitStack()
+        self.path, self.demos, self.paths, self.opened = path, demos, trajectory or (), ExitStack()
 
     @cached_property
     def pictures(self) -> list[Observed]:

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
 from ddco_pyro.data.arrays import Observed
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
+from ddco_pyro.data.labels import label_names
 from ddco_pyro.data.sources import open_source
 from ddco_pyro.drawing.figures import style
-from ddco_pyro.drawing.page import Block, Folded, Page, Text, Warned, note
-from ddco_pyro.drawing.shown import paths_of, pictures, stored_pictures
+from ddco_pyro.drawing.page import Block, Folded, Page, Section, Text, Warned, note
+from ddco_pyro.drawing.shown import pictures, stored_pictures
 from ddco_pyro.evaluation import verdicts
 from ddco_pyro.evaluation.options import beside_equal_parts
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.names import method
-from ddco_pyro.report import agreement, inputs, likelihood, options, rollouts, skills, training
-from ddco_pyro.report.trajectories import activity
+from ddco_pyro.report import inputs, likelihood, options, rollouts, skills, training
+from ddco_pyro.segmenting.segments import Segmented, of_piece, of_run
 from ddco_pyro.segmenting.page import timelines
 
 
@@ -29,34 +31,53 @@ def write_report(fit: Fit, demos: Demonstrations) -> Path:
     :raises RunError: the fit has no folder.
     """
     path, metrics = fit.run_folder / "report.html", fit.metrics
-    active = activity(fit, demos) if fit.spec.hierarchy else None
-    segmented, paths = active.segmented if active else None, paths_of(fit.spec.report.trajectory, demos)
-    if segmented:
-        ordered = demos.select([demo.name for demo in segmented.segments])
-        shown = pictures(ordered) or _stored(fit, ordered)
-        drawn = timelines(segmented, ordered, shown, paths, options.MOST_STEPS)
-        drawings = skills.Shown(ordered, shown, paths)
-        every = skills.skills(fit, segmented)
+    tiles: list[Block] = []
+    by_options: dict[str, Section] = {}
+    anchors: set[str] = set()
     with style():
         learning = training.learning(fit)  # or a history is damaged, and no figure is written
+        if fit.spec.hierarchy:
+            segmented = segments_of(fit, demos)
+            ordered = demos.select([demo.name for demo in segmented.segments])
+            paths = fit.spec.report.trajectory or ()
+            shown = skills.Shown(ordered, pictures(ordered) or _stored(fit, ordered), paths)
+            drawn = timelines(segmented, ordered, shown.pictures, paths, options.MOST_STEPS)
+            every = skills.skills(fit, segmented)
+            tiles, anchors = skills.overview(fit, every, shown), {track.anchor for track in drawn.tracks}
+            by_options = {
+                "skills": skills.section(fit, every, shown, segmented),
+                "segments": options.segments(drawn, len(metrics.demonstrations_by_likelihood)),
+                "options": options.section(fit, segmented, shown),
+            }
         sections = [
             likelihood.test(metrics),
-            skills.section(fit, ordered, every, drawings, active) if active else None,
-            options.segments(drawn, len(metrics.demonstrations_by_likelihood)) if segmented else None,
-            agreement.section(fit, demos),
+            by_options.get("skills"),
+            by_options.get("segments"),
+            options.agreement(fit, demos),
             rollouts.success(fit),
             rollouts.films(fit),
             likelihood.section(fit),
-            likelihood.demonstrations(metrics, {track.anchor for track in drawn.tracks} if segmented else ()),
+            likelihood.demonstrations(metrics, anchors),
             likelihood.dimensions(fit),
-            options.section(fit, demos, active, paths) if active else None,
+            by_options.get("options"),
             inputs.branches(fit),
             learning,
             training.particulars(fit),
         ]
-    tiles = skills.overview(fit, every, drawings) if active else []
     write_text(path, Page(title(fit), [*tiles, *header(fit)], sections, subtitle=subtitle(fit)).html())
     return path
+
+
+def segments_of(fit: Fit, demos: Demonstrations) -> Segmented:
+    """The segments of a fit's demonstrations, in the order and with the numbers of ``demonstrations_by_likelihood``."""
+    labels = {demo.name: {name: demo.labels[name] for name in fit.spec.demonstrations.label_names} for demo in demos}
+    found = {demo.name: demo for piece in fit.infer(demos) for demo in of_piece(fit, piece, labels, intervals=True)}
+    ordered = [  # held out, where a model trains with it too
+        replace(found[row.name], log_likelihood=row.log_likelihood_per_step[fit.name], held_out=row.part == "valid")
+        for row in fit.metrics.demonstrations_by_likelihood
+        if row.name in found
+    ]
+    return of_run(fit, ordered, demos.frequency, label_names(demos.attributes))
 
 
 def title(fit: Fit) -> str:

@@ -16,9 +16,9 @@ from ddco_pyro.drawing.words import (
     capital,
     duration,
     listed,
-    mean_and_interval,
     number,
     of_episodes,
+    over_seeds,
     with_error,
 )
 from ddco_pyro.evaluation.effort import effort, unconverged
@@ -199,13 +199,13 @@ def parts(metrics: Metrics) -> Table | None:
     }
     columns = {"Nats per step, this fit": {part: with_error(getattr(found, part)) for part in parts}}
     if seeds:
-        each = {part: mean_and_interval(values) for part, values in seeds.worth.items()}
+        each = {part: over_seeds("log_likelihood", values) for part, values in seeds.worth.items()}
         columns[f"Nats per step, {len(seeds.training_seeds)} training seeds"] = each
     if rollouts and rollouts.worth:
         column = f"Successes of {rollouts.episodes} episodes, this fit"
         columns[column] = {part: of_episodes(getattr(rollouts.worth, part)) for part in parts}
     if rollouts and rollouts.seeds:
-        each = {part: mean_and_interval(values, 100, 0) for part, values in rollouts.seeds.worth.items()}
+        each = {part: over_seeds("success", values) for part, values in rollouts.seeds.worth.items()}
         columns[f"Points of success, {len(rollouts.seeds.training_seeds)} training seeds"] = each
     rows = [
         [name, *(values.get(part, "–") for values in columns.values())]

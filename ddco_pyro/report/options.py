@@ -1,25 +1,30 @@
-"""Options in the report: how each is used, where it is active in space, and its segments."""
+"""Options in the report: how each is used, where it is active in space, its segments, and agreement with labels."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 from markupsafe import Markup
 
 from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.files import write_text
+from ddco_pyro.data.labels import label_names
 from ddco_pyro.drawing.colours import option_colour
-from ddco_pyro.drawing.page import Block, Cell, Section, Table, Text, note
+from ddco_pyro.drawing.diagrams import MOST_PATHS, paths_of_options
+from ddco_pyro.drawing.page import Block, Cell, Drawing, Section, Table, Text, footnote, note
+from ddco_pyro.drawing.shown import in_words
 from ddco_pyro.drawing.timeline import Timelines
-from ddco_pyro.drawing.words import duration, number, percent
+from ddco_pyro.drawing.words import capital, duration, number, percent
+from ddco_pyro.evaluation.agreement import EXPLAINED, agreement_table, tolerances
+from ddco_pyro.evaluation.effort import contributions, recogniser
 from ddco_pyro.fitting.fitted import Fit
-from ddco_pyro.metrics import NamedByLabel
-from ddco_pyro.names import numbered_name
-from ddco_pyro.report import trajectories
-from ddco_pyro.report.trajectories import Activity
+from ddco_pyro.metrics import Confusion, Scores
+from ddco_pyro.names import label_name, numbered_name, option_name
+from ddco_pyro.report.skills import Shown, agreeing
+from ddco_pyro.segmenting.segments import Segmented
+from ddco_pyro.segmenting.baselines import BASELINES, EQUAL, RECOGNISED
 from ddco_pyro.segmenting.page import HOW
-from ddco_pyro.spec import PathSpec
 
 ROWS = 6
 """Time lines that are seen at once."""
@@ -28,19 +33,27 @@ MOST_STEPS = 1_000_000
 """Steps of all levels in time lines, about; ``ddco-pyro segment --html`` makes a page of more."""
 
 
-def section(fit: Fit, demos: Demonstrations, activity: Activity, paths: Sequence[PathSpec]) -> Section:
-    """How each option is used, and the paths in space."""
-    drawn = trajectories.picture(fit, demos, activity, paths)
-    used = note("On the most likely path of all demonstrations. The same option chosen anew stays one segment.")
-    blocks: list[Block] = [] if drawn is None else [drawn]
+def section(fit: Fit, segmented: Segmented, shown: Shown) -> Section:
+    """How each option is used, and the paths in space, in ``figures/trajectories.svg`` too."""
+    blocks: list[Block] = []
     if len(fit.names) > 1:
         named = " Legends give the names of the highest level first." if fit.named else ""
-        apart = f"Each level numbers its own options: equal colours in two levels mean nothing.{named}"
-        blocks.insert(0, Text(apart))
-    blocks.append(Text("Use of the options", "heading"))
-    blocks.append(use_table(fit))
+        blocks.append(Text(f"Each level numbers its own options: equal colours in two levels mean nothing.{named}"))
+    for level in reversed(fit.names) if shown.paths else ():
+        options = [demo.levels[level].options for demo in segmented.segments]
+        drawing = paths_of_options(shown.paths, options)
+        name = "trajectories" if len(fit.names) == 1 else f"trajectories-{level}"
+        standing_alone = drawing.replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1)
+        write_text(fit.run_folder / "figures" / f"{name}.svg", standing_alone)
+        caption = (
+            f"Level “{level}”: {min(len(options), MOST_PATHS)} demonstrations, coloured by the most likely option: "
+            f"{in_words(shown.drawn, shown.demos)}. Circles: first steps."
+        )
+        blocks.append(Drawing(drawing, caption))
+    blocks += [Text("Use of the options", "heading"), use_table(fit)]
+    blocks.append(note("On the most likely path of all demonstrations. The same option chosen anew stays one segment."))
     link = Markup('<a href="#segments">segments of every demonstration</a>')
-    blocks += [used, Text(Markup("Step by step: {}.").format(link))]
+    blocks.append(Text(Markup("Step by step: {}.").format(link)))
     return Section("options", "How the options are used", blocks, folded=True)
 
 
@@ -59,16 +72,6 @@ def use_table(fit: Fit) -> Table:
     return Table([*head, *(["Label, agreement"] if stands_for else [])], rows, {0, 1, 5})
 
 
-def agreeing(one: NamedByLabel) -> str:
-    """The label that an option stands for, with their agreement: ``reach 0.71``."""
-    return f"{one.name} {number(one.agreement)}"
-
-
-def quoted(names: Mapping[str, Any] | Sequence[str]) -> str:
-    """``label “phase” and “grasp”``."""
-    return "label " + " and ".join(f"“{name}”" for name in names)
-
-
 # --- segments ---------------------------------------------------------------------------------------------------------
 
 
@@ -80,3 +83,65 @@ def segments(drawn: Timelines, demonstrations: int) -> Section:
         command = Markup("<code>ddco-pyro segment RUN FILE --html PAGE</code>")
         blocks.append(note(Markup("The others would make this page slow; {} makes a page of them.").format(command)))
     return Section("segments", "Segments of every demonstration", blocks)
+
+
+# --- labels -----------------------------------------------------------------------------------------------------------
+
+
+def agreement(fit: Fit, demos: Demonstrations) -> Section | None:
+    """The measures of each level, and where the steps of each label lie; None where the spec names no labels."""
+    record = fit.metrics.agreement
+    names, truth = list(fit.names), fit.spec.demonstrations.labels_by_level(len(fit.names))
+    if not record or not truth:
+        return None
+    scores, given = dict[str, Scores | None](), fit.spec.training.labels
+    sides = (
+        ("held out", "valid", record.valid, record.equal_valid),
+        ("training", "train", record.train, record.equal_train),
+    )
+    for place, level in enumerate(names):
+        before = f"{level}: " if len(names) > 1 else ""
+        for words, part, found, equal in sides:
+            if found is not None:
+                scores[f"{before}options, {words}"] = found[place]
+                if given is not None and level == given.level and part in record.recogniser:
+                    scores[f"{before}{RECOGNISED}, {words}"] = record.recogniser[part]
+                if equal:
+                    scores[f"{before}{BASELINES[EQUAL]}, {words}"] = equal[place]
+    known = label_names(demos.attributes)
+    compared = " and ".join(f"“{name}”" for name in fit.spec.demonstrations.label_names)
+    blocks: list[Block] = [Text(f"Options and the ground-truth label {compared}."), agreement_table(scores)]
+    blocks.append(footnote(f"{EXPLAINED} {tolerances(demos.frequency)}"))
+    if told := recogniser(fit.metrics.training):
+        blocks.append(Text(f"{capital(told)}."))
+    if each := contributions(fit.metrics.training):
+        rows = [[name, number(accuracy), number(edit)] for name, (accuracy, edit) in each.items()]
+        blocks += [Text("Left-out labelled demonstrations", "heading"), Table(["", "Accuracy", "Edit score"], rows)]
+    for level, label, own in zip(names, truth, record.confusion, strict=True):
+        names_of_labels = [label_name(label, value, known.get(label, ()), level) for value in own.labels]
+        title = f"Where each label’s steps lie: level “{level}”, label “{label}”"
+        blocks += [Text(title, "heading"), confusion_table(own, fit.names[level], names_of_labels)]
+    part = "training" if record.valid is None else "held-out"
+    blocks.append(
+        note(
+            f"Share of the steps of each label, {part} demonstrations. “Stands for”: the label matched with the "
+            "option in all demonstrations; – for an option without a label. The steps of a label without an option "
+            "lie in options that stand for other labels."
+        )
+    )
+    return Section("agreement", "Agreement with ground truth", blocks)
+
+
+def confusion_table(record: Confusion, names: Sequence[str], labels: Sequence[str]) -> Table:
+    """Share of each label's steps in each option, and the label of each option.
+
+    :param names: of each choice, control first.
+    :param labels: the names of the table's labels.
+    """
+    rows = [
+        [label, str(sum(steps)), *(percent(count / sum(steps)) if count else "" for count in steps)]
+        for label, steps in zip(labels, record.steps, strict=True)
+    ]
+    matched = ["–" if value is None else labels[record.labels.index(value)] for value in record.matched]
+    options = [option_name(option, names) for option in record.options]
+    return Table(["Label", "Steps", *options], [*rows, ["stands for", "", *matched]])

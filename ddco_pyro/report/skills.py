@@ -28,14 +28,12 @@ from ddco_pyro.drawing.page import (
     note,
 )
 from ddco_pyro.drawing.shown import frames, in_words, jpeg, positions, projection
-from ddco_pyro.drawing.words import duration, percent
+from ddco_pyro.drawing.words import duration, number, percent
 from ddco_pyro.evaluation.options import diagnose
 from ddco_pyro.fitting.fitted import Fit
-from ddco_pyro.metrics import Use
+from ddco_pyro.metrics import NamedByLabel, Use
 from ddco_pyro.names import numbered_name, option_name
 from ddco_pyro.report.inputs import deciding
-from ddco_pyro.report.options import agreeing
-from ddco_pyro.report.trajectories import Activity
 from ddco_pyro.segmenting.segments import Segmented
 from ddco_pyro.simulation.film import encoded
 from ddco_pyro.spec import PathSpec
@@ -57,6 +55,9 @@ MOST_FILMS = 12
 
 MOST_PATHS = 25
 """Demonstrations behind the segments in a drawing."""
+
+MOST_CONTROLS = 6
+"""Numbers of the control in a drawing."""
 
 
 @dataclass(frozen=True)
@@ -146,6 +147,11 @@ class Skill:
     labels: Mapping[str, str]
 
 
+def agreeing(one: NamedByLabel) -> str:
+    """The label that an option stands for, with their agreement: ``reach 0.71``."""
+    return f"{one.name} {number(one.agreement)}"
+
+
 def skills(fit: Fit, segmented: Segmented) -> list[Skill]:
     """The options that a most likely path has, of the highest level first."""
     return [
@@ -188,12 +194,9 @@ def overview(fit: Fit, every: Sequence[Skill], shown: Shown) -> list[Block]:
     return blocks
 
 
-def section(fit: Fit, demos: Demonstrations, every: Sequence[Skill], shown: Shown, activity: Activity) -> Section:
-    """Every option of every level, the highest level first, then the order of the options.
-
-    :param demos: in the order of their segments.
-    """
-    segmented, reads = activity.segmented, deciding(fit, demos)
+def section(fit: Fit, every: Sequence[Skill], shown: Shown, segmented: Segmented) -> Section:
+    """Every option of every level, the highest level first, then the order of the options."""
+    reads = deciding(fit, shown.demos)
     blocks: list[Block] = [note(shown.explained())]
     whole = {
         (one.level, one.choice): one
@@ -255,14 +258,20 @@ def _frequent(counts: np.ndarray, names: Sequence[str], most: int = 2) -> str:
 
 
 class Shown:
-    """Pictures and films of segments, from what demonstrations have."""
+    """Pictures and films of segments, from what demonstrations have: pictures, or else paths, or else controls.
 
-    def __init__(self, demos: Demonstrations, pictures: Sequence[Observed], paths: Sequence[PathSpec]) -> None:
-        self.demos, self.pictures, self.drawn = demos, pictures, () if pictures else paths
+    :param demos: in the order of their segments.
+    :param pictures: of each demonstration; empty for none.
+    :param drawn: the paths in space that the spec names.
+    :ivar paths: of each demonstration, turned into the plane of the page, [P, T, 2]; empty without ``drawn``.
+    """
+
+    def __init__(self, demos: Demonstrations, pictures: Sequence[Observed], drawn: Sequence[PathSpec]) -> None:
+        self.demos, self.pictures, self.drawn = demos, pictures, drawn
         self.films = 0
         self.paths: list[np.ndarray] = []
-        if self.drawn:
-            places = [positions(demo, self.drawn) for demo in self.demos]
+        if drawn:
+            places = [positions(demo, drawn) for demo in demos]
             turned = projection(np.concatenate([place.reshape(-1, place.shape[-1]) for place in places]))
             self.paths = [place @ turned.T for place in places]
 
@@ -275,7 +284,10 @@ class Shown:
                 "film are aligned at their onset; one that has ended rests."
             )
         if not self.drawn:
-            return f"Lines: controls from the onset of each segment on. {typical}"
+            return (
+                f"Lines: controls from the onset of each segment on. {typical} To draw an observation as a path in "
+                "space: ddco-pyro report RUN --set report.trajectory=KEY."
+            )
         return (
             f"Drawings: {in_words(self.drawn, self.demos)}. Circle, square and triangle: first, "
             f"middle and last step of a segment. {typical}"
@@ -283,37 +295,39 @@ class Shown:
 
     def first(self, found: Sequence[Instance], choice: int) -> list[Block]:
         """The most typical segment of an option: its middle picture, its path, or its first control."""
-        (one, *_), colour = found, option_colour(choice)
-        where = f"{self.demos[one.row].name} {one.start}–{one.end - 1}"
+        one = found[0]
         if self.pictures:
+            where = f"Middle picture of {self._places([one])}"
             middle = frames(self.pictures[one.row], [(one.start + one.end - 1) // 2], SHEET_HEIGHT)[0]
-            return [Picture(data_uri(jpeg(middle), "image/jpeg"), f"Middle picture of {where}", "")]
-        if self.drawn:
-            rows = list(dict.fromkeys([one.row, *range(len(self.demos))]))[:MOST_PATHS]
-            return [Drawing(typical_paths([self.paths[row] for row in rows], [(0, one.start, one.end)], colour), "")]
-        return [Drawing(curves(dict([*self.controls(found[:INSTANCES]).items()][:1]), colour), "")]
-
-    def controls(self, chosen: Sequence[Instance]) -> dict[str, list[np.ndarray]]:
-        """Each number of the control over the steps of instances."""
-        every = [
-            self.demos[one.row].actions.reshape(len(self.demos[one.row]), -1)[one.start : one.end] for one in chosen
-        ]
-        return {f"control[{n}]": [array[:, n].astype(float) for array in every] for n in range(every[0].shape[1])}
+            return [Picture(data_uri(jpeg(middle), "image/jpeg"), where, "")]
+        return [self._drawing(found[:1] if self.drawn else found, choice, "", 1)]
 
     def blocks(self, found: Sequence[Instance], choice: int) -> list[Block]:
-        """A contact sheet and a film of the most typical segments of an option."""
-        chosen, colour = found[:INSTANCES], option_colour(choice)
-        caption = f"{len(chosen)} instances from their onset on"
-        where = ", ".join(f"{self.demos[one.row].name} {one.start}–{one.end - 1}" for one in chosen[:SHOWN])
+        """A contact sheet and a film of the most typical segments of an option, or a drawing of them."""
+        chosen = found[:INSTANCES]
+        where = self._places(chosen[:SHOWN])
         if self.pictures:
             self.films += 1
             film = [Films([film_of(self.pictures, chosen, choice)])] if self.films <= MOST_FILMS else []
             return [sheet_of(self.pictures, chosen[:SHOWN], where), *film]
+        caption = where if self.drawn else f"{len(chosen)} instances from their onset on"
+        return [self._drawing(chosen[:SHOWN] if self.drawn else chosen, choice, caption, MOST_CONTROLS)]
+
+    def _places(self, chosen: Sequence[Instance]) -> str:
+        return ", ".join(f"{self.demos[one.row].name} {one.start}–{one.end - 1}" for one in chosen)
+
+    def _drawing(self, chosen: Sequence[Instance], choice: int, caption: str, controls: int) -> Drawing:
+        """The paths of segments over those of demonstrations, or the first few numbers of their control."""
         if self.drawn:
-            shown = list(dict.fromkeys([*(one.row for one in chosen[:SHOWN]), *range(len(self.demos))]))[:MOST_PATHS]
-            segments = [(shown.index(one.row), one.start, one.end) for one in chosen[:SHOWN]]
-            return [Drawing(typical_paths([self.paths[row] for row in shown], segments, colour), where)]
-        return [Drawing(curves(dict([*self.controls(chosen).items()][:6]), colour), caption)]
+            rows = list(dict.fromkeys([*(one.row for one in chosen), *range(len(self.demos))]))[:MOST_PATHS]
+            segments = [(rows.index(one.row), one.start, one.end) for one in chosen]
+            return Drawing(typical_paths([self.paths[row] for row in rows], segments, option_colour(choice)), caption)
+        every = [
+            self.demos[one.row].actions.reshape(len(self.demos[one.row]), -1)[one.start : one.end, :controls]
+            for one in chosen[:INSTANCES]
+        ]
+        values = {f"control[{n}]": [array[:, n].astype(float) for array in every] for n in range(every[0].shape[1])}
+        return Drawing(curves(values, option_colour(choice)), caption)
 
 
 def sheet_of(pictures: Sequence[Observed], chosen: Sequence[Instance], where: str) -> Picture:

@@ -310,4 +310,4 @@ class ReportSpec(Model):
 
     trajectory: Annotated[Trajectory | None, PlainSerializer(_written)] = None
     """What is drawn as paths in space: an observation (its first three numbers, or both of two), ``[key, slice]``, or a
-    list of these, one for each arm; null: the observation that moves most as the controls say."""
+    list of these, one for each arm; null: nothing. ``init`` names the observation that controls move."""

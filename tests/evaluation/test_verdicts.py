@@ -94,6 +94,15 @@ def test_options_below_flat_are_doubtful():
     )
 
 
+@pytest.mark.parametrize(("nats", "controls", "told"), [(0.02, 7, False), (0.02, 1, True), (0.08, 7, True)])
+def test_a_mixture_that_leads_in_training_by_what_nobody_acts_on_is_no_doubt(nats, controls, told):
+    """A control has to be 1 % more probable under the mixture."""
+    below = {"mixture": {"objective": nats, "nats": 0.0}}
+    metrics = scored({"ddco": 1.0}, {"ddco": around(1.0)}, -2.0, controls, below=below)
+    said = f"In training options are less likely than the mixture that they contain, by {nats:.2f} nats per step."
+    assert [text for text, _ in verdicts.doubts(metrics)] == [said] * told
+
+
 @pytest.mark.parametrize(("left_out", "train", "few"), [(True, 4, True), (True, 8, False), (False, 4, False)])
 def test_few_demonstrations_that_are_each_left_out_are_said_to_be_few(left_out, train, few):
     """Where the fits without one of them fell apart; a sound fit needs no more."""

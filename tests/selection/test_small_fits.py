@@ -14,7 +14,7 @@ from sklearn.metrics import normalized_mutual_info_score
 import ddco_pyro
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.options import segments_of
-from ddco_pyro.selection.small import heavy_tails, in_steps, lasting, overrides
+from ddco_pyro.selection.small import heavy_tails, in_steps, lasting, moved, overrides
 from ddco_pyro.spec import load_spec, parse_spec, with_overrides
 
 SLOW = 30
@@ -101,3 +101,34 @@ def test_heavy_tails_are_found_where_they_predict_better():
         noise = [0.3 * own * random.normal(size=(60, 2)) for own in scale]
         demos = numbered(({"state": x}, x + e) for x, e in zip(observed, noise, strict=True))
         assert heavy_tails(spec, demos) == dims
+
+
+# --- what is drawn ----------------------------------------------------------------------------------------------------
+
+
+def reaching(other, absolute, random):
+    """A hand that wanders by 0.1, and something else that moves further, in [60, 3]."""
+    steps = 0.02 * random.normal(size=3) + 0.01 * random.normal(size=(60, 3))
+    hand = np.cumsum(steps, axis=0)
+    seen = {"handle": other(np.linspace(0, 1, 60)[:, None]) * [3.0, 2.0, 1.0], "palm": hand}
+    return seen, np.vstack([hand[1:], hand[-1:]]) if absolute else np.vstack([steps[1:], 0 * steps[:1]])
+
+
+@pytest.mark.parametrize("absolute", [False, True], ids=["velocities", "targets"])
+@pytest.mark.parametrize(
+    "other", [lambda time: np.maximum(time - 0.7, 0), lambda time: time], ids=["late", "on a belt"]
+)
+def test_the_hand_is_drawn_where_something_else_moves_further(other, absolute):
+    random = np.random.default_rng(0)
+    assert moved(numbered(reaching(other, absolute, random) for _ in range(10))) == "palm"
+
+
+@pytest.mark.parametrize(("more", "drawn"), [({}, ""), ({"hand": 2}, "hand"), ({"hand": 2, "arm": 3}, "arm")])
+def test_a_plane_is_drawn_where_nothing_moves_in_space(more, drawn):
+    """A goal does not move, a sine and a cosine are no place, and two fingers of a gripper none beside an arm."""
+    rng, rows = np.random.default_rng(0), []
+    for _ in range(4):
+        control, turn = rng.normal(size=(30, 3)), np.cumsum(0.1 * rng.random(30))[:, None]
+        seen = {key: np.cumsum(control[:, :size], 0) for key, size in more.items()}
+        rows.append(({"angle": np.hstack([np.sin(turn), np.cos(turn)]), "goal": np.ones((30, 3)), **seen}, control))
+    assert moved(numbered(rows)) == drawn

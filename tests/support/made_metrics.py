@@ -36,12 +36,14 @@ def compared(mean: float, error: float | None, **values: float) -> dict[str, Any
 def made_metrics(held_out: int = 1, **fields: Any) -> Metrics:
     """Metrics with these fields and so many held-out demonstrations."""
     each = {"by_dimension": [1.0], "options": 0.0}
+    names = [fields.get("model", "ddco"), *fields.get("comparison", {})]
+    row = {"part": "valid", "steps": 1, "log_likelihood_per_step": dict.fromkeys(names, 1.0)}
     fixed = {
         "model": "ddco",
         "log_likelihood_per_step": {"train": 2.0, "valid": 1.0},
         "log_likelihood_by_dimension": {"train": each, "valid": each},
         "valid": [{"name": f"demo_{n}", "steps": 1, "log_likelihood": 1.0} for n in range(held_out)],
-        "demonstrations_by_likelihood": [],
+        "demonstrations_by_likelihood": [{"name": f"demo_{n}", **row} for n in range(held_out)],
         "comparison": {},
         "engine_check": {"value": 0.0, "gradient": 0.0},
         "demonstrations": {"train": 1, "tune": 1, "valid": held_out},

@@ -308,7 +308,8 @@ def test_a_hierarchy_is_no_less_likely_in_training_than_its_mixture(seed, monkey
     assert held.objective == pytest.approx(
         after.comparison["mixture"].training.objective - after.training.objective, abs=1e-9
     )
-    assert ("less likely than the mixture that they contain" in verdict(before)) == broken.told
+    counts = max(broken.objective, broken.nats) > 0.01 * before.marginal.controls
+    assert ("less likely than the mixture that they contain" in verdict(before)) == counts
     restarts = after.training.restarts
     went_on = [one.start for one in restarts.each[1:]]
     assert (went_on == []) == (broken.objective <= restarting.ROUNDING)

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from itertools import chain, islice
 from typing import Any
 
 import numpy as np
 import pandas
 
-from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import whole_file
 from ddco_pyro.data.labels import BOUNDARY, SOURCE, UNKNOWN
-from ddco_pyro.drawing.shown import paths_of, stored_pictures
+from ddco_pyro.drawing.shown import stored_pictures
 from ddco_pyro.names import option_name
 from ddco_pyro.segmenting.formats.asked import Asked
 from ddco_pyro.segmenting.page import timelines, write_page
@@ -61,16 +59,10 @@ def write_parquet(asked: Asked, segmented: Segmented) -> str:
     return str(asked.out)
 
 
-FIRST = 10
-"""Demonstrations among which an observation that moves like a position is sought."""
-
-
 def write_html(asked: Asked, segmented: Segmented) -> str:
     """The page of :mod:`ddco_pyro.segmenting.page`."""
     pictures = stored_pictures(asked.source, {demo.name: len(demo) for demo in segmented.segments})
     demos = recorded(segmented, asked.fit, asked.source)
-    first = list(islice(demos, FIRST))
-    paths = paths_of(asked.fit.spec.report.trajectory, Demonstrations(tuple(first)))
-    drawn = timelines(segmented, chain(first, demos), pictures, paths)
+    drawn = timelines(segmented, demos, pictures, asked.fit.spec.report.trajectory or ())
     write_page(asked.out, segmented, str(asked.run), str(asked.demos), drawn)
     return str(asked.out)
