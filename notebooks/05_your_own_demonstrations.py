@@ -23,7 +23,7 @@ import os
 import warnings
 from pathlib import Path
 
-from IPython.display import Image, Markdown
+from IPython.display import SVG, Markdown
 
 warnings.filterwarnings("ignore", message="IProgress")  # progress needs no widgets here
 
@@ -69,6 +69,7 @@ hierarchy:
   meta_policy: {{network: linear}}
 training: {{starts: [vq_controls], optimizer: {{lr: 1.0e-2}}, epochs: 400}}
 compare_with: [flat]
+report: {{trajectory: {observations[0]}}}
 """
 (RUNS / "mine.yaml").write_text(SPEC)
 spec = load_spec(RUNS / "mine.yaml", [one for one in SMALLER if not one.startswith("demonstrations.")])

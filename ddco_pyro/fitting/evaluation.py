@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import one_hot
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.errors import Failed
@@ -18,6 +19,7 @@ from ddco_pyro.evaluation.branch_use import branch_use
 from ddco_pyro.evaluation.inferred import Inferred, infer
 from ddco_pyro.evaluation.options import divergences, option_use, segments_of
 from ddco_pyro.events import OnEvent, ignore
+from ddco_pyro.fitting.draws import matched
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.inference import Posterior
 from ddco_pyro.inference.posteriors import Decomposition
@@ -37,7 +39,6 @@ from ddco_pyro.metrics import (
     TrainedLabels,
     Use,
 )
-from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.outputs import Outputs
 from ddco_pyro.spec import LearnedStd, Spec, with_overrides
 from ddco_pyro.statistics import paired, worth
@@ -69,11 +70,11 @@ class _Part:
     @classmethod
     def of(cls, fit: Fit, demos: Demonstrations, held_out: bool = False) -> _Part:
         values, parts, paths, recognised = [], [], [], list[np.ndarray]()
-        named = _Names(fit, demos) if held_out and fit.without else None
+        choices = _as_own(fit, demos) if held_out and fit.without else lambda piece: piece.path.choices
         for piece in fit.infer(demos, held_out):
             values.append(_finite(fit, piece))
             parts.append(piece.decomposition)
-            paths.append(named.alike(piece) if named else piece.path.choices)
+            paths.append(choices(piece))
             if piece.recognised is not None:
                 rows = zip(piece.recognised.numpy(), piece.lengths, strict=True)
                 recognised += [row[:steps] for row, steps in rows]
@@ -81,37 +82,35 @@ class _Part:
         return cls(np.concatenate(values), Decomposition.joined(parts), segments, recognised)
 
 
-class _Names:
-    """Names the options of models without a demonstration as a fit's own.
+def _as_own(fit: Fit, demos: Demonstrations) -> Callable[[Inferred], tuple[Tensor, ...]]:
+    """The most likely choices of a piece by the model without its demonstration, with the numbers of a fit's own.
 
     Options are matched so that both models agree on as many steps of the other demonstrations as possible.
     """
+    sizes = [1 + level.count for level in fit.hierarchy.option_levels()]
+    own = _active(infer(fit.hierarchy, demos), sizes)
 
-    def __init__(self, fit: Fit, demos: Demonstrations) -> None:
-        self.demos, self.own = demos, _choices(fit.hierarchy, demos)
+    def renumbered(piece: Inferred) -> tuple[Tensor, ...]:
+        others = demos.select([name for name in demos.names if name not in piece.names])
+        theirs = _active(infer(piece.hierarchy, others), sizes)
+        orders = matched([own[name] for name in theirs], [*theirs.values()], sizes)
+        pairs = zip(piece.path.choices, orders, strict=True)
+        return tuple(torch.where(h < 0, h, torch.from_numpy(order)[h.clamp(min=0)]) for h, order in pairs)
 
-    def alike(self, piece: Inferred) -> tuple[Tensor, ...]:
-        """The most likely choices of each level for the demonstration of a piece, by the model without it."""
-        from scipy.optimize import linear_sum_assignment
-
-        others = [name for name in self.demos.names if name not in piece.names]
-        theirs, choices = _choices(piece.hierarchy, self.demos.select(others)), piece.path.choices
-        matched = []
-        for level, own in enumerate(choices):
-            pairs = np.concatenate([np.stack([theirs[name][level], self.own[name][level]]) for name in others], axis=1)
-            names = np.arange(max(int(pairs.max()), int(own.max())) + 1)
-            together = np.zeros((len(names), len(names)))
-            np.add.at(together, tuple(pairs), 1)
-            names[1:] = 1 + linear_sum_assignment(together[1:, 1:], maximize=True)[1]  # 0 is the control
-            matched.append(torch.where(own < 0, own, torch.as_tensor(names)[own.clamp(min=0)]))
-        return tuple(matched)
+    return renumbered
 
 
-def _choices(model: Hierarchy, demos: Demonstrations) -> dict[str, list[np.ndarray]]:
-    """The most likely choices of each demonstration by its name, [T] for each level."""
+def _active(pieces: Iterable[Inferred], sizes: Sequence[int]) -> dict[str, Tensor]:
+    """Whether each choice is active on the most likely path of each demonstration, by name, [T, Σ (1 + k_d)]."""
     return {
-        name: [level[row, : piece.lengths[row]].numpy() for level in piece.path.choices]
-        for piece in infer(model, demos)
+        name: torch.cat(
+            [
+                one_hot(level[row, : piece.lengths[row]].long(), size).double()
+                for level, size in zip(piece.path.choices, sizes, strict=True)
+            ],
+            dim=1,
+        )
+        for piece in pieces
         for row, name in enumerate(piece.names)
     }
 
@@ -165,8 +164,6 @@ def evaluate(
     held_out = {} if valid is None else {name: each["valid"] for name, each in by_method.items()}
     lengths = np.array([] if valid is None else valid.lengths, dtype=float)
     options, segments, alike = _options(fitted, demos, on_event) if depth else ([], [], [])
-    labels = fitted.spec.demonstrations.labels_by_level(depth) if depth else ()
-    counts = [level.count for level in fitted.hierarchy.option_levels()]
     return Metrics(
         model=fitted.name,
         log_likelihood_per_step=PerStep(train=per_step["train"], valid=per_step.get("valid")),
@@ -198,7 +195,7 @@ def evaluate(
         options=options,
         segments=segments,
         divergences=alike,
-        agreement=_agreement(labels, counts, ours, parts, fitted.hierarchy) if labels else None,
+        agreement=_agreement(fitted, ours, parts),
         control_frequency=demos.frequency,
         trained_labels=_trained_labels(fitted, demos),
         **about,
@@ -300,45 +297,23 @@ def _by_dimension(fit: Fit, each: Decomposition, demos: Demonstrations) -> Dimen
     return Dimensions(by_dimension=values, options=float(each.options.sum()) / steps)
 
 
-def _agreement(
-    names: Sequence[str],
-    counts: Sequence[int],
-    ours: dict[str, _Part],
-    parts: dict[str, Demonstrations],
-    model: Hierarchy,
-) -> Agreement:
-    """All measures of each level's segments against its labels, and the confusion matrix of the held-out part.
+def _agreement(fit: Fit, ours: Mapping[str, _Part], parts: Mapping[str, Demonstrations]) -> Agreement | None:
+    """All measures of each level's segments against its labels, and the confusion matrix of the last part.
 
-    Without a held-out part the confusion matrix is of the training part.
-
-    :param counts: the number of options of each level.
+    None where the spec names no labels.
     """
-    pairs = {
-        name: [
-            (level, [demo.labels[label] for demo in part])
-            for level, label in zip(ours[name].segments, names, strict=True)
-        ]
-        for name, part in parts.items()
-    }
-    scores = {name: [agreement(*pair) for pair in each] for name, each in pairs.items()}
-    tables = [confusion(*pair) for pair in pairs.get("valid", pairs["train"])]
-    alone = {}
-    if model.recogniser is not None:
-        level = model.recogniser.level - 1
-        alone = {name: agreement(ours[name].recognised, pairs[name][level][1]) for name in parts}
-    equal = {
-        name: [of_equal_lengths(labels, count) for (_, labels), count in zip(each, counts, strict=True)]
-        for name, each in pairs.items()
-    }
-    return Agreement(
-        labels=list(names),
-        train=scores["train"],
-        valid=scores.get("valid"),
-        equal_train=equal["train"],
-        equal_valid=equal.get("valid"),
-        recogniser=alone,
-        confusion=tables,
-    )
+    levels, recogniser = fit.hierarchy.option_levels(), fit.hierarchy.recogniser
+    names = fit.spec.demonstrations.labels_by_level(len(levels)) if levels else ()
+    found: dict[str, Any] = {"labels": list(names), "recogniser": {}}
+    for part, demos in parts.items():
+        truth = [[demo.labels[name] for demo in demos] for name in names]
+        pairs = list(zip(ours[part].segments, truth, strict=False))
+        equal = zip(truth, (level.count for level in levels), strict=False)
+        found |= {part: [agreement(*pair) for pair in pairs], "confusion": [confusion(*pair) for pair in pairs]}
+        found[f"equal_{part}"] = [of_equal_lengths(labels, count) for labels, count in equal]
+        if names and recogniser is not None:
+            found["recogniser"][part] = agreement(ours[part].recognised, truth[recogniser.level - 1])
+    return Agreement(**found) if names else None
 
 
 def _trained_labels(fit: Fit, demos: Demonstrations) -> TrainedLabels | None:

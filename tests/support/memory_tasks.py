@@ -1,7 +1,7 @@
-"""Small tasks on a line whose supervisor's intention is hidden from what is observed.
+"""Two small tasks on a line whose supervisor's intention is hidden from what is observed.
 
 In each the supervisor moves one way or the other, 1 or -1: this is its *intention*. The observation ``seen`` does not
-tell it, or tells it once. The observation ``intention`` tells it to a spec that names it. That is the control case,
+tell it. The observation ``intention`` tells it to a spec that names it. That is the control case,
 with the same demonstrations and the same starts.
 """
 
@@ -102,25 +102,6 @@ class ThereAndBack(Line):
         return 1.0 if self.position < 0 else 0.0 if self.position > 1 else 0.5
 
 
-class CueOnce(Line):
-    """To the side that a cue names. The cue is seen at the first step alone, beside it how much time is over."""
-
-    steps, speed, sees = 12, 0.1, 2
-
-    def begin(self) -> None:
-        self.cue = self.direction
-
-    @property
-    def arrived(self) -> bool:
-        return self.over and self.cue * self.position > 0.9
-
-    def seen(self) -> list[float]:
-        return [0.0 if self.time else float(self.cue), self.time / self.steps]
-
-    def odds(self) -> float:
-        return 0.5 if self.time else float(self.cue > 0)
-
-
 class Obstacle(Line):
     """Past an obstacle, left or right of it: either will do. What is seen is how near it is, and, under much noise,
     how far the point is to the side.
@@ -138,36 +119,6 @@ class Obstacle(Line):
 
     def odds(self) -> float:
         return float(1 / (1 + np.exp(-2 * self.speed * self.time * self.now[1] / self.noise**2)))
-
-
-class TwoGoals(Line):
-    """By way of both of two goals, at -1 and 1, in either order; the position is seen.
-
-    Half of all demonstrations pass a place between the middle and a goal outwards and then inwards, the others outwards
-    alone: two of three moves seen there are outwards.
-    """
-
-    steps, speed = 24, 0.25
-
-    def begin(self) -> None:
-        self.position, self.visited = self.random.uniform(-0.2, 0.2), {0}
-
-    def moved(self) -> None:
-        side = int(np.sign(self.position))
-        self.visited |= {side} if abs(self.position) > 0.75 else set()
-        self.direction = -side if abs(self.position) > 1 else self.direction
-
-    @property
-    def over(self) -> bool:
-        return self.arrived or super().over
-
-    @property
-    def arrived(self) -> bool:
-        return self.visited == {-1, 0, 1}
-
-    def odds(self) -> float:
-        outwards = 2 / 3 if abs(self.position) < 0.75 else 0.5 if abs(self.position) < 1 else 0.0
-        return outwards if self.position > 0 else 1 - outwards
 
 
 class Supervisor:
@@ -202,4 +153,4 @@ def _task(environment: type[Line]) -> Task:
     )
 
 
-there_and_back, cue_once, obstacle, two_goals = map(_task, (ThereAndBack, CueOnce, Obstacle, TwoGoals))
+there_and_back, obstacle = map(_task, (ThereAndBack, Obstacle))
