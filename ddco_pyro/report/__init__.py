@@ -19,8 +19,8 @@ from ddco_pyro.evaluation.options import beside_equal_parts
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.names import method
 from ddco_pyro.report import inputs, likelihood, options, rollouts, skills, training
-from ddco_pyro.segmenting.segments import Segmented, of_piece, of_run
 from ddco_pyro.segmenting.page import timelines
+from ddco_pyro.segmenting.segments import Segmented, of_piece, of_run
 
 
 def write_report(fit: Fit, demos: Demonstrations) -> Path:

@@ -22,9 +22,9 @@ from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Confusion, Scores
 from ddco_pyro.names import label_name, numbered_name, option_name
 from ddco_pyro.report.skills import Shown, agreeing
-from ddco_pyro.segmenting.segments import Segmented
 from ddco_pyro.segmenting.baselines import BASELINES, EQUAL, RECOGNISED
 from ddco_pyro.segmenting.page import HOW
+from ddco_pyro.segmenting.segments import Segmented
 
 ROWS = 6
 """Time lines that are seen at once."""
