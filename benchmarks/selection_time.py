@@ -21,7 +21,7 @@ from typing import Any
 from ddco_pyro.data.files import write_text
 from ddco_pyro.events import CellDone, Event
 from ddco_pyro.fitting.fit import fit
-from ddco_pyro.selection import Workers, folds, grid, select
+from ddco_pyro.selection import Workers, grid, select
 from ddco_pyro.spec import load_spec
 from ddco_pyro.training.data import demonstrations
 from ddco_pyro.training.networks import Dimensions
@@ -34,7 +34,7 @@ SHORT = ("selection.grid.hierarchy.levels.0.count=[2, 3, 4, 5]", "selection.fold
 def one_fold() -> dict[str, Any]:
     """Seconds of CPU that the first of ten folds takes for each candidate of the needle spec."""
     spec = load_spec("specs/needle.yaml", [GRID])
-    fold, *_ = folds.divide(demonstrations(spec), spec.selection.folds, spec.seed)
+    fold, *_ = grid.divide(demonstrations(spec), spec.selection.folds, spec.seed)
     seconds = {}
     for candidate in grid.candidates(spec, Dimensions.of(fold)):
         start = time.process_time()

@@ -72,10 +72,12 @@ def segments_of(fit: Fit, demos: Demonstrations) -> Segmented:
     """The segments of a fit's demonstrations, in the order and with the numbers of ``demonstrations_by_likelihood``."""
     labels = {demo.name: {name: demo.labels[name] for name in fit.spec.demonstrations.label_names} for demo in demos}
     found = {demo.name: demo for piece in fit.infer(demos) for demo in of_piece(fit, piece, labels, intervals=True)}
-    ordered = [  # held out, where a model trains with it too
+    rows = fit.metrics.demonstrations_by_likelihood
+    held_out = {row.name for row in rows if row.part == "valid"}
+    ordered = [
         replace(found[row.name], log_likelihood=row.log_likelihood_per_step[fit.name], held_out=row.part == "valid")
-        for row in fit.metrics.demonstrations_by_likelihood
-        if row.name in found
+        for row in rows
+        if row.name in found and (row.part == "valid" or row.name not in held_out)  # some are in both parts
     ]
     return of_run(fit, ordered, demos.frequency, label_names(demos.attributes))
 

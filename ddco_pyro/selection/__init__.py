@@ -25,8 +25,7 @@ from ddco_pyro.metrics import Metrics
 from ddco_pyro.selection import choice as choosing
 from ddco_pyro.selection import grid
 from ddco_pyro.selection.choice import Choice
-from ddco_pyro.selection.folds import assign, divide
-from ddco_pyro.selection.grid import Candidate
+from ddco_pyro.selection.grid import Candidate, assign, divide
 from ddco_pyro.spec import Spec, with_overrides
 from ddco_pyro.training import data
 from ddco_pyro.training.networks import Dimensions, model_name

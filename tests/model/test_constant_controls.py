@@ -18,7 +18,7 @@ import ddco_pyro
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.fitting.fitted import Fit
-from ddco_pyro.selection.folds import divide
+from ddco_pyro.selection.grid import divide
 from ddco_pyro.spec import with_overrides
 from ddco_pyro.training.networks import Dimensions
 

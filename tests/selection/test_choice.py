@@ -15,8 +15,7 @@ from selecting import DATA, candidate, scored, spec_at, two_skills
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.selection.choice import as_data, choose, markdown, table
-from ddco_pyro.selection.folds import FoldError, assign, divide
-from ddco_pyro.selection.grid import candidates, wide
+from ddco_pyro.selection.grid import FoldError, assign, candidates, divide, wide
 from ddco_pyro.spec import SpecError, parse_spec, with_overrides
 from ddco_pyro.training.networks import Dimensions
 
