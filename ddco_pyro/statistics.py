@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ddco_pyro.metrics import Against, Difference, Worth
+from ddco_pyro.metrics import Against, Difference, Mean, Rate, Worth
 from ddco_pyro.names import FLAT, MIXTURE
 
 CONFIDENCE = 0.95
@@ -42,31 +42,26 @@ def wider_interval(values: Sequence[float], error: float, trials: int) -> tuple[
     return mean - half, mean + half
 
 
-def mean(values: np.ndarray) -> dict[str, Any]:
+def mean(values: np.ndarray) -> Mean:
     """A mean with its standard deviation and Student's 95 % interval; both are None for less than two values."""
     trials = len(values)
     centre = float(values.mean()) if trials else None
-    if centre is None or trials < 2:
-        return {"mean": centre, "std": None, "trials": trials, "interval": None}
-    return {"mean": centre, "std": float(values.std(ddof=1)), "trials": trials, "interval": [*mean_interval(values)]}
+    if trials < 2:
+        return Mean(mean=centre, std=None, trials=trials, interval=None)
+    return Mean(mean=centre, std=float(values.std(ddof=1)), trials=trials, interval=mean_interval(values))
 
 
-def rate(successes: int, trials: int) -> dict[str, Any]:
+def rate(successes: int, trials: int) -> Rate:
     """A success rate and its Wilson 95 % interval."""
     if trials == 0:
-        return {"successes": 0, "trials": 0, "rate": None, "interval": None}
+        return Rate(successes=0, trials=0, rate=None, interval=None)
     from scipy.stats import binomtest
 
-    interval = binomtest(successes, trials).proportion_ci(CONFIDENCE, method="wilson")
-    return {
-        "successes": successes,
-        "trials": trials,
-        "rate": successes / trials,
-        "interval": [float(interval.low), float(interval.high)],
-    }
+    low, high = binomtest(successes, trials).proportion_ci(CONFIDENCE, method="wilson")
+    return Rate(successes=successes, trials=trials, rate=successes / trials, interval=(float(low), float(high)))
 
 
-def paired_difference(ours: Sequence[float], theirs: Sequence[float]) -> dict[str, Any]:
+def paired_difference(ours: Sequence[float], theirs: Sequence[float]) -> Against:
     """Successes from the same initial states: counts of those of one policy alone, and McNemar's exact p-value."""
     from scipy.stats import binomtest
 
@@ -74,7 +69,7 @@ def paired_difference(ours: Sequence[float], theirs: Sequence[float]) -> dict[st
     only_theirs = int(sum(a < b for a, b in zip(ours, theirs, strict=True)))
     discordant = only_ours + only_theirs
     p_value = float(binomtest(only_ours, discordant).pvalue) if discordant else 1.0
-    return {"only_ours": only_ours, "only_theirs": only_theirs, "trials": len(ours), "p_value": p_value}
+    return Against(only_ours=only_ours, only_theirs=only_theirs, trials=len(ours), p_value=p_value)
 
 
 def edit_score(ours: np.ndarray, theirs: np.ndarray) -> float:

@@ -117,7 +117,7 @@ def estimate(
     elif len(units) > 1 and trials:
         number = trials * len(values)
         count = round(abs(value) * number)
-        low, high = rate(count, number)["interval"]
+        low, high = rate(count, number).interval or (0.0, 1.0)
         least, most = sorted((math.copysign(low, value), math.copysign(high, value)))
         interval = (least, most) if count else (max(lowest, -high), high)
         error = (interval[1] - interval[0]) / 2 / t_quantile(math.inf)

@@ -252,7 +252,8 @@ def _paired_rollouts(fits: Sequence[Fit]) -> list[dict[str, Any]]:
         if fit.spec.task == first.spec.task and seeds:
             left, right = [ours[seed] for seed in seeds], [theirs[seed] for seed in seeds]
             rates = {"rate": rate(int(sum(left)), len(left)), "other_rate": rate(int(sum(right)), len(right))}
-            pairs.append({"run": first.place, "other": fit.place, **paired_difference(left, right), **rates})
+            each = {name: one.model_dump() for name, one in rates.items()}
+            pairs.append({"run": first.place, "other": fit.place, **dict(paired_difference(left, right)), **each})
     return pairs
 
 

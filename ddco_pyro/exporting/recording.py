@@ -16,7 +16,7 @@ from ddco_pyro.model.encoder import ObservationEncoder
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs, States
 from ddco_pyro.model.outputs import Outputs
-from ddco_pyro.spec import STEP, ObservationSpec
+from ddco_pyro.spec import STEP
 
 EPISODES, STEPS = 3, 20
 """Number and length of synthetic episodes. Without images the first one is a step longer than the longest
@@ -100,7 +100,10 @@ def _arrays(outputs: Outputs) -> runner.Outputs:
 
 
 def _episode(encoder: ObservationEncoder, steps: int, random: np.random.Generator) -> dict[str, np.ndarray]:
-    """Random observations with the mean and spread of the training data, and of its differences where they are used."""
+    """Random observations with the mean and spread of the training data, and of its differences where they are used.
+
+    Angles are of a turn, and quaternions have norm 1.
+    """
     observations: dict[str, np.ndarray] = {}
     means, stds = (
         (part.numpy() for part in statistic.split(encoder.sizes)) for statistic in (encoder.mean, encoder.std)
@@ -109,30 +112,18 @@ def _episode(encoder: ObservationEncoder, steps: int, random: np.random.Generato
         if spec.key == STEP:
             continue
         shape = encoder.shapes[spec.key]
-        length = int(np.prod(shape))
-        if spec.angles or spec.quaternions:
-            observations[spec.key] = _turning(spec, mean, std, random, (steps, *shape))
-            continue
-        values = mean[:length] + std[:length] * random.normal(size=(steps, length))
-        if spec.differences:
-            behind = slice(length, 2 * length)
+        values = random.uniform(-np.pi, np.pi, (steps, int(np.prod(shape))))
+        quaternions = [[first + place for place in range(4)] for first in spec.quaternions]
+        rest = np.delete(np.arange(values.shape[1]), [*spec.angles, *np.ravel(quaternions).astype(int)])
+        values[:, rest] = mean[: len(rest)] + std[: len(rest)] * random.normal(size=(steps, len(rest)))
+        for four in quaternions:
+            values[:, four] /= np.linalg.norm(values[:, four], axis=1, keepdims=True)
+        if spec.differences and len(rest) == values.shape[1]:
+            behind = slice(len(rest), 2 * len(rest))
             differences = mean[behind] + std[behind] * random.normal(size=values.shape)
-            values = _walk(values[0], differences, mean[:length], std[:length])
+            values = _walk(values[0], differences, mean[: len(rest)], std[: len(rest)])
         observations[spec.key] = values.reshape(steps, *shape)
     return observations | {key: _pictures(steps, encoder.shapes[key], random) for key in encoder.images}
-
-
-def _turning(
-    spec: ObservationSpec, mean: np.ndarray, std: np.ndarray, random: np.random.Generator, shape: tuple[int, ...]
-) -> np.ndarray:
-    """Random observations [T, ...] of this shape: angles of a turn, unit quaternions, other numbers as in training."""
-    values = random.uniform(-np.pi, np.pi, (shape[0], int(np.prod(shape[1:]))))
-    quaternions = [[first + place for place in range(4)] for first in spec.quaternions]
-    for four in quaternions:
-        values[:, four] /= np.linalg.norm(values[:, four], axis=1, keepdims=True)
-    rest = np.delete(np.arange(values.shape[1]), [*spec.angles, *np.ravel(quaternions).astype(int)])
-    values[:, rest] = mean[: len(rest)] + std[: len(rest)] * random.normal(size=(shape[0], len(rest)))
-    return values.reshape(shape)
 
 
 def _pictures(steps: int, shape: tuple[int, ...], random: np.random.Generator) -> np.ndarray:

@@ -70,7 +70,8 @@ class _Part:
     @classmethod
     def of(cls, fit: Fit, demos: Demonstrations, held_out: bool = False) -> _Part:
         values, parts, paths, recognised = [], [], [], list[np.ndarray]()
-        choices = _as_own(fit, demos) if held_out and fit.without else lambda piece: piece.path.choices
+        renumbered = held_out and fit.without and fit.hierarchy.depth
+        choices = _as_own(fit, demos) if renumbered else lambda piece: piece.path.choices
         for piece in fit.infer(demos, held_out):
             values.append(_finite(fit, piece))
             parts.append(piece.decomposition)

@@ -86,18 +86,16 @@ def roll_out(
         for name, outcomes in by_method.items()
         if all(SUCCESS in outcome for outcome in outcomes)
     }
+    pairs = {
+        name: paired_difference(succeeded[fit.name], own)
+        for name, own in succeeded.items()
+        if name != fit.name and fit.name in succeeded
+    }
     fit.metrics.rollouts = Rollouts(
         seed=seeds.start,
         episodes=episodes,
         methods={
-            name: Method.model_validate(
-                {
-                    "measures": summarize(task, outcomes),
-                    "against": paired_difference(succeeded[fit.name], succeeded[name])
-                    if name != fit.name and {name, fit.name} <= {*succeeded}
-                    else None,
-                }
-            )
+            name: Method(measures=summarize(task, outcomes), against=pairs.get(name))
             for name, outcomes in by_method.items()
         },
         worth=success_worth(fit.name, succeeded),

@@ -43,7 +43,7 @@ def section(fit: Fit, segmented: Segmented, shown: Shown) -> Section:
         options = [demo.levels[level].options for demo in segmented.segments]
         drawing = paths_of_options(shown.paths, options)
         name = "trajectories" if len(fit.names) == 1 else f"trajectories-{level}"
-        standing_alone = drawing.replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1)
+        standing_alone = str(drawing).replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1)
         write_text(fit.run_folder / "figures" / f"{name}.svg", standing_alone)
         caption = (
             f"Level “{level}”: {min(len(options), MOST_PATHS)} demonstrations, coloured by the most likely option: "

@@ -11,6 +11,7 @@ import numpy as np
 
 from ddco_pyro.data.demonstrations import Demonstration
 from ddco_pyro.jobs import Workers, run_all
+from ddco_pyro.metrics import Measure
 from ddco_pyro.simulation.task import Policy, Task, find_task
 from ddco_pyro.statistics import mean, rate
 
@@ -106,12 +107,12 @@ def _run_named(task: str, *how: Any) -> Episode:
     return run_episode(find_task(task), *how)
 
 
-def summarize(task: Task, outcomes: Sequence[Mapping[str, float]]) -> dict[str, dict[str, Any]]:
+def summarize(task: Task, outcomes: Sequence[Mapping[str, float]]) -> dict[str, Measure]:
     """Each measure over episodes: a rate with its Wilson 95 % interval, or a mean with Student's 95 % interval.
 
     Episodes to which a measure does not apply (NaN) are not among its ``trials``.
     """
-    summary = {}
+    summary: dict[str, Measure] = {}
     for name in dict.fromkeys(name for outcome in outcomes for name in outcome):
         values = np.array([outcome.get(name, np.nan) for outcome in outcomes])
         values = values[~np.isnan(values)]

@@ -90,7 +90,7 @@ def test_options_remember_what_a_mixture_cannot(name):
     by_chance = chance(name)
     low, _ = worth(fit)
     assert ours >= 0.95 * len(options)
-    most = stats.binomtest(by_chance["successes"], by_chance["trials"]).proportion_ci(1 - 2 * UNLIKELY).high
+    most = stats.binomtest(by_chance.successes, by_chance.trials).proportion_ci(1 - 2 * UNLIKELY).high
     assert theirs <= stats.binom.isf(UNLIKELY, len(mixture), most)
     assert low > 0
     if name == "obstacle":  # either side is passed, as in the demonstrations
@@ -102,5 +102,5 @@ def test_where_the_intention_is_seen_there_is_nothing_to_remember(name):
     fit, options, mixture = fitted(name, ["seen", "intention"])
     low, high = worth(fit)
     assert sum(successes(options)) >= 0.95 * len(options)
-    assert paired_difference(successes(options), successes(mixture))["p_value"] > 0.05
+    assert paired_difference(successes(options), successes(mixture)).p_value > 0.05
     assert low <= 0 <= high

@@ -9,18 +9,14 @@ import numpy as np
 import pytest
 import torch
 from command_line import call
-from dots import SIZE, dots, followed, together
-from planted import make_spec, make_trainer, make_truth, plant
+from dots import SIZE, followed, together
 from sklearn.decomposition import PCA
 from sklearn.linear_model import LinearRegression
-from sklearn.metrics import normalized_mutual_info_score
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.encoding import Backbone, encode, load, principal_components
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import DemonstrationsDone
-from ddco_pyro.inference import segment
-from ddco_pyro.model.batch import encode as prepare
 
 MEANS, PLACES = "user_encoders:means", "user_encoders:places"
 
@@ -44,20 +40,6 @@ def test_components_say_where_the_dot_is(tmp_path, out):
     train, valid = Demonstrations.read(out).split(0.2, 0)
     places = LinearRegression().fit(together(train, "camera_features"), together(train, "place"))
     assert places.score(together(valid, "camera_features"), together(valid, "place")) > 0.9
-
-
-def test_options_are_recovered_from_features(tmp_path, out):
-    """Planted in a plane, and seen as pictures of a dot alone."""
-    truth = make_truth(make_spec((3,)))
-    demos, choices = plant(truth, 40, 20, seed=1)
-    drawn = [Demonstration(demo.name, {"camera": dots(demo.observations["state"])}, demo.actions) for demo in demos]
-    Demonstrations(tuple(drawn)).write(tmp_path / "planted.hdf5")
-    encoded(tmp_path / "planted.hdf5", out, PLACES, size=8, name="state")
-    spec = make_spec((3,), epochs=300, starts=["vq_controls"])
-    found = make_trainer(spec, Demonstrations.read(out), tmp_path / "fit").run()
-    batch = prepare(Demonstrations.read(out), found.encoder, found.scaling)
-    segments = segment(found.tabulate(batch), batch.lengths)[0]
-    assert normalized_mutual_info_score(choices.flatten(), segments.flatten()) > 0.85
 
 
 def test_all_but_the_pictures_stays(few_dots, out):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 from itertools import pairwise
 
 import pytest
@@ -19,8 +18,7 @@ from ddco_pyro.comparison.page import write
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.names import method
 from ddco_pyro.selection import Workers, select
-from ddco_pyro.spec import dump_spec, with_overrides
-from ddco_pyro.training.data import demonstrations
+from ddco_pyro.spec import with_overrides
 from ddco_pyro.training.networks import nearest_widths
 
 BASELINES = ["flat", "flat_equal", "per_timestep"]
@@ -87,17 +85,6 @@ def test_flat_equal_has_as_many_parameters_as_the_hierarchy(fitted):
     assert abs(perceptron((width,)) - ours) <= 4  # a unit has 8
     assert equal.spec.baseline.policy.hidden == (width,)
     assert equal.spec.baseline.kind == equal.name == "flat_equal"
-
-
-def test_flat_equal_is_a_run_of_its_own(fitted, tmp_path):
-    run, _ = fitted
-    alone = ddco_pyro.load(shutil.copytree(run.folder / "baselines" / "flat_equal", tmp_path / "alone"))
-    demos = demonstrations(run.spec)
-    assert alone.log_likelihood(demos) == pytest.approx(run.baselines["flat_equal"].log_likelihood(demos))
-    again = call("fit", alone.folder / "spec.yaml", "--out", tmp_path / "again")
-    assert again.status == 0, again.err
-    assert ddco_pyro.load(tmp_path / "again").metrics.parameters == alone.metrics.parameters
-    assert (tmp_path / "again" / "spec.yaml").read_text() == dump_spec(alone.spec)
 
 
 # --- equal budgets ----------------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from command_line import call
-from exportable import FITS, RECURRENT, SHAPES, make, observe
+from exportable import FITS, RECURRENT, make, observe
 from user_networks import Remembering
 
 import ddco_pyro
@@ -125,13 +125,6 @@ def test_both_refuse_the_same_observations(exported, toy_run, observation, messa
     for controller in (runner.Runner(folder), ddco_pyro.load(toy_run.folder).controller()):
         with pytest.raises(ValueError, match=message):
             controller.act(observation)
-
-
-def test_a_picture_has_to_be_bytes():
-    fit = make("conv", camera=True)
-    seen = {key: np.zeros(shape) for key, shape in SHAPES.items()}
-    with pytest.raises(ValueError, match="observation 'camera' is float64, it has to be uint8"):
-        fit.controller().act(seen)
 
 
 # --- what acts otherwise ----------------------------------------------------------------------------------------------

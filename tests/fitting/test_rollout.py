@@ -13,6 +13,7 @@ from scipy import stats
 from toy_task import task
 
 from ddco_pyro.acting.controller import Controller
+from ddco_pyro.metrics import Mean, Rate
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.simulation.episodes import run_episode, run_episodes, summarize
 from ddco_pyro.spec import RolloutSpec, parse_spec
@@ -140,8 +141,8 @@ def wilson(successes, trials):
 @pytest.mark.parametrize(("successes", "trials"), [(0, 1), (1, 1), (0, 20), (20, 20), (13, 50), (199, 200)])
 def test_a_rate_has_its_wilson_interval(successes, trials):
     found = rate(successes, trials)
-    assert (found["successes"], found["trials"], found["rate"]) == (successes, trials, successes / trials)
-    np.testing.assert_allclose(found["interval"], wilson(successes, trials), atol=1e-12)
+    assert (found.successes, found.trials, found.rate) == (successes, trials, successes / trials)
+    np.testing.assert_allclose(found.interval, wilson(successes, trials), atol=1e-12)
 
 
 @pytest.mark.parametrize(("only_ours", "only_theirs", "both"), [(0, 0, 5), (6, 1, 3), (1, 6, 3), (4, 4, 0), (12, 0, 0)])
@@ -152,31 +153,31 @@ def test_mcnemars_exact_p_value(only_ours, only_theirs, both):
     n, least = only_ours + only_theirs, min(only_ours, only_theirs)
     tail = sum(math.comb(n, k) for k in range(least + 1)) / 2**n
     found = paired_difference(ours, theirs)
-    assert (found["only_ours"], found["only_theirs"], found["trials"]) == (only_ours, only_theirs, len(ours))
-    assert found["p_value"] == pytest.approx(min(1.0, 2 * tail))
+    assert (found.only_ours, found.only_theirs, found.trials) == (only_ours, only_theirs, len(ours))
+    assert found.p_value == pytest.approx(min(1.0, 2 * tail))
 
 
 def test_a_measure_leaves_out_the_episodes_it_does_not_apply_to():
     outcomes = [{"success": 1.0, "error": 0.5}, {"success": 0.0, "error": math.nan}, {"success": 1.0, "error": 1.5}]
     found = summarize(task, [*outcomes, {"success": 1.0}])
-    assert (found["success"]["successes"], found["success"]["trials"]) == (3, 4)
-    assert (found["error"]["mean"], found["error"]["trials"]) == (1.0, 2)
+    assert (found["success"].successes, found["success"].trials) == (3, 4)
+    assert (found["error"].mean, found["error"].trials) == (1.0, 2)
 
 
 def test_a_mean_has_students_interval():
     values = [0.5, 1.5, 2.5, 4.0]
     found = summarize(task, [{"error": value} for value in values])["error"]
     low, high = stats.t.interval(0.95, 3, np.mean(values), stats.sem(values))
-    np.testing.assert_allclose(found["interval"], [low, high])
-    assert found["std"] == pytest.approx(np.std(values, ddof=1))
-    assert summarize(task, [{"error": 0.5}])["error"] == {"mean": 0.5, "std": None, "trials": 1, "interval": None}
+    np.testing.assert_allclose(found.interval, [low, high])
+    assert found.std == pytest.approx(np.std(values, ddof=1))
+    assert summarize(task, [{"error": 0.5}])["error"] == Mean(mean=0.5, std=None, trials=1, interval=None)
 
 
 def test_a_measure_that_never_applies_is_unknown_and_of_its_own_kind():
     declared = replace(task, measures={"inserted": "rate", "error": "mean"})
     found = summarize(declared, [{"inserted": math.nan, "error": math.nan}] * 3)
-    assert found["inserted"] == {"successes": 0, "trials": 0, "rate": None, "interval": None}
-    assert found["error"] == {"mean": None, "std": None, "trials": 0, "interval": None}
+    assert found["inserted"] == Rate(successes=0, trials=0, rate=None, interval=None)
+    assert found["error"] == Mean(mean=None, std=None, trials=0, interval=None)
 
 
 # --- episodes played together -----------------------------------------------------------------------------------------
