@@ -95,7 +95,9 @@ def _record(
                 write_demonstration(data, episode.record)
                 outcomes.append(episode.outcome)
                 on_event(DemonstrationsDone(len(data), spec.count))
-        attributes["supervisor"] = json.dumps({name: one.model_dump() for name, one in summarize(task, outcomes).items()})
+        attributes["supervisor"] = json.dumps(
+            {name: one.model_dump() for name, one in summarize(task, outcomes).items()}
+        )
 
 
 def _refuse_others(path: Path, task: Task, spec: DemonstrationsSpec) -> None:
