@@ -18,7 +18,7 @@ from ddco_pyro.data.controls import described, notes
 from ddco_pyro.data.errors import printable
 from ddco_pyro.drawing import words
 from ddco_pyro.drawing.page import Table
-from ddco_pyro.evaluation import effort, verdicts
+from ddco_pyro.evaluation import verdicts
 from ddco_pyro.events import (
     BaselineSegmented,
     CellDone,
@@ -260,12 +260,12 @@ def log_likelihoods(fit: Fit) -> None:
         show(found)
     show(table(metrics, 3, "log-likelihood, nats per step (higher is better)"))
     others = {name: one.training for name, one in metrics.comparison.items()}
-    for what, advice in (*verdicts.faults(metrics), *effort.unconverged(others)):
+    for what, advice in (*verdicts.faults(metrics), *verdicts.unconverged(others)):
         say(f"warning: {what} {advice}")
     if differ := stds(fit):
         say(differ)
     for name, training in metrics.trainings.items():
-        if restarts := effort.restarts(training):
+        if restarts := verdicts.restarts(training):
             say(f"{name}: {restarts}")
 
 
@@ -284,9 +284,9 @@ def names(fit: Fit) -> None:
         level: [(name, found.get((level, option))) for option, name in enumerate(own[1:], start=1)]
         for level, own in fit.names.items()
     }
-    if told := effort.recogniser(fit.metrics.training):
+    if told := verdicts.recogniser(fit.metrics.training):
         say(f"labels: {told}")
-    for row, (accuracy, edit) in effort.contributions(fit.metrics.training).items():
+    for row, (accuracy, edit) in verdicts.contributions(fit.metrics.training).items():
         say(f"  left out, {row}: accuracy {words.number(accuracy)}, edit score {words.number(edit)}")
     file = fit.run_folder / "names.yaml"
     written = [

@@ -126,14 +126,13 @@ def compare(runs: Sequence[str | Path], allow_code: bool = False) -> Comparison:
     order = sorted(range(len(fits)), key=lambda run: -float(values[run].sum()))
     rows = [_row(rank, fits[run], values[run], best, demos[0].lengths) for rank, run in enumerate(order)]
     ranked = [fits[run] for run in order]
-    agreement: list[dict[str, Any]] = []
-    for fit in ranked:
-        agreement += [
-            row for row in _agreement(fit) if row not in agreement
-        ]  # equal parts are the same in several runs
+    every = (row for fit in ranked for row in _agreement(fit))
+    agreement = {(row["run"], row["level"], row["labels"]): row for row in every}  # several runs have the same parts
     sorted_by = next((fit.place for fit in ranked if fit.spec.hierarchy), ranked[0].place)
     marginal = next((fit.metrics.marginal for fit in ranked if fit.metrics.marginal), None)
-    return Comparison(rows, demos[0].names, demos[0].lengths, agreement, _paired_rollouts(ranked), sorted_by, marginal)
+    return Comparison(
+        rows, demos[0].names, demos[0].lengths, [*agreement.values()], _paired_rollouts(ranked), sorted_by, marginal
+    )
 
 
 def _row(rank: int, fit: Fit, values: np.ndarray, best: np.ndarray, lengths: Sequence[int]) -> Row:
@@ -230,13 +229,12 @@ def _agreement(fit: Fit) -> Iterator[dict[str, Any]]:
     record = fit.metrics.agreement
     if not record or not record.valid or fit.spec.hierarchy is None:
         return
-    equal = (f"equal lengths, {level.count} parts" for level in fit.spec.hierarchy.levels)
-    rows = zip([fit.place] * len(record.labels), fit.spec.hierarchy.levels, record.labels, record.valid, strict=True)
-    others = zip(equal, fit.spec.hierarchy.levels, record.labels, record.equal_valid or (), strict=True)
-    for run, level, labels, scores in (*rows, *others):
-        found = {key: scores and getattr(scores, key) for key in UNMATCHED}
-        accuracy = scores and scores.matched_globally.accuracy
-        yield {"run": run, "level": level.name, "labels": labels, **found, "accuracy": accuracy}
+    equal = record.equal_valid or [None] * len(record.valid)
+    for level, labels, *each in zip(fit.spec.hierarchy.levels, record.labels, record.valid, equal, strict=True):
+        for run, scores in zip((fit.place, f"equal lengths, {level.count} parts"), each, strict=True):
+            found = {key: scores and getattr(scores, key) for key in UNMATCHED}
+            accuracy = scores and scores.matched_globally.accuracy
+            yield {"run": run, "level": level.name, "labels": labels, **found, "accuracy": accuracy}
 
 
 def _paired_rollouts(fits: Sequence[Fit]) -> list[dict[str, Any]]:

@@ -15,7 +15,7 @@ from ddco_pyro.data.files import json_text, write_text
 from ddco_pyro.drawing import words
 from ddco_pyro.drawing.figures import Interval, Panel, interval_plot, save, style
 from ddco_pyro.drawing.page import Block, Cell, Page, Picture, Section, Table, Text, note
-from ddco_pyro.evaluation import effort, verdicts
+from ddco_pyro.evaluation import verdicts
 from ddco_pyro.evaluation.agreement import EXPLAINED, UNMATCHED
 from ddco_pyro.metrics import METRICS, Rate
 from ddco_pyro.names import HIERARCHY, method
@@ -70,7 +70,7 @@ def run_table(compared: Comparison) -> Table:
         if row.rank == 0:
             numbers[2:] = ["0", "0"]
         first = [str(row.rank), row.name, method(row.model), str(row.parameters)]
-        rows.append([*first, *numbers, words.number(row.per_step, 3), effort.effort(row.training)])
+        rows.append([*first, *numbers, words.number(row.per_step, 3), verdicts.effort(row.training)])
     return Table(head, rows, {0, 1, 2})
 
 
@@ -123,7 +123,7 @@ def verdict(compared: Comparison) -> str:
     if models.sound() and (found := worth(HIERARCHY, alone, compared.steps)):
         told.append(models.lasting(found.memory))
         told += [] if compared.rollouts else [verdicts.said("success", "few")]
-    rising = effort.rising(row.name for row in compared.rows if not row.training.converged)
+    rising = verdicts.rising(row.name for row in compared.rows if not row.training.converged)
     return f"{' '.join(told)}{rising}"
 
 

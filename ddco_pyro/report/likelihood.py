@@ -21,8 +21,7 @@ from ddco_pyro.drawing.words import (
     over_seeds,
     with_error,
 )
-from ddco_pyro.evaluation.effort import effort, unconverged
-from ddco_pyro.evaluation.verdicts import explained, faults, tested, verdict
+from ddco_pyro.evaluation.verdicts import effort, explained, faults, tested, unconverged, verdict
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Compared, Metrics
 from ddco_pyro.names import method

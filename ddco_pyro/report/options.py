@@ -17,7 +17,7 @@ from ddco_pyro.drawing.shown import in_words
 from ddco_pyro.drawing.timeline import Timelines
 from ddco_pyro.drawing.words import capital, duration, number, percent
 from ddco_pyro.evaluation.agreement import EXPLAINED, agreement_table, tolerances
-from ddco_pyro.evaluation.effort import contributions, recogniser
+from ddco_pyro.evaluation.verdicts import contributions, recogniser
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Confusion, Scores
 from ddco_pyro.names import label_name, numbered_name, option_name

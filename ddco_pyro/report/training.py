@@ -16,7 +16,7 @@ from ddco_pyro.data.likeness import reasons_told
 from ddco_pyro.drawing.figures import INK, blank, save
 from ddco_pyro.drawing.page import Code, Columns, Facts, Folded, Section, note
 from ddco_pyro.drawing.words import number, rate
-from ddco_pyro.evaluation import effort, verdicts
+from ddco_pyro.evaluation import verdicts
 from ddco_pyro.evaluation.options import degeneracies
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Counts, Rate, read_table, refit
@@ -144,7 +144,7 @@ def doubts(fit: Fit) -> list[tuple[str, str]]:
     metrics = fit.metrics
     unlike = reasons_told(fit.usual.unlike if fit.usual else {}, len(metrics.demonstrations_by_likelihood))
     found = [*((f"{line}.", "Repair or exclude such ones (demonstrations.exclude).") for line in unlike)]
-    found += [*effort.unconverged({metrics.model: metrics.training}), *verdicts.doubts(metrics)]
+    found += [*verdicts.unconverged({metrics.model: metrics.training}), *verdicts.doubts(metrics)]
     return [*found, *(degeneracies(metrics, fit.spec, fit.names) if fit.spec.hierarchy else ())]
 
 
@@ -174,7 +174,7 @@ def particulars(fit: Fit) -> Section:
     check = {name: f"{value:.1e}" for name, value in dict(fit.metrics.engine_check).items()}
     differences = "Largest relative difference of the two inference engines."
     counts, supervisor = fit.metrics.demonstrations, fit.metrics.demonstrations.supervisor.get("success")
-    model = {"Parameters": str(fit.metrics.parameters), "Training": effort.spent(fit.metrics.training)}
+    model = {"Parameters": str(fit.metrics.parameters), "Training": verdicts.spent(fit.metrics.training)}
     model["Demonstrations"] = f"{counts.train} for training, {counts.tune} for tuning, {held_out(counts)}"
     if isinstance(supervisor, Rate):
         model["Supervisor’s own success"] = f"{rate(supervisor, 'demonstrations')}, 95 % interval"

@@ -22,7 +22,7 @@ from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.inspection import inspect
 from ddco_pyro.data.planted import pick_and_place
 from ddco_pyro.data.starting import starting_spec
-from ddco_pyro.evaluation import effort, verdicts
+from ddco_pyro.evaluation import verdicts
 from ddco_pyro.inference import log_likelihood, segment
 from ddco_pyro.model.batch import Batch, encode
 from ddco_pyro.model.emissions import KINDS
@@ -369,8 +369,8 @@ def test_a_fit_by_em_says_so_and_trains_what_is_not_linear_by_gradients():
     assert trained["ddco"].spent.gradient_steps == trained["ddco"].spent.epochs
     assert {name: one.by_lbfgs for name, one in trained.items()} == {"ddco": False, "mixture": False, "flat": True}
     assert trained["flat"].spent.gradient_steps == trained["flat"].spent.epochs
-    assert "(EM)" in effort.effort(trained["ddco"])
-    assert "(L-BFGS)" in effort.effort(trained["flat"])
+    assert "(EM)" in verdicts.effort(trained["ddco"])
+    assert "(L-BFGS)" in verdicts.effort(trained["flat"])
 
 
 def flat_spec(kind="flat", **control):
@@ -458,7 +458,7 @@ def test_ridges_are_raised_where_demonstrations_are_few_for_their_observations(t
     assert fallen.training.raised_ridge is many.training.raised_ridge is None
     assert verdicts.verdict(fallen).startswith("Options fell apart")
     assert held.training.raised_ridge >= 30
-    assert f"ridge {held.training.raised_ridge:g}" in effort.effort(held.training)
+    assert f"ridge {held.training.raised_ridge:g}" in verdicts.effort(held.training)
     assert held.log_likelihood_per_step.valid > fallen.log_likelihood_per_step.valid + 50
 
 

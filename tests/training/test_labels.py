@@ -19,8 +19,8 @@ from sklearn.metrics import normalized_mutual_info_score
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.evaluation.agreement import agreement
-from ddco_pyro.evaluation.effort import contributions
 from ddco_pyro.evaluation.inferred import infer
+from ddco_pyro.evaluation.verdicts import contributions
 from ddco_pyro.inference import log_likelihood, segment
 from ddco_pyro.model.batch import encode
 from ddco_pyro.report import write_report

@@ -13,7 +13,7 @@ from sklearn.metrics import normalized_mutual_info_score
 
 import ddco_pyro
 from ddco_pyro.drawing import words
-from ddco_pyro.evaluation import effort
+from ddco_pyro.evaluation import verdicts
 from ddco_pyro.evaluation.verdicts import verdict
 from ddco_pyro.events import RestartDiverged, RestartStopped
 from ddco_pyro.inference import log_likelihood, segment
@@ -204,7 +204,7 @@ def test_segments_of_restarts_are_compared_with_the_best(demos, tmp_path):
     stages = [list(dict.fromkeys(row["stage"] for row in one.progress.history)) for one in trainer.restarts]
     assert stages == [["joint"], ["parts-1", "joint"], ["vq-1", "mixture", "joint"], ["joint"]]
     each = trainer.summary["restarts"]["each"]
-    said = effort.restarts(Training.model_validate(trainer.summary))
+    said = verdicts.restarts(Training.model_validate(trainer.summary))
     going = [(n, one) for n, one in enumerate(each) if one["objective"] is not None]
     assert going
     assert all(f"{n} from {starts[n]}: {words.number(one['objective'])}" in said for n, one in going)
@@ -242,7 +242,7 @@ def test_a_restart_that_diverges_ends_there_and_is_not_the_best(demos, tmp_path,
     reasons = {event.restart: event.why for event in told if isinstance(event, RestartDiverged)}
     assert sorted(reasons) == ended
     assert all(f"epoch {passes + 1}: the log-likelihood of demo_" in why for why in reasons.values())
-    assert f"; diverged: {', '.join(map(str, ended))}" in effort.restarts(Training.model_validate(trainer.summary))
+    assert f"; diverged: {', '.join(map(str, ended))}" in verdicts.restarts(Training.model_validate(trainer.summary))
     made = training.train(trainer.data, Restart(Progress(best)))
     assert all(torch.equal(model[name], value) for name, value in made.states["best"].items())
 
