@@ -61,13 +61,6 @@ def test_a_picture_of_one_colour_is_standardised_to_nothing():
     assert gradient.isfinite().all()
 
 
-def test_dropout_drops_only_while_training():
-    network, inputs = make(hidden=[64], dropout=0.5), make_inputs()
-    quiet = network(inputs)[0]
-    assert torch.equal(network(inputs)[0], quiet)
-    assert not torch.equal(network.train()(inputs)[0], quiet)
-
-
 # --- per-timestep -----------------------------------------------------------------------------------------------------
 
 

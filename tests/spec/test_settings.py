@@ -156,19 +156,17 @@ def of_scripts() -> Iterator[tuple[str, str]]:
 
 
 def of_init(folder: Path) -> Iterator[tuple[str, str]]:
-    """What ``init`` writes for vectors with angles and quaternions, pictures, labels, few demonstrations, targets."""
+    """What ``init`` writes for vectors with angles and quaternions, labels, few demonstrations, targets."""
     random, steps = np.random.default_rng(0), 30
-    turns, pictures = [], []
+    turns = []
     for _ in range(12):
         quaternions = np.cumsum(random.normal(size=(steps, 4)), axis=0)
         quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
         angles = np.angle(np.exp(1j * np.cumsum(random.uniform(0, 1, size=(steps, 1)), axis=0)))
         turns.append(({"turn": quaternions, "angle": angles}, random.normal(size=(steps, 2))))
-        pictures.append(({"eye": random.integers(0, 256, (5, 96, 96, 3), np.uint8)}, random.normal(size=(5, 2))))
     operators = (replace(demo, attributes={"operator": n % 3}) for n, demo in enumerate(pick_and_place(12)))
     files = {
         "vectors": numbered(turns),
-        "pictures": numbered(pictures),
         "few demonstrations": pick_and_place(4),
         "labels": Demonstrations(tuple(operators)),
         "targets": targets(velocities(4)),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
@@ -219,34 +218,19 @@ def test_every_table_stands_on_a_page():
     assert there == made
 
 
-class Visible(HTMLParser):
-    """What a browser shows of HTML, without code."""
-
-    def __init__(self):
-        super().__init__()
-        self.shown, self.code = [], 0
-
-    def handle_starttag(self, tag, attributes):
-        self.code += tag in ("code", "pre")
-
-    def handle_endtag(self, tag):
-        self.code -= tag in ("code", "pre")
-
-    def handle_data(self, data):
-        self.shown += [data] * (not self.code)
-
-
 RAW = re.compile(r"<!--|-->|\*\*|__\w|\]\(|`|^\s*\||\|\s*:?-{2,}|^#{1,6} |\{\w+\.(csv|yaml):", re.MULTILINE)
 """What is Markdown, or a comment, and nothing that a reader is to see."""
 
 
 def raw(text):
     """The raw Markdown and comments in a page as GitHub shows it, and the lines that would begin a raw line."""
-    visible = Visible()
-    visible.feed(MarkdownIt("commonmark").enable(["table", "strikethrough"]).render(text))
-    visible.close()
+    shown = []
+    for block in MarkdownIt("commonmark").enable(["table", "strikethrough"]).parse(text):
+        parts = [part for part in block.children or [block] if not part.type.startswith(("code", "fence"))]
+        visible = "".join(part.content or "\n" * part.type.endswith("break") for part in parts)
+        shown.append(re.sub(r"<!--.*?-->|<[^>]*>", "", visible, flags=re.DOTALL))
     prose = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
-    return RAW.findall("".join(visible.shown)) + re.findall(r"^<!--.*-->[ \t]*\S.*", prose, re.MULTILINE)
+    return RAW.findall("\n".join(shown)) + re.findall(r"^<!--.*-->[ \t]*\S.*", prose, re.MULTILINE)
 
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
