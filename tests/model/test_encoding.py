@@ -143,29 +143,6 @@ def test_batches_are_padded_with_zeros_and_images_stay_bytes():
 
 # --- controls ---------------------------------------------------------------------------------------------------------
 
-ACTIONS = np.concatenate([demo.actions for demo in DEMOS])
-
-
-def scaling(scale):
-    found = ControlScaling(ControlSpec(scale=scale), 3, {}, all_gaussian(range(3)))
-    found.fit(DEMOS)
-    return found
-
-
-@pytest.mark.parametrize(
-    ("scale", "shift", "unit"),
-    [
-        ("standardize", ACTIONS.mean(0), [ACTIONS[:, 0].std(), 1.0, ACTIONS[:, 2].std()]),
-        ("none", np.zeros(3), np.ones(3)),
-    ],
-)
-def test_controls_in_units_of_their_spread(scale, shift, unit):
-    found = scaling(scale)
-    np.testing.assert_allclose(found.scaled(ACTIONS), (ACTIONS - shift) / unit, atol=1e-12)
-    np.testing.assert_allclose(found.emitted(torch.from_numpy(found.scaled(ACTIONS))), ACTIONS, atol=1e-12)
-    emission = found.emission(torch.zeros(1, 3), torch.ones(3))
-    np.testing.assert_allclose(emission.log_scale, np.log(unit))
-
 
 @pytest.mark.parametrize("scale", ["standardize", "none"])
 def test_the_density_is_in_the_controls_own_units(scale):

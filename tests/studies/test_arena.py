@@ -105,14 +105,6 @@ def test_the_first_successes_are_recorded(tmp_path):
 # --- phases -----------------------------------------------------------------------------------------------------------
 
 
-def twice(function):
-    @functools.wraps(function)
-    def wrapped(*arguments):
-        return list(function(*arguments))
-
-    return wrapped
-
-
 class Expert:
     """Its methods are traced while it acts. Which of four return statements was reached is known from the value."""
 
@@ -173,7 +165,7 @@ def test_or_the_assignment_to_a_key():
 
 
 def test_a_decorated_function_is_seen_through():
-    @twice
+    @functools.cache
     def desired(x):
         if x:
             return [1]

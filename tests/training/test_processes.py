@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import shutil
@@ -23,7 +22,6 @@ from killing import alive
 from planted import small_spec
 from random_demonstrations import of_states
 
-from ddco_pyro.data.files import only_one
 from ddco_pyro.errors import Failed
 from ddco_pyro.events import DemonstrationsDone, SeedFitted
 from ddco_pyro.fitting.fit import fit
@@ -149,21 +147,15 @@ def test_a_finished_run_keeps_no_process_of_torchrun_waiting(whole, tmp_path):
     assert other == (0, "", "")
 
 
-@pytest.mark.parametrize("what", ["busy folder", "damaged checkpoint"])
-def test_what_is_refused_under_torchrun_is_one_line_of_one_process(whole, tmp_path, what):
+def test_what_is_refused_under_torchrun_is_one_line_of_one_process(whole, tmp_path):
     spec, run = whole
     folder = shutil.copytree(run, tmp_path / "run")
-    with contextlib.ExitStack() as stack:
-        if what == "busy folder":
-            stack.enter_context(only_one(folder))
-            line = f"{folder}: another process is at work on it"
-        else:
-            (folder / "model.safetensors").unlink()
-            (folder / "checkpoints" / "restart-0.safetensors").write_text("damaged")
-            line = f"{folder / 'checkpoints' / 'restart-0.safetensors'}: is damaged: "
-        first, other = under_torchrun(tmp_path, "fit", spec, "--out", folder, "--resume")
+    (folder / "model.safetensors").unlink()
+    checkpoint = folder / "checkpoints" / "restart-0.safetensors"
+    checkpoint.write_text("damaged")
+    first, other = under_torchrun(tmp_path, "fit", spec, "--out", folder, "--resume")
     assert (first.status, first.err.count("\n")) == (2, 1)
-    assert first.err.startswith(f"ddco-pyro: {line}")
+    assert first.err.startswith(f"ddco-pyro: {checkpoint}: is damaged: ")
     assert other == (0, "", "")
 
 
