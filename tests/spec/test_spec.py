@@ -60,16 +60,6 @@ def write(folder: Path, text: str | bytes) -> Path:
 # --- what it accepts --------------------------------------------------------------------------------------------------
 
 
-def test_the_example_of_the_documentation_is_read(tmp_path: Path) -> None:
-    spec = load_spec(write(tmp_path, EXAMPLE))
-    assert spec.hierarchy is not None
-    (level,) = spec.hierarchy.levels
-    assert (level.name, level.count, level.policy.hidden) == ("option", 5, (64,))
-    assert (level.policy.emits, spec.hierarchy.meta_policy.emits) == (("control",), ("options",))
-    assert [observation.key for observation in spec.observations] == ["gripper_pose", "needle_ellipse"]
-    assert spec.selection.grid == {"hierarchy.levels.0.count": (1, 2, 3, 4, 5, 6, 7, 8)}
-
-
 def test_higher_levels_select_from_below_unless_told_otherwise() -> None:
     both = {"policy": {"emits": ["options", "control"]}}
     levels = [{"count": 2}, {"name": "b", "count": 2}, {"name": "c", "count": 2, **both}]
