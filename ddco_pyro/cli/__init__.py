@@ -83,7 +83,6 @@ Overrides = Annotated[
     list[str], typer.Option("--set", metavar="KEY=VALUE", help="Override a key of the spec; repeatable.")
 ]
 RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="The folder of a finished fit.")]
-Level = Annotated[str | None, typer.Option(help="Name of their level; by default the lowest.")]
 AllowCode = Annotated[
     bool, typer.Option("--allow-code", help="Import the user code (module:name) that the spec names.")
 ]

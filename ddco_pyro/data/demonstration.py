@@ -31,6 +31,9 @@ Attribute = float | int | str | bool
 
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 
+DIMENSION_NAMES = "dimension_names"
+"""Attribute of a source: JSON, the names of the dimensions of observations, and of ``control``, by key."""
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Demonstration:

@@ -14,6 +14,9 @@ LABEL_NAMES = "label_names"
 UNKNOWN = -1
 """The label of a step without ground truth."""
 
+EXCLUDE = "exclude"
+"""The mask of demonstrations that a person leaves out; ``init`` excludes them."""
+
 BOUNDARY, SOURCE = "_boundary", "_source"
 """Ends of the names of labels beside those of a level: 1 where a segment begins, and who says what a step is."""
 

@@ -16,7 +16,7 @@ from ddco_pyro.data.division import FEW, LEAST, check_division, with_values
 from ddco_pyro.data.errors import DemonstrationsError, printable
 from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.inspection import Field, Inspection, inspect
-from ddco_pyro.data.labels import BOUNDARY
+from ddco_pyro.data.labels import BOUNDARY, EXCLUDE
 from ddco_pyro.errors import command
 from ddco_pyro.spec import parse_spec
 from ddco_pyro.spec.yaml import read_yaml
@@ -109,14 +109,16 @@ def starting_spec(
 ) -> Starting:
     """A spec for the inspected demonstrations, with ``path`` as its file.
 
-    Unreadable and odd demonstrations are excluded. Demonstrations with unusable values are excluded if they are few;
+    Unreadable and odd demonstrations are excluded, and those of the mask ``exclude``.
+    Demonstrations with unusable values are excluded if they are few;
     otherwise the affected observations are left out. Comments say why.
 
     :param hold_out_by: the attribute of demonstrations whose values are not to be on both sides of the split.
     :raises DemonstrationsError: nothing can be fitted to the demonstrations, or the attribute cannot divide them.
     """
     odd = list(inspection.odd) if _divides(inspection, inspection.odd) else []
-    excluded = sorted({*inspection.unreadable, *_few_affected(inspection), *odd}, key=natural)
+    left_out = inspection.masks.get(EXCLUDE, ())
+    excluded = sorted({*inspection.unreadable, *_few_affected(inspection), *odd, *left_out}, key=natural)
     reasons = [printable(line) for line in inspection.exclusions if odd]
     if excluded:
         inspection = inspect(inspection.path, exclude=excluded)

@@ -325,7 +325,7 @@ def compare_annotators(first: str | Path, second: str | Path, tolerance: int) ->
     if not labels:
         raise BadInput(f"{second}: has no labels that {first} has, too; labels of the same name are compared")
     return {
-        name: _compared(
+        name: compared(
             name, pairs, [own.get(name) or known[1 - n].get(name, []) for n, own in enumerate(known)], tolerance
         )
         for name, pairs in sorted(labels.items())
@@ -346,9 +346,15 @@ def _read(path: str | Path) -> tuple[dict[str, dict[str, np.ndarray]], dict[str,
         return labels, label_names(source.attributes)
 
 
-def _compared(
+def compared(
     name: str, pairs: Sequence[tuple[np.ndarray, np.ndarray]], known: Sequence[Sequence[str]], tolerance: int
 ) -> Annotators:
+    """How two annotators agree on labels of one name.
+
+    :param pairs: the labels of each demonstration by both, [T] each; -1 where one says nothing.
+    :param known: the names of labels 0, 1, ... by both.
+    :param tolerance: the largest distance of matched boundaries, in steps.
+    """
     from sklearn.metrics import cohen_kappa_score
 
     values = [np.unique(np.concatenate(side)) for side in zip(*pairs, strict=True)]

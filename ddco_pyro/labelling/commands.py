@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,12 +11,15 @@ import numpy as np
 
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.inferred import runs
-from ddco_pyro.labelling.document import CONFIRM, FREE, OPEN, PAINT, Change, Document
+from ddco_pyro.labelling.document import CONFIRM, FREE, MARKS, OPEN, PAINT, Change, Document
 from ddco_pyro.labelling.proposals import Shown, first_wrong, labels_shown, sources_shown
 from ddco_pyro.segmenting.segments import SOURCES
 
 LONGEST = 80
 """Characters of a name."""
+
+REACH = 50
+"""A boundary goes to a change point that is this part of the demonstration away, or nearer."""
 
 
 @dataclass(frozen=True)
@@ -36,11 +40,13 @@ class View:
     """What a person looks at: the labels, and what is shown of each demonstration.
 
     :param first: what was shown before anything was said of a demonstration.
+    :param changes_of: the steps of a demonstration at which its observations and controls change.
     """
 
     document: Document
     shown: Mapping[str, Shown]
     first: Mapping[str, Shown]
+    changes_of: Callable[[str], Sequence[int]]
 
     def segments(self, name: str) -> list[Segment]:
         """The segments of a demonstration that are shown."""
@@ -67,15 +73,22 @@ class View:
         :param name: of the demonstration; None for commands that concern none.
         :raises BadInput: the command is none, or cannot be done here.
         """
-        names = self.document.names
+        names, colours = self.document.names, self.document.colours
         if do == "new":
             return [("names", [*names, self._text(command, names)])]
         if do == "rename":
             option = self._option(command, 1)
-            before, after = names[: option - 1], names[option:]
-            return [("names", [*before, self._text(command, (*before, *after)), *after])]
+            before, old, after = names[: option - 1], names[option - 1], names[option:]
+            new = self._text(command, (*before, *after))
+            return [("names", [*before, new, *after]), ("colour", old, None), ("colour", new, colours.get(old))]
+        if do == "drop":
+            return self._drop(self._option(command, 1), self._option(command, 0, "into"))
+        if do == "colour":
+            return [("colour", names[self._option(command, 1) - 1], _colour(command))]
         if name is None:
             raise BadInput(f"{do}: names no demonstration, or is no command")
+        if do == "mark":
+            return [("mark", name, *_mark(command))]
         if do == "accept":
             return [] if name in self.document.accepted else self._accept(name, command.get("segments"))
         if do == "reopen":
@@ -92,9 +105,12 @@ class View:
         step = whole(command, "step")
         here = self.at(name, step)
         if do == "name":
-            return [(PAINT, name, here.start, here.stop, self._option(command, 1))]
+            start = self._snapped(name, step, here) if command.get("from_here") else here.start
+            return [(PAINT, name, start, here.stop, self._option(command, 1))]
         if do == "open":
             return [(PAINT, name, here.start, here.stop, OPEN)]
+        if do == "scratch":
+            return [(PAINT, name, 0, self.document.lengths[name], OPEN)]
         if do == "everywhere":
             option = self._option(command, 1)
             return [
@@ -118,6 +134,31 @@ class View:
                 raise BadInput(f"merge: the segment at step {step} of {name} has no option; name it first")
             return [("cut", name, here.stop, False), (PAINT, name, here.start, following.stop, here.option)]
         raise BadInput(f"{do}: is no command")
+
+    def _snapped(self, name: str, step: int, here: Segment) -> int:
+        """The change point that is nearest to a step of a segment, within reach; else the step."""
+        reach = max(1, self.document.lengths[name] // REACH)
+        near = [point for point in self.changes_of(name) if abs(point - step) <= reach]
+        inside = [point for point in near if here.start < point < here.stop]
+        return min(inside, key=lambda point: (abs(point - step), point), default=step)
+
+    def _drop(self, option: int, into: int) -> list[Change]:
+        """An option is none any more: its labels are those of another one, or nothing where that is 0."""
+        if option == into or len(self.document.names) == 1:
+            raise BadInput("drop: name an option to merge into, and keep one at least")
+        document, changes = self.document, list[Change]()
+        numbers = np.arange(1 + len(document.names)) - (np.arange(1 + len(document.names)) > option)
+        numbers[option] = numbers[into] if into else FREE
+        for name, labels in document.labels.items():
+            said, given = np.where(labels > 0, labels, 0), document.given[name]
+            edges = (np.diff(said, prepend=-1) != 0) | (np.diff(given, prepend=not given[0]) != 0)
+            changes += [
+                (PAINT if given[start] else CONFIRM, name, start, stop, int(numbers[own]))
+                for own, start, stop in runs(said, edges)
+                if own and numbers[own] != own
+            ]
+        kept = [name for number, name in enumerate(document.names, start=1) if number != option]
+        return [*changes, ("names", kept)]
 
     def _accept(self, name: str, seen: Any) -> list[Change]:
         """What a person sees becomes labels where nothing was said.
@@ -168,8 +209,8 @@ class View:
             changes += [("cut", name, boundary, False), ("cut", name, to, True)]
         return changes
 
-    def _option(self, command: Mapping[str, Any], least: int) -> int:
-        option = whole(command, "option")
+    def _option(self, command: Mapping[str, Any], least: int, key: str = "option") -> int:
+        option = whole({"into": 0, **command}, key)
         if not least <= option <= len(self.document.names):
             raise BadInput(f"there is no option {option}; there are {least} to {len(self.document.names)}")
         return option
@@ -180,6 +221,21 @@ class View:
         if not name or len(name) > LONGEST or not name.isprintable() or name in ("control", *others):
             raise BadInput(f"a name is one line of at most {LONGEST} characters that no other option has")
         return name
+
+
+def _mark(command: Mapping[str, Any]) -> tuple[str, Any]:
+    """A mark and its value; None takes it back."""
+    mark, value = command.get("mark"), command.get("value")
+    if mark not in MARKS or not isinstance(value, str if mark == "note" else bool):
+        raise BadInput(f"mark: give one of {', '.join(MARKS)}, and a value")
+    return str(mark), value or None
+
+
+def _colour(command: Mapping[str, Any]) -> str:
+    colour = command.get("colour")
+    if not isinstance(colour, str) or not re.fullmatch("#[0-9a-f]{6}", colour):
+        raise BadInput("colour: write it as #rrggbb")
+    return colour
 
 
 def whole(command: Mapping[str, Any], key: str) -> int:

@@ -12,8 +12,9 @@ import getpass
 import hashlib
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -32,8 +33,11 @@ PAINT, CONFIRM = "paint", "confirm"
 
 Change = tuple[Any, ...]
 """(:data:`PAINT` or :data:`CONFIRM`, demonstration, start, stop, option), ("cut", demonstration, step, whether),
-("accept", demonstration, whether, steps of it that were expected wrong, steps of it that were) or ("names", names of
-the options 1 to k)."""
+("accept", demonstration, whether, steps of it that were expected wrong, steps of it that were), ("mark", demonstration,
+one of :data:`MARKS`, its value), ("names", names of the options 1 to k) or ("colour", name of an option, colour)."""
+
+MARKS = ("exclude", "flag", "note")
+"""What a person can say of a demonstration as a whole: leave it out, look at it again, and a text."""
 
 
 @dataclass
@@ -47,6 +51,8 @@ class Document:
     :ivar cuts: steps at which a segment begins although the option stays.
     :ivar accepted: demonstrations that a person is done with: of each the steps whose first proposal was expected to be
         wrong, and the steps in which it was.
+    :ivar marks: of each demonstration, the :data:`MARKS` that a person gave it.
+    :ivar colours: that a person gave to options, by their names.
     :ivar undone: edits that can be done again, the next one last.
     """
 
@@ -56,6 +62,8 @@ class Document:
     given: dict[str, np.ndarray] = field(init=False)
     cuts: dict[str, set[int]] = field(init=False)
     accepted: dict[str, tuple[float, int]] = field(init=False, default_factory=dict)
+    marks: dict[str, dict[str, Any]] = field(init=False)
+    colours: dict[str, str] = field(init=False, default_factory=dict)
     done: list[tuple[Change, ...]] = field(init=False, default_factory=list)
     undone: list[tuple[Change, ...]] = field(init=False, default_factory=list)
 
@@ -63,12 +71,17 @@ class Document:
         self.labels = {name: np.full(length, FREE, np.int16) for name, length in self.lengths.items()}
         self.given = {name: np.ones(length, bool) for name, length in self.lengths.items()}
         self.cuts = {name: set() for name in self.lengths}
+        self.marks = {name: {} for name in self.lengths}
 
     def alters(self, kind: str, *of: Any) -> bool:
         """Whether a change makes a difference."""
         if kind == "names":
             return self.names != tuple(of[0])
+        if kind == "colour":
+            return self.colours.get(of[0]) != of[1]
         name, *what = of
+        if kind == "mark":
+            return bool(self.marks[name].get(what[0]) != what[1])
         if kind in (PAINT, CONFIRM):
             steps = slice(*what[:2])
             return bool(
@@ -108,7 +121,11 @@ class Document:
             back: Change = ("names", self.names)
             self.names = tuple(of[0])
             return [back]
+        if kind == "colour":
+            return [("colour", of[0], _put(self.colours, *of))]
         name = of[0]
+        if kind == "mark":
+            return [("mark", name, of[1], _put(self.marks[name], *of[1:]))]
         if kind in (PAINT, CONFIRM):
             start, stop, option = of[1:]
             labels, given = self.labels[name], self.given[name]
@@ -130,21 +147,29 @@ class Document:
         return [("accept", name, known is not None, *(known or (0.0, 0)))]
 
 
+def _put(table: dict[str, Any], key: str, value: Any) -> Any:
+    """Put a value under a key, nothing for None, and give what was there."""
+    before = table.pop(key, None)
+    if value is not None:
+        table[key] = value
+    return before
+
+
 # --- the file of edits ------------------------------------------------------------------------------------------------
 
 SUFFIX = ".journal"
 """Of the file of edits, beside the file of labels."""
 
-UNDO, REDO = "undo", "redo"
+UNDO, REDO, SAVED = "undo", "redo", "saved"
 
 HEADER = b'{"labels":'
 """What a journal begins with."""
 
 
-def version(path: Path) -> list[int]:
-    """Size and time of change of a file."""
-    stat = path.stat()
-    return [stat.st_size, stat.st_mtime_ns]
+def version(files: Iterable[Path]) -> list[tuple[int, int]]:
+    """Size and time of change of files; none of those that are missing."""
+    stats = [path.stat() for path in files if path.exists()]
+    return [(stat.st_size, stat.st_mtime_ns) for stat in stats]
 
 
 def digest(demos: Demonstrations, level: str) -> str:
@@ -155,18 +180,61 @@ def digest(demos: Demonstrations, level: str) -> str:
     return found.hexdigest()
 
 
+def replay(path: Path, content: bytes, document: Document, labels: str) -> tuple[int, bool]:
+    """Make the edits of a journal.
+
+    :param labels: what the labels are for, as :func:`digest` gives it.
+    :returns: the bytes of whole lines, and whether all edits are in the file of labels.
+    :raises BadInput: the journal is of other demonstrations.
+    :raises Damaged: a line is none of a journal.
+    """
+    *lines, _ = content.split(b"\n")
+    number, saved = 1, True
+    try:
+        if not HEADER.startswith(content[: len(HEADER)]):
+            raise ValueError
+        if lines:
+            known = json.loads(lines[0])
+            if known["labels"] != labels:
+                raise BadInput(f"{path}: has edits of other demonstrations or of another level; give another --out")
+            document.names = tuple(known["names"])
+        for line in lines[1:]:
+            number += 1
+            entry = json.loads(line)
+            saved = _apply(document, entry["edit"] if isinstance(entry, dict) else entry)
+    except BadInput:
+        raise
+    except (ValueError, TypeError, LookupError):
+        remedy = "move it away to begin anew, or give another --out"
+        raise Damaged(path, f"line {number} is none of a journal of labels", remedy) from None
+    return sum(len(line) + 1 for line in lines), saved
+
+
+def _apply(document: Document, entry: Any) -> bool:
+    """Make the edit of a line; whether all edits are in the file of labels then."""
+    if entry == UNDO:
+        document.undo()
+    elif entry == REDO:
+        document.redo()
+    elif entry != SAVED:
+        document.edit([tuple(change) for change in entry])
+    return bool(entry == SAVED)
+
+
 class Journal:
-    """A file of edits that one process has open.
+    """A file of edits that one process has open: a line for each, with who made it and when.
 
     :param path: of the file; it is made where it is missing.
     :param document: gets the edits of the file.
     :param labels: what the labels are for, as :func:`digest` gives it.
+    :param annotator: who makes edits.
+    :ivar saved: whether all edits are in the file of labels.
     :raises BadInput: another process has the file, or it is of other demonstrations.
     :raises Damaged: a line is none of a journal, which stays as it is.
     """
 
-    def __init__(self, path: Path, document: Document, labels: str) -> None:
-        self.path, self.document = path, document
+    def __init__(self, path: Path, document: Document, labels: str, annotator: str = "") -> None:
+        self.path, self.document, self.annotator = path, document, annotator or getpass.getuser()
         path.parent.mkdir(parents=True, exist_ok=True)
         self.file = open(path, "a+b", buffering=0)  # noqa: SIM115  (open as long as this object)
         try:
@@ -174,45 +242,16 @@ class Journal:
         except OSError:
             self.file.close()
             raise BadInput(f"{path}: is open in {self._holder()}; end it, or give another --out") from None
-        header = {"labels": labels, "names": list(document.names)}
+        self.file.seek(0)
         try:
-            whole = self._read(header)
+            whole, self.saved = replay(path, self.file.read(), document, labels)
         except BadInput:
             self.close()
             raise
         self.file.truncate(whole)  # a torn last line was never acknowledged
         if not whole:
-            self._append(header)
+            self._append({"labels": labels, "names": list(document.names)})
         self._held_by(f"a process of {getpass.getuser()}, {os.getpid()}")
-
-    def _read(self, header: Mapping[str, Any]) -> int:
-        """Make the edits of the file.
-
-        :returns: the bytes of whole lines.
-        """
-        self.file.seek(0)
-        content = self.file.read()
-        *lines, _ = content.split(b"\n")
-        number = 1
-        try:
-            if not HEADER.startswith(content[: len(HEADER)]):
-                raise ValueError
-            if lines:
-                known = json.loads(lines[0])
-                if known["labels"] != header["labels"]:
-                    raise BadInput(
-                        f"{self.path}: has edits of other demonstrations or of another level; give another --out"
-                    )
-                self.document.names = tuple(known["names"])
-            for line in lines[1:]:
-                number += 1
-                self._apply(json.loads(line))
-        except BadInput:
-            raise
-        except (ValueError, TypeError, LookupError):
-            remedy = "move it away to begin anew, or give another --out"
-            raise Damaged(self.path, f"line {number} is none of a journal of labels", remedy) from None
-        return sum(len(line) + 1 for line in lines)
 
     def edit(self, changes: Sequence[Change]) -> None:
         """Make an edit of the document, once it is on disk."""
@@ -245,9 +284,14 @@ class Journal:
         self.file.close()
         self._lock.unlink(missing_ok=True)
 
+    def save(self) -> None:
+        """Say that all edits are in the file of labels."""
+        self._write(SAVED)
+
     def _write(self, entry: Any) -> None:
-        self._append(entry)
-        self._apply(entry)
+        now = datetime.now(UTC).isoformat(timespec="seconds")
+        self._append({"by": self.annotator, "at": now, "edit": entry})
+        self.saved = _apply(self.document, entry)
 
     def _append(self, entry: Any) -> None:
         line = json.dumps(entry, separators=(",", ":")).encode() + b"\n"
@@ -259,14 +303,6 @@ class Journal:
         except OSError:
             self.file.truncate(before)  # no part of an edit that is not made
             raise
-
-    def _apply(self, entry: Any) -> None:
-        if entry == UNDO:
-            self.document.undo()
-        elif entry == REDO:
-            self.document.redo()
-        else:
-            self.document.edit([tuple(change) for change in entry])
 
     @property
     def _lock(self) -> Path:

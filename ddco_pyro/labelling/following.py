@@ -2,55 +2,95 @@
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Sequence
 from contextlib import ExitStack
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
-from ddco_pyro.data.arrays import Observed
+import numpy as np
+
+from ddco_pyro.data.arrays import Observed, is_picture
+from ddco_pyro.data.demonstration import DIMENSION_NAMES
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.data.sources import open_source
-from ddco_pyro.drawing.shown import frames, jpeg, stored_pictures
+from ddco_pyro.data.sources import Source, open_source
+from ddco_pyro.drawing.shown import frames, jpeg
 from ddco_pyro.drawing.timeline import following
 from ddco_pyro.errors import BadInput
 from ddco_pyro.spec import PathSpec
 
-PICTURE_HEIGHT = 240
-"""Rows of a picture."""
+PICTURE_HEIGHT = 360
+"""Rows of a picture, at most."""
+
+AHEAD = 16
+"""Pictures that are read together: a video is read in order."""
+
+KEPT = 64
+"""Such blocks of pictures in memory."""
 
 
 class Following:
     """What follows the cursor.
 
-    :param path: the file of the demonstrations; its pictures are read when they are asked for.
+    :param path: the demonstrations; their pictures are read when they are asked for.
     :param trajectory: ``report.trajectory`` of the run's spec.
     """
 
     def __init__(self, path: Path, demos: Demonstrations, trajectory: Sequence[PathSpec] | None) -> None:
         self.path, self.demos, self.paths, self.opened = path, demos, trajectory or (), ExitStack()
+        self.names: dict[str, list[str]] = json.loads(str(demos.attributes.get(DIMENSION_NAMES, "{}")))
+        self.cameras, self.block = lru_cache(KEPT)(self._cameras), lru_cache(KEPT)(self._block)
+        self.lock = Lock()
 
     @cached_property
-    def pictures(self) -> list[Observed]:
-        """Of each demonstration; empty where there are none."""
-        source = self.opened.enter_context(open_source(self.path))
-        return stored_pictures(source, dict(zip(self.demos.names, self.demos.lengths, strict=True)))
+    def source(self) -> Source:
+        """The demonstrations, open."""
+        return self.opened.enter_context(open_source(self.path))
+
+    def _cameras(self, index: int) -> dict[str, Observed]:
+        """The pictures of a demonstration by their names."""
+        demo = self.demos[index]
+        there = self.source.read(demo.name).observations if demo.name in self.source.names else {}
+        return {key: array for key, array in there.items() if is_picture(array) and len(array) == len(demo)}
+
+    def _block(self, index: int, camera: str, number: int) -> list[bytes]:
+        """The pictures of some steps in order, as JPEG."""
+        array = self.cameras(index)[camera]
+        steps = np.arange(number * AHEAD, min((number + 1) * AHEAD, len(array)))
+        height = min(PICTURE_HEIGHT, max(array.shape[1], 240))
+        return [jpeg(picture) for picture in frames(array, steps, height)]
 
     def shown(self, index: int) -> dict[str, Any]:
-        """Numbers and paths of a demonstration, and how many pictures it has."""
+        """Numbers and paths of a demonstration, and the names of its cameras."""
         demo = self.demos[index]
         (found,) = following([demo], [], len(demo), self.paths)
-        pictures = len(self.pictures[index]) if self.pictures else 0
-        return {"numbers": found.get("n"), "paths": found.get("paths"), "view": found.get("view"), "pictures": pictures}
+        numbers = found.get("n")
+        if numbers:
+            numbers = {**numbers, "names": [self._named(name) for name in numbers["names"]]}
+        with self.lock:
+            cameras = [*self.cameras(index)]
+        return {"numbers": numbers, "paths": found.get("paths"), "view": found.get("view"), "cameras": cameras}
 
-    def picture(self, index: int, step: int) -> bytes:
+    def _named(self, name: str) -> str:
+        """A number such as ``state[2]``, by the name of its dimension where there is one."""
+        key, place = re.fullmatch(r"(.*?)(?:\[(\d+)\])?", name).groups()  # type: ignore[union-attr]
+        names = self.names.get(key, [])
+        return f"{key} {names[int(place)]}" if place and int(place) < len(names) else name
+
+    def picture(self, index: int, camera: int, step: int) -> bytes:
         """The picture of a step as JPEG.
 
         :raises BadInput: there is none.
         """
-        if not self.pictures or not 0 <= step < len(self.demos[index]):
-            raise BadInput(f"{self.demos.names[index]}: has no picture of step {step}")
-        return jpeg(frames(self.pictures[index], [step], PICTURE_HEIGHT)[0])
+        with self.lock:
+            cameras = [*self.cameras(index)]
+            if not 0 <= camera < len(cameras) or not 0 <= step < len(self.demos[index]):
+                raise BadInput(f"{self.demos.names[index]}: has no picture {camera} of step {step}")
+            number, place = divmod(step, AHEAD)
+            return self.block(index, cameras[camera], number)[place]
 
     def close(self) -> None:
         """Close the file of the pictures."""

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import copy, deepcopy
 from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,14 +15,14 @@ from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.data.labels import BOUNDARY, SOURCE, UNKNOWN, label_names
+from ddco_pyro.data.labels import BOUNDARY, EXCLUDE, SOURCE, UNKNOWN, label_names
 from ddco_pyro.data.sources import Source
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.agreement import agreement
 from ddco_pyro.evaluation.inferred import Inferred, runs
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.labelling.document import CONFIRM, FREE, OPEN, PAINT, Change, Document
-from ddco_pyro.model.recogniser import Windows
+from ddco_pyro.model.recogniser import SCALES, Windows
 from ddco_pyro.model.tables import NEVER, Tables
 from ddco_pyro.names import choice_names, label_name, option_name
 from ddco_pyro.segmenting.segments import SOURCES, LevelLabels, Segmented, Segments, segments
@@ -32,6 +33,9 @@ RIDGE = 50.0
 
 AT_ONCE = 8
 """Demonstrations that are inferred together."""
+
+GONE = -9
+"""The person's number of an option of the model that is never proposed."""
 
 
 def weight(power: float) -> float:
@@ -119,17 +123,24 @@ class Proposals:
         every = torch.cat([self._rows(name) for name in demos.names])
         self.middle, self.spread = every.mean(0).numpy(), every.std(0).clamp(min=1e-9).numpy()
         self.whole = np.concatenate([self.centres(name, [0]) for name in demos.names])
+        self.options = np.array([], int)
+        self.renumber(labels, count, before)
+        self.learned = self.learn(labels)
+        self.paths = dict[str, tuple[np.ndarray, np.ndarray]]()
+        for piece in self.infer(demos.names, labels):
+            self.paths |= self.found(piece)
+
+    def renumber(
+        self, labels: Mapping[str, np.ndarray], count: int, before: Mapping[str, np.ndarray] = MappingProxyType({})
+    ) -> None:
+        """Number the options anew, as the person has other ones; arguments as of the class."""
         self.usual = np.eye(self.size, count)
         if before:
             self.usual = np.sum([self._common(name, own, count) for name, own in before.items()], axis=0)
             self.usual /= self.usual.sum(1, keepdims=True).clip(min=1)
         self.usual *= self.half
-        self.common, self.options = dict[str, np.ndarray](), np.array([], int)
+        self.common = dict[str, np.ndarray]()
         self.number(labels)
-        self.learned = self.learn(labels)
-        self.paths = dict[str, tuple[np.ndarray, np.ndarray]]()
-        for piece in self.infer(demos.names, labels):
-            self.paths |= self.found(piece)
 
     def number(self, labels: Mapping[str, np.ndarray]) -> bool:
         """Number the options by the named steps of these demonstrations, and leave all others unchanged.
@@ -146,7 +157,8 @@ class Proposals:
     def aligned(self, common: Mapping[str, np.ndarray]) -> np.ndarray:
         """The person's option for each option 0 to k of the model, another one for each where there are enough.
 
-        An option that is newer than the model is none of them.
+        An option that is newer than the model is none of them. An option of the model that is none of the person's is
+        :data:`GONE`, where the person has fewer.
 
         :param common: of each demonstration, the steps that labels have in common with the model.
         """
@@ -156,6 +168,7 @@ class Proposals:
             total[:, : known.shape[1]] += known
         best = total.argmax(1)
         ours, theirs = linear_sum_assignment(-total)
+        best[total.sum(1) == 0] = GONE - 1
         best[ours] = theirs
         return np.array([0, *(best + 1)])
 
@@ -182,7 +195,7 @@ class Proposals:
 
     def _by_model(self, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The named steps of a demonstration whose label stands for one option of the model, and that option."""
-        counts = np.bincount(self.options[1:], minlength=labels.max(initial=0) + 1)
+        counts = np.bincount(self.options[self.options > 0], minlength=labels.max(initial=0) + 1)
         said = np.flatnonzero((labels > 0) & (counts[labels.clip(0)] == 1))
         return said, (self.options[1:] == labels[said, None]).argmax(1) + 1
 
@@ -250,7 +263,7 @@ class Proposals:
         every, ours = torch.full((len(labels), max(map(len, labels))), -1), torch.as_tensor(self.options)
         for row, own in enumerate(labels):
             every[row, : len(own)] = torch.as_tensor(np.where(np.isin(own, self.options[1:]), own, -1))
-        return (every.unsqueeze(-1) == ours) | (every < 1).unsqueeze(-1)
+        return (every.unsqueeze(-1) == ours) | ((every < 1).unsqueeze(-1) & (ours != GONE))
 
     def shown(self, name: str, labels: np.ndarray | None = None) -> Shown:
         """The most likely options of a demonstration where its labels say nothing."""
@@ -270,6 +283,24 @@ class Proposals:
         lengths = np.diff(starts, append=len(rows))[:, None]
         centres: np.ndarray = (np.add.reduceat(rows, starts) / lengths - self.middle) / self.spread
         return centres
+
+    def change_points(self, name: str) -> list[int]:
+        """The steps at which what is observed and done changes most: local maxima of d(t), t from 1 on.
+
+        d(t) is the distance between the means of standardised features of the w steps before t and of the w steps from
+        t on, and w is a quarter of a usual segment.
+        """
+        rows = self._rows(name).numpy()
+        size = rows.shape[1] // (1 + SCALES)
+        sums = np.cumsum(np.pad((rows[:, :size] - self.middle[:size]) / self.spread[:size], ((1, 0), (0, 0))), axis=0)
+        wide, steps = max(1, round(self.half / 2)), np.arange(1, len(rows))
+        low, high = (steps - wide).clip(0), (steps + wide).clip(max=len(rows))
+        before = (sums[steps] - sums[low]) / (steps - low)[:, None]
+        after = (sums[high] - sums[steps]) / (high - steps)[:, None]
+        away = np.linalg.norm(after - before, axis=1)
+        around = np.lib.stride_tricks.sliding_window_view(np.pad(away, wide, constant_values=-1.0), 2 * wide + 1)
+        peaks: list[int] = steps[away >= around.max(1)].tolist()
+        return peaks
 
     def _rows(self, name: str) -> Tensor:
         """The features of each step of a demonstration, [T, 3 F]."""
@@ -301,29 +332,47 @@ def sources_shown(document: Document, name: str) -> np.ndarray:
     return np.select([labels == OPEN, labels == FREE], [SOURCES.index("open"), SOURCES.index("proposed")], said)
 
 
-def said_segments(document: Document, level: str, source: Source, frequency: float | None) -> Segmented:
-    """The labels of a level alone, -1 where nothing is said."""
-    each, count = [], len(document.names)
-    for name in document.lengths:
-        labels = document.in_file(name)
-        levels = {level: LevelLabels(labels, _starts(document, name, labels), np.ones(len(labels)))}
-        each.append(Segments(name, levels, 0.0, False, baselines={level + SOURCE: sources_shown(document, name)}))
-    names: dict[str, Sequence[str]] = {level: choice_names(count, document.names)}
-    known = {**label_names(source.attributes), level + SOURCE: list(SOURCES)}
-    return Segmented(tuple(each), {level: count}, frequency, {}, names, known)
+def said_segments(
+    documents: Mapping[str, Document],
+    source: Source,
+    frequency: float | None,
+    marks: Mapping[str, Mapping[str, Any]],
+) -> Segmented:
+    """The labels of levels alone, -1 where nothing is said.
+
+    :param documents: by level.
+    :param marks: of demonstrations.
+    """
+    each = []
+    for name in next(iter(documents.values())).lengths:
+        levels, said = dict[str, LevelLabels](), dict[str, np.ndarray]()
+        for level, document in documents.items():
+            labels = document.in_file(name)
+            levels[level] = LevelLabels(labels, _starts(document, name, labels), np.ones(len(labels)))
+            said[level + SOURCE] = sources_shown(document, name)
+        each.append(Segments(name, levels, 0.0, False, baselines=said))
+    counts = {level: len(document.names) for level, document in documents.items()}
+    names = {level: choice_names(counts[level], document.names) for level, document in documents.items()}
+    known = {**label_names(source.attributes), **{level + SOURCE: list(SOURCES) for level in documents}}
+    return Segmented(tuple(each), counts, frequency, {}, names, known, marks=marks)
 
 
-def said_in(demos: Demonstrations, level: str, names: Sequence[str]) -> list[Change]:
+def said_in(
+    demos: Demonstrations, level: str, names: Sequence[str], lerobot: bool = False, marked: bool = True
+) -> list[Change]:
     """What the labels of a file say of a level: those that a page saved, or those of another program.
 
     Labels that ``segment`` wrote say nothing: a model proposed them.
 
     :param names: of the options 1 to k, as the run has them. A name that none of them has is given to one that has no
         name of its own, or is new.
+    :param lerobot: whether the labels are the subtasks of a LeRobot dataset.
+    :param marked: whether marks of demonstrations are read, too.
     """
+    level = "subtask" if lerobot else level
     known = label_names(demos.attributes).get(level, ())
     words = label_names(demos.attributes).get(level + SOURCE, SOURCES)
-    ours, changes = any(level + SOURCE in demo.labels for demo in demos), list[Change]()
+    ours, changes = not lerobot and any(level + SOURCE in demo.labels for demo in demos), list[Change]()
     if not ours and any(level + BOUNDARY in demo.labels for demo in demos):
         return []
     found, options = [*names], dict[int, int]()
@@ -344,6 +393,14 @@ def said_in(demos: Demonstrations, level: str, names: Sequence[str]) -> list[Cha
             if source != "proposed":
                 kind = CONFIRM if source == "accepted" else PAINT
                 changes.append((kind, demo.name, start, stop, OPEN if source == "open" else options[value]))
+    if marked:
+        changes += [("mark", name, EXCLUDE, True) for name in demos.masks.get(EXCLUDE, ())]
+        changes += [
+            ("mark", demo.name, mark, demo.attributes[mark])
+            for demo in demos
+            for mark in ("flag", "note")
+            if mark in demo.attributes
+        ]
     return [("names", found), *changes] if changes else []
 
 
@@ -352,11 +409,11 @@ def shown_segments(
 ) -> Segmented:
     """All levels of a model, one of them as it is shown.
 
-    :raises BadInput: the model lacks an option.
+    :raises BadInput: the model has other options.
     """
     names = document.names
     if len(names) + 1 != len(fit.names[level]):
-        raise BadInput("an option is new; refit before you write segments")
+        raise BadInput("options are new, merged or deleted; refit before you write segments")
     model = segments(fit, source)
     each = []
     for demo in model.segments:

@@ -9,7 +9,7 @@ import secrets
 import shutil
 import socket
 import tempfile
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from importlib.resources import files
@@ -81,10 +81,10 @@ class Listening:
 
 
 @contextmanager
-def running(session: Session, listening: Listening) -> Iterator[Thread]:
-    """Serve a session in a thread while the context lasts."""
+def running(sessions: Sequence[Session], listening: Listening) -> Iterator[Thread]:
+    """Serve sessions in a thread while the context lasts."""
     settings = uvicorn.Config(
-        application(session, listening.token),
+        application(sessions, listening.token),
         log_config=None, log_level="critical", lifespan="off", ws="none", server_header=False,
         timeout_graceful_shutdown=PATIENCE,
     )  # fmt: skip
@@ -99,23 +99,24 @@ def running(session: Session, listening: Listening) -> Iterator[Thread]:
         listening.socket.close()
 
 
-def serve(session: Session, listening: Listening, ready: Callable[[], None] = lambda: None) -> str:
-    """Serve a session until an interrupt; then save it and close it.
+def serve(sessions: Sequence[Session], listening: Listening, ready: Callable[[], None] = lambda: None) -> str:
+    """Serve sessions until an interrupt; then save and close them.
 
     :param ready: called when the page can be asked for.
     :returns: a line that says what was saved.
     """
     try:
-        with suppress(KeyboardInterrupt), running(session, listening) as thread:
+        with suppress(KeyboardInterrupt), running(sessions, listening) as thread:
             ready()
             thread.join()
-        return session.save() if session.state()["dirty"] else "nothing new to save"
+        return sessions[0].save() if sessions[0].dirty else "nothing new to save"
     finally:
-        session.close()
+        for session in sessions:
+            session.close()
 
 
-def application(session: Session, token: str) -> Starlette:
-    """The web application of a session, for requests to ``/token/``."""
+def application(sessions: Sequence[Session], token: str) -> Starlette:
+    """The web application of the sessions of a run's levels, for requests to ``/token/``."""
 
     async def canvas(request: Request) -> Response:
         return FileResponse(str(CANVAS))
@@ -129,9 +130,10 @@ def application(session: Session, token: str) -> Starlette:
         status, text = (error.status_code, error.detail) if isinstance(error, HTTPException) else (500, reason(error))
         return JSONResponse({"error": text}, status)
 
+    levels = [Mount(f"/level/{number}", routes=_answers(session)) for number, session in enumerate(sessions)]
     page = Mount("/", StaticFiles(directory=str(PAGE), html=True))
     return Starlette(
-        routes=[Mount(f"/{token}", routes=[*_answers(session), Route("/canvas.js", canvas), page])],
+        routes=[Mount(f"/{token}", routes=[*levels, Route("/canvas.js", canvas), page])],
         middleware=[
             Middleware(BaseHTTPMiddleware, dispatch=headed),
             Middleware(TrustedHostMiddleware, allowed_hosts=[LOOPBACK, "localhost"]),
@@ -152,7 +154,7 @@ def _answers(session: Session) -> list[Route]:
         return session.nearest(request.path_params["index"], request.path_params["step"])
 
     def picture(request: Request) -> Response:
-        content = session.picture(request.path_params["index"], request.path_params["step"])
+        content = session.picture(*(request.path_params[key] for key in ("index", "camera", "step")))
         return Response(content, media_type="image/jpeg")
 
     def exported(request: Request) -> Response:
@@ -187,7 +189,7 @@ def _answers(session: Session) -> list[Route]:
         "state": lambda asked: session.state(),
         "view/{index:int}": view,
         "demo/{index:int}/nearest/{step:int}": nearest,
-        "demo/{index:int}/picture/{step:int}": picture,
+        "demo/{index:int}/picture/{camera:int}/{step:int}": picture,
         "export/{format}": exported,
     }
     posts = {

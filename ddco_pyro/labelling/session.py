@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from copy import copy
 from dataclasses import replace
 from functools import cached_property, partial
@@ -15,10 +16,12 @@ import numpy as np
 import sklearn.linear_model
 import sklearn.metrics  # noqa: F401  (the first edit does not wait for these)
 
-from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.data.labels import SOURCE
+from ddco_pyro.data.arrays import is_picture
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.labels import EXCLUDE, SOURCE
 from ddco_pyro.data.likeness import Likeness
-from ddco_pyro.data.sources import open_source
+from ddco_pyro.data.sources import Source, format_of, open_source
+from ddco_pyro.data.sources.metadata import FREQUENCY
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.drawing.timeline import text
 from ddco_pyro.errors import BadInput, reason
@@ -26,7 +29,7 @@ from ddco_pyro.evaluation.inferred import Inferred, runs, within
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.labelling.background import Background
 from ddco_pyro.labelling.commands import Segment, View, whole
-from ddco_pyro.labelling.document import FREE, SUFFIX, Document, Journal, digest, version
+from ddco_pyro.labelling.document import FREE, SUFFIX, Change, Document, Journal, digest, version
 from ddco_pyro.labelling.following import Following
 from ddco_pyro.labelling.proposals import (
     Proposals,
@@ -40,10 +43,12 @@ from ddco_pyro.labelling.proposals import (
     unforeseen,
 )
 from ddco_pyro.labelling.refitting import refit
+from ddco_pyro.labelling.team import Others, Team, agreement, taken
 from ddco_pyro.names import option_name
 from ddco_pyro.segmenting.formats import FORMATS, check_format, write_format
 from ddco_pyro.segmenting.formats.asked import Asked
-from ddco_pyro.segmenting.formats.labels import check_copy, check_labels, has_labels, write_labels
+from ddco_pyro.segmenting.formats.labels import check_copy, check_labels, write_labels
+from ddco_pyro.segmenting.segments import Segmented
 
 NEAREST = 5
 """Segments elsewhere that are shown for one."""
@@ -52,15 +57,35 @@ UNCERTAIN = 20
 """Boundaries that are named as the most uncertain ones."""
 
 
+def read(path: Path, needed: Iterable[str] = ()) -> Demonstrations:
+    """The demonstrations of a file or data set as they are; pictures and videos are read when they are shown.
+
+    :param needed: the pictures that a model reads.
+    """
+    if format_of(path) == "robomimic":
+        return Demonstrations.read(path)
+    with open_source(path) as source:
+        each = []
+        for demo in map(source.read, source.names):
+            seen = {key: own for key, own in demo.observations.items() if key in needed or not is_picture(own)}
+            each.append(Demonstration(demo.name, seen, demo.actions, demo.labels, demo.attributes))
+        rate = {FREQUENCY: source.frequency} if source.frequency else {}
+        return Demonstrations(tuple(each), source.masks, {**source.attributes, **rate})
+
+
 class Session:
     """Labels of one level of a run's options, which people correct.
 
     Every method may be called from any thread. Steps are counted from 0, and ``stop`` is the step after the last.
 
     :param fit: has options.
-    :param path: an HDF5 file of demonstrations.
-    :param out: the file of labels; the same as ``path`` to write into it.
+    :param path: an HDF5 file of demonstrations, or a LeRobot dataset.
+    :param out: the file or dataset of labels; the same as ``path`` to write into it.
     :param level: the lowest one by default.
+    :param skills: names of the options 1, 2, ... where nothing is labelled yet; further ones are new options.
+    :param team: who labels, and who labels what.
+    :param first: the session of another level, whose demonstrations and marks are those of this one.
+    :ivar beside: the sessions of the other levels.
     :raises BadInput: the run has no options or no such level, ``out`` is something else, or another process labels it.
     """
 
@@ -70,52 +95,85 @@ class Session:
         path: Path,
         out: Path,
         level: str | None = None,
+        skills: Sequence[str] = (),
+        team: Team | None = None,
+        first: Session | None = None,
     ) -> None:
         fit.refuse_flat()
         self.run, self.fit, self.path, self.out = fit, fit, path, out
-        self.level = level or next(iter(fit.names))
+        self.level, self.team, self.first = level or next(iter(fit.names)), team or Team(), first or self
         if self.level not in fit.names:
             raise BadInput(f"--level: there is no level {self.level!r} (there is: {', '.join(fit.names)})")
-        self.demos = Demonstrations.read(path)
-        if out.exists() and out.samefile(path):
-            check_labels(path, [self.level, self.level + SOURCE], self.demos.names)
-        else:
-            check_copy(path, out)
-        self.version, self.frequency = version(path), self.demos.frequency
-        self.document = Document({demo.name: len(demo) for demo in self.demos}, fit.names[self.level][1:])
-        self.journal = Journal(out.with_name(out.name + SUFFIX), self.document, digest(self.demos, self.level))
-        if not (self.document.done or self.document.undone) and (
-            known := said_in(Demonstrations.read(out) if out.exists() else self.demos, self.level, self.document.names)
-        ):
-            self.journal.edit(known)
+        self.beside = list[Session]()
+        self.demos: Demonstrations = first.demos if first else read(path, fit.hierarchy.encoder.shapes)
+        self.form, self.in_place = format_of(path), out.exists() and out.samefile(path)
+        self._check_out()
+        self.version, self.frequency = self._version(), self.demos.frequency
+        known = [*skills, *fit.names[self.level][1 + len(skills) :]]
+        self.document = Document({demo.name: len(demo) for demo in self.demos}, tuple(known))
+        ours = digest(self.demos, self.level)
+        place = out.with_name(f"{out.name}{f'.{self.level}' if first else ''}{SUFFIX}")
+        self.journal = Journal(place, self.document, ours, self.team.me)
+        self.others = Others(place, self.team.me, self.document.lengths, ours)
+        self.shares = self.team.shares(self.demos.names)
+        if not (self.document.done or self.document.undone):
+            there = read(out) if out.exists() and not self.in_place else self.demos
+            if said := said_in(there, self.level, self.document.names, self.form == "lerobot", first is None):
+                self.journal.edit(said)
+                self.journal.save()
         self.lock, self.revision, self.edits, self.changed = threading.RLock(), 0, 0, set[int]()
-        self.saved = self.edits - self._is_unsaved()
         self.behind, self.inferring, self.inferred = False, False, dict.fromkeys(self.demos.names, 0)
         self.refits, self.again = 0, False
         self.background = Background(self.lock, self._ended, "ddco_pyro.labelling.refitting", "sklearn.linear_model")
-        self.first, self.shown, self.wrong, self.sure = dict[str, Shown](), dict[str, Shown](), dict[str, float](), 0.0
+        self.shown, self.wrong, self.sure = dict[str, Shown](), dict[str, float](), 0.0
+        self.untouched = dict[str, Shown]()
         self.rows, self.recent = dict[str, list[list[Any]]](), dict[str, Inferred]()
-        self.following = Following(path, self.demos, fit.spec.report.trajectory)
+        trajectory = fit.spec.report.trajectory
+        self.following: Following = first.following if first else Following(path, self.demos, trajectory)
         self.error = ""
         self._prepare(fit)()
-        self.unlike = self._unlike()
-        self.proposed = self.proposals
+        self.unlike = [] if first else self._unlike()
+        self.proposed: Proposals = self.proposals
         """By the run."""
+
+    def _check_out(self) -> None:
+        """Refuse a place of something else."""
+        if self.form == "robomimic" and self.in_place:
+            check_labels(self.path, [self.level, self.level + SOURCE], self.demos.names)
+        elif self.form == "robomimic":
+            check_copy(self.path, self.out)
+        elif not self.in_place and self.out.exists():
+            from ddco_pyro.segmenting.formats.lerobot import is_copy
+
+            if not is_copy(self.out, self.path):
+                raise BadInput(
+                    f"--out {self.out}: exists and is not a labelled copy of {self.path}; choose another --out"
+                )
+
+    def _version(self) -> list[tuple[int, int]]:
+        if self.form == "robomimic":
+            return version([self.path])
+        with open_source(self.path) as source:
+            return version(source.files)
 
     def begin(self) -> None:
         """Refit where something is labelled already; else have the process ready for it."""
         if self._is_labelled():
             self.refit()
-        else:
+        elif self.first is self:
             self.background.ready()
 
-    def _is_unsaved(self) -> bool:
-        """Whether the journal has labels that the file of labels lacks."""
-        if not self.out.exists() or not (self.document.done or self.document.undone):
-            return bool(self.document.done)
-        with open_source(self.path) as source:
-            said = said_segments(self.document, self.level, source, self.frequency)
-        return not has_labels(self.out, said)
+    @property
+    def excluded(self) -> set[str]:
+        """The demonstrations that a person leaves out."""
+        return {name for name, marks in self.first.document.marks.items() if EXCLUDE in marks}
+
+    @property
+    def dirty(self) -> bool:
+        """Whether the journals hold more than the file of labels."""
+        return any(not own.journal.saved for own in (self, *self.beside)) or bool(
+            self.document.done and not self.out.exists()
+        )
 
     # --- the model ----------------------------------------------------------------------------------------------------
 
@@ -156,7 +214,7 @@ class Session:
             shown = self.shown[name] = self.proposals.shown(name, labels)
             self.rows[name] = [[own.start, own.option, own.source] for own in self.segments(name)]
             if (labels == FREE).all():
-                self.first[name] = shown
+                self.untouched[name] = shown
             if before is not None and name != edited and not np.array_equal(before.options, shown.options):
                 self.changed.add(self.demos.names.index(name))
             self.wrong[name] = expected_wrong(shown, labels, self.sure)
@@ -234,6 +292,12 @@ class Session:
         self.order, self.farthest = ranking(
             wrong, edits, self.proposals.whole, np.array([name in accepted for name in lengths])
         )
+        left_out, me = self.excluded, self.team.me
+        apart = {
+            place: (name in left_out, me not in (*self.shares[name], *([] if self.shares[name] else [me])))
+            for place, name in enumerate(self.demos.names)
+        }
+        self.order.sort(key=lambda place: (apart[place][0], self.demos.names[place] in accepted, apart[place][1]))
         found = [
             (float(self.shown[name].probability[max(start - 1, 0) : start + 1].min()), place, start)
             for place, name in enumerate(self.demos.names)
@@ -246,14 +310,14 @@ class Session:
     @property
     def view(self) -> View:
         """The labels, and what is shown."""
-        return View(self.document, self.shown, self.first)
+        return View(self.document, self.shown, self.untouched, lambda name: self.proposals.change_points(name))
 
     # --- what is shown ------------------------------------------------------------------------------------------------
 
     def state(self) -> dict[str, Any]:
         """Everything but the demonstrations themselves."""
         with self.lock:
-            document, names = self.document, self.demos.names
+            document, names, others = self.document, self.demos.names, self.others.documents()
             demos = [
                 {
                     "name": name,
@@ -265,27 +329,59 @@ class Session:
                     "held_out": name in self.run.held_out,
                     "reason": f"{self.wrong[name]:.0f} of {document.lengths[name]} steps expected wrong"
                     + "; the least like those you labelled" * (place == self.farthest),
+                    "marks": self.first.document.marks[name],
+                    "people": [*self.shares[name]],
+                    "done_by": [other for other, own in others.items() if name in own.accepted],
                     "strip": self.rows[name],
                 }
                 for place, name in enumerate(names)
             ]
             return {
                 "title": self.path.name,
-                "formats": [*self.formats],
+                "formats": self.formats,
                 "uncertain": self.uncertain,
                 "level": self.level,
-                "levels": [*self.fit.names],
+                "levels": [own.level for own in (self.first, *self.first.beside)],
                 "names": list(document.names),
-                "colours": [option_colour(option + 1) for option in range(len(document.names))],
+                "colours": self.colours,
                 "frequency": self.frequency,
                 "demos": demos,
                 "order": self.order,
                 "summary": self.summary(),
+                "annotator": self.team.me,
+                "team": self._team(others),
+                "scratch": self._scratch(),
                 "can_undo": bool(document.done),
                 "can_redo": bool(document.undone),
                 "out": str(self.out),
                 **self.progress(),
             }
+
+    @property
+    def colours(self) -> list[str]:
+        """Of the options 1 to k: those that a person chose, else the usual ones."""
+        own, names = self.document.colours, self.document.names
+        return [own.get(name, option_colour(option)) for option, name in enumerate(names, start=1)]
+
+    def _team(self, others: Mapping[str, Document]) -> list[dict[str, Any]]:
+        """How far each annotator is, and how the others agree with this one."""
+        found = []
+        for name, document in {self.team.me: self.document, **others}.items() if self.team.me else ():
+            turn = [demo for demo, people in self.shares.items() if name in people] or list(self.demos.names)
+            done = sum(demo in document.accepted for demo in turn)
+            both = None if document is self.document else agreement(self.document, document, self.demos.names)
+            found.append({"name": name, "done": done, "of": len(turn), "agreement": both})
+        return found
+
+    def _scratch(self) -> bool:
+        """Whether a first demonstration is likely cheaper to name from scratch than to correct.
+
+        That is so where the segments that are proposed are likely wrong in more than half of the steps.
+        """
+        if any(labels.max() > 0 for labels in self.document.labels.values()):
+            return False
+        steps = sum(self.document.lengths.values())
+        return sum(float((1 - shown.probability).sum()) for shown in self.shown.values()) > steps / 2
 
     def progress(self) -> dict[str, Any]:
         """What changes by itself.
@@ -304,7 +400,7 @@ class Session:
                     "error": self.background.error and f"fitting the labels failed: {self.background.error}",
                 },
                 "warnings": self.warnings(),
-                "dirty": self.edits != self.saved,
+                "dirty": self.dirty,
             }
 
     def summary(self) -> dict[str, Any]:
@@ -312,10 +408,11 @@ class Session:
 
         Both shares are None before anything is accepted.
         """
-        steps, labelled = sum(self.document.lengths.values()), len(self.document.accepted)
-        following = self.demos.names[self.order[0]]
+        names = [name for name in self.demos.names if name not in self.excluded]
+        steps = max(1, sum(self.document.lengths[name] for name in names))
+        labelled, following = len(self.document.accepted), self.demos.names[self.order[0]]
         return {
-            "expected_wrong": sum(self.wrong.values()) / steps if labelled else None,
+            "expected_wrong": sum(self.wrong[name] for name in names) / steps if labelled else None,
             "one_more": self.wrong[following] / steps if labelled else None,
             "labelled": labelled,
         }
@@ -336,7 +433,7 @@ class Session:
         ]
 
     def _unchanged(self) -> bool:
-        return self.path.exists() and version(self.path) == self.version
+        return self.path.exists() and self.version == self._version()
 
     def segments(self, name: str) -> list[Segment]:
         """The segments of a demonstration that are shown."""
@@ -362,16 +459,17 @@ class Session:
                 }
                 for segment in own[1:]
             ]
-            levels = [*self.fit.names]
+            levels, others = (self.first, *self.first.beside), self.others.documents()
             upper = [
                 {
-                    "level": levels[number - 1],
-                    "names": list(self.fit.names[levels[number - 1]][1:]),
-                    "colours": [option_colour(n) for n in range(1, len(self.fit.names[levels[number - 1]]))],
-                    "segments": [{"start": start, "stop": stop, "option": option} for option, start, stop in every],
+                    "level": levels.index(own),
+                    "above": [*self.run.names].index(own.level) > [*self.run.names].index(self.level),
+                    "name": own.level,
+                    "names": list(own.document.names),
+                    "colours": own.colours,
+                    "segments": [vars(segment) for segment in own.segments(name)],
                 }
-                for number, every in enumerate((runs(*one) for one in piece.segmented(row, lasts)), start=1)
-                if number != self.proposals.level
+                for own in self.beside
             ]
             self.changed.discard(index)
             return {
@@ -383,17 +481,35 @@ class Session:
                 "boundaries": boundaries,
                 "probability": text(np.rint(255 * shown.probability)),
                 "upper": upper,
+                "others": [self._other(other, own, name) for other, own in others.items()],
+                "task": str(self.demos[index].attributes.get("task", "")),
                 **self.following.shown(index),
             }
 
-    def picture(self, index: int, step: int) -> bytes:
+    def _other(self, other: str, own: Document, name: str) -> dict[str, Any]:
+        """What another annotator says of a demonstration, and how that agrees with this one."""
+        labels, ours = own.labels[name], self.document.names
+        colour = dict(zip(ours, self.colours, strict=True))
+        segments = [
+            {"start": start, "stop": stop, "option": max(value, 0), "source": "open" if value < 0 else "given"}
+            for value, start, stop in runs(labels, np.diff(labels, prepend=-9))
+        ]
+        return {
+            "annotator": other,
+            "names": list(own.names),
+            "colours": [colour.get(text, option_colour(n)) for n, text in enumerate(own.names, start=1)],
+            "segments": segments,
+            "accepted": name in own.accepted,
+            "agreement": agreement(self.document, own, [name]),
+        }
+
+    def picture(self, index: int, camera: int, step: int) -> bytes:
         """The picture of a step as JPEG.
 
         :raises BadInput: there is none.
         """
-        with self.lock:
-            self._name(index)
-            return self.following.picture(index, step)
+        self._name(index)
+        return self.following.picture(index, camera, step)
 
     def nearest(self, index: int, step: int) -> list[dict[str, Any]]:
         """The segments of other demonstrations that are most like the one at a step."""
@@ -424,23 +540,54 @@ class Session:
         with self.lock:
             do, document = command.get("do"), self.document
             index = whole(command, "demo") if "demo" in command else None
-            name = None if index is None else self._name(index)
+            name, names, shown = None if index is None else self._name(index), document.names, self._shown_now()
+            if do == "mark" and self.first is not self:
+                return self.first.edit(command)
             if do in ("undo", "redo"):
                 getattr(self.journal, do)()
                 changes = list((document.undone if do == "undo" else document.done)[-1])
             else:
-                changes = [one for one in self.view.changes(str(do), name, command) if document.alters(*one)]
+                asked = self._taken(name, command) if do == "take" else self.view.changes(str(do), name, command)
+                changes = [one for one in asked if document.alters(*one)]
                 if changes:
                     self.journal.edit(changes)
-            touched = list(dict.fromkeys(change[1] for change in changes if change[0] != "names"))
+            of = ("names", "colour")
+            touched = list(dict.fromkeys(change[1] for change in changes if change[0] not in of))
             if do in ("undo", "redo"):
                 index = self.demos.names.index(touched[0]) if touched else None
             if changes:
                 self.edits += 1
+                if len(names) != len(document.names) and do != "new":
+                    self._renumber(names, shown, command.get("into", 0) if do == "drop" else 0)
                 self._follow(touched, None if index is None else self.demos.names[index])
                 if do == "accept":
                     self.refit()
             return {"revision": self.revision, "demo": index, "done": bool(changes)}
+
+    def _taken(self, name: str | None, command: Mapping[str, Any]) -> list[Change]:
+        """The changes by which another annotator's labels of a demonstration become one's own."""
+        others = self.others.documents()
+        if name is None or command.get("annotator") not in others:
+            raise BadInput(f"take: name a demonstration and one of the annotators {', '.join(others)}")
+        return taken(self.document, others[command["annotator"]], name)
+
+    def _renumber(self, names: Sequence[str], shown: Mapping[str, np.ndarray], into: int) -> None:
+        """Number the options of the model anew after options of the person were dropped, or are back.
+
+        :param names: the person's options before.
+        :param shown: of each step, before.
+        :param into: the option, as it was before, that a dropped one is merged into; 0 for none.
+        """
+        now = self.document.names
+        numbers = np.array([0, *(now.index(name) + 1 if name in now else 0 for name in names)])
+        numbers[numbers == 0] = numbers[into]
+        before, labels = {name: numbers[own] for name, own in shown.items()}, self._labels()
+        self.proposals.renumber(labels, len(now), before)
+        self.proposals.learned = self.proposals.learn(labels)
+        if self.proposed is not self.proposals:
+            self.proposed.renumber(labels, len(now), before)
+        self.untouched, self.recent = {}, {}
+        self._show(self.demos.names)
 
     def _follow(self, touched: Sequence[str], edited: str | None) -> None:
         """Show what follows from an edit at once: the demonstration at hand, and the numbers of options everywhere."""
@@ -465,6 +612,8 @@ class Session:
         """Give the run's options the names of the options that they stand for."""
         ours, known = self.document.names, self.run.names[self.level][1:]
         stand = self.proposed.options[1:]
+        if stand.min() < 1:
+            return
         names = tuple(
             option_name(own) if ours[other - 1] == option_name(other) else ours[other - 1]
             for own, other in enumerate(stand.tolist(), start=1)
@@ -506,11 +655,13 @@ class Session:
     def _refitting(self) -> Callable[..., Fit]:
         """The call that fits to what is said so far."""
         with self.lock:
-            labels = {name: self.document.in_file(name) for name in self.demos.names}
+            names = [name for name in self.demos.names if name not in self.excluded]
+            labels = {name: self.document.in_file(name) for name in names}
             waiting = self.proposals.waiting(labels)
-            kept = {name: np.where(np.isin(own, waiting), own, FREE) for name, own in self._shown_now().items()}
+            shown = self._shown_now()
+            kept = {name: np.where(np.isin(shown[name], waiting), shown[name], FREE) for name in names}
             trained, count = replace(self.fit, given=None), len(self.document.names)
-        return partial(refit, trained, self.level, count, self._observed, labels, kept)
+        return partial(refit, trained, self.level, count, self._observed.select(names), labels, kept)
 
     @cached_property
     def _observed(self) -> Demonstrations:
@@ -531,31 +682,57 @@ class Session:
     # --- files --------------------------------------------------------------------------------------------------------
 
     def save(self) -> str:
-        """Write ``labels/<level>``, -1 where nothing is said, whole or not at all.
+        """Write the labels of all levels and the marks, -1 where nothing is said, whole or not at all.
 
         :returns: what was written, in words.
         :raises BadInput: the demonstrations changed underneath.
         """
-        with self.lock:
+        every = (self, *self.beside)
+        with ExitStack() as held:
+            for own in every:
+                held.enter_context(own.lock)
             if not self._unchanged():
                 raise BadInput(self.warnings()[0])
+            documents = {own.level: own.document for own in every}
             with open_source(self.path) as source:
-                labels = said_segments(self.document, self.level, source, self.frequency)
-            write_labels(self.path, self.out, labels)
-            if self.out.exists() and self.out.samefile(self.path):
-                self.version = version(self.path)
-            self.saved = self.edits
+                labels = said_segments(documents, source, self.frequency, self.first.document.marks)
+                if self.form == "robomimic":
+                    write_labels(self.path, self.out, labels)
+                else:
+                    self._write("--lerobot", self.out, source, labels, self.first.level)
+            if self.in_place:
+                for own in every:
+                    own.version = self._version()
+            for own in every:
+                own.journal.save()
             steps = sum(int(self.document.said(name).sum()) for name in self.demos.names)
-            return f"{self.out}: labels/{self.level}, {steps} of {sum(self.document.lengths.values())} steps"
+            what = f"labels/{self.level}" if self.form == "robomimic" else "subtasks"
+            return f"{self.out}: {what}, {steps} of {sum(self.document.lengths.values())} steps"
 
-    @cached_property
+    def _write(self, option: str, place: Path, source: Source, segmented: Segmented, level: str) -> str:
+        names = {own.level: own.document.names for own in (self, *self.beside)}
+        named = replace(self.fit, named={**self.fit.named, **names})
+        asked = Asked(
+            option,
+            place,
+            named,
+            self.run.folder or Path(),
+            self.path,
+            source,
+            level,
+            annotator=self.journal.annotator,
+        )
+        if place != self.out:
+            check_format(asked)
+        return write_format(asked, segmented)
+
+    @property
     def formats(self) -> list[str]:
         """Those of ``segment`` that the page offers: all that take the demonstrations, without the copy with labels."""
-        takes = ("", "robomimic")
-        return [option[2:] for option, form in FORMATS.items() if form.takes in takes and option != "--out"]
+        return [option[2:] for option, form in FORMATS.items() if form.takes in ("", self.form) and option != "--out"]
 
     def export(self, form: str, folder: Path) -> Path:
-        """Write the shown segments in one of :attr:`formats` into a folder.
+        """Write the shown segments in one of :attr:`formats` into a folder, without excluded demonstrations.
 
         :returns: the file or folder that was written.
         :raises BadInput: there is no such format, or it does not fit the demonstrations.
@@ -566,11 +743,10 @@ class Session:
         place = folder / f"segments{'' if about.kind == 'folder' else about.suffix or f'.{form}'}"
         with open_source(self.path) as source:
             with self.lock:
-                named = replace(self.fit, named={**self.fit.named, self.level: self.document.names})
                 segmented = shown_segments(self.fit, source, self.level, self.shown, self.document)
-            asked = Asked(f"--{form}", place, named, self.run.folder or Path(), self.path, source, self.level)
-            check_format(asked)
-            write_format(asked, segmented)
+            marks, whole = self.first.document.marks, about.takes == "lerobot"
+            kept = tuple(demo for demo in segmented.segments if whole or demo.name not in self.excluded)
+            self._write(f"--{form}", place, source, replace(segmented, segments=kept, marks=marks), self.level)
         return place
 
     def close(self) -> None:
@@ -580,7 +756,7 @@ class Session:
             self.thread.join()
         with self.lock:
             self.background.close()
-            if self.edits != self.saved and self._unchanged():
+            if not self.journal.saved and self._unchanged():
                 self.save()
             self.following.close()
             self.journal.close()

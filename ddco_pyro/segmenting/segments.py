@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -92,6 +93,7 @@ class Segmented:
     :param matched: for labels that the run's spec compares with a level, the option that each label is matched with
         in the run's own table: of the lowest level, where labels are compared with several.
     :param unlike: a line for each reason why demonstrations are unlike those of the fit.
+    :param marks: what a person said of demonstrations as a whole: ``exclude``, ``flag``, ``note``.
     """
 
     segments: tuple[Segments, ...]
@@ -102,6 +104,7 @@ class Segmented:
     label_names: Mapping[str, Sequence[str]] = field(default_factory=dict)
     matched: Mapping[str, Mapping[int, int]] = field(default_factory=dict)
     unlike: Sequence[str] = ()
+    marks: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.segments)

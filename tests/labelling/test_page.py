@@ -61,7 +61,7 @@ def here(background, call):
 def served(session):
     """The address of a session that is served."""
     listening = Listening.at()
-    with running(session, listening):
+    with running([session], listening):
         yield listening.address
 
 
@@ -359,7 +359,7 @@ def test_an_undo_of_a_name_stays_where_it_is_and_what_changes_nothing_cannot_be_
 
 def test_the_keyboard_alone_does_everything(tab, session):
     def reached(what):
-        for _ in range(40):
+        for _ in range(90):
             if what.evaluate("one => one === document.activeElement"):
                 return
             tab.keyboard.press("Shift+Tab")
@@ -533,7 +533,7 @@ def test_a_server_killed_during_an_edit_loses_nothing_that_it_acknowledged(tabs,
 
 
 def state_of(address):
-    return httpx2.get(f"{address}state", trust_env=False).json()
+    return httpx2.get(f"{address}level/0/state", trust_env=False).json()
 
 
 def starts_of(address, demo):

@@ -37,11 +37,11 @@ def session(run, file, tmp_path, monkeypatch):
 
 @pytest.fixture
 def client(session):
-    return TestClient(application(session, TOKEN), base_url=BASE, follow_redirects=False)
+    return TestClient(application([session], TOKEN), base_url=BASE, follow_redirects=False)
 
 
 def post(client, path, body, **headers):
-    return client.post(f"/{TOKEN}/{path}", json=body, headers=headers)
+    return client.post(f"/{TOKEN}/level/0/{path}", json=body, headers=headers)
 
 
 @pytest.mark.parametrize(
@@ -55,7 +55,7 @@ def test_without_the_token_or_outside_the_page_there_is_nothing(client, path):
 def test_foreign_hosts_are_refused_whatever_they_know(client, session):
     step = {"do": "split", "demo": 0, "step": 3}
     assert post(client, "edit", step, Host="evil.example").status_code == 400
-    assert client.get(f"/{TOKEN}/state", headers={"Host": f"evil.example:{PORT}"}).status_code == 400
+    assert client.get(f"/{TOKEN}/level/0/state", headers={"Host": f"evil.example:{PORT}"}).status_code == 400
     assert not session.document.done
     assert post(client, "edit", step, Host=f"localhost:{PORT}").status_code == 200
     assert len(session.document.done) == 1
@@ -73,8 +73,8 @@ def test_the_page_asks_for_nothing_outside_its_table_and_every_answer_is_guarded
         assert " style=" not in answer.text
     for answer in (
         client.get(f"/{TOKEN}/"),
-        client.get(f"/{TOKEN}/view/99"),
-        client.post(f"/{TOKEN}/state"),
+        client.get(f"/{TOKEN}/level/0/view/99"),
+        client.post(f"/{TOKEN}/level/0/state"),
     ):
         assert {name: answer.headers.get(name) for name in HEADERS} == HEADERS
     policy = HEADERS["Content-Security-Policy"]
@@ -84,17 +84,17 @@ def test_the_page_asks_for_nothing_outside_its_table_and_every_answer_is_guarded
 
 def test_bodies_and_commands_are_checked(client, session):
     for body in ("{", '{"do": "undo"}', '{"do": "fly"}', "{}"):
-        answer = client.post(f"/{TOKEN}/edit", content=body)
+        answer = client.post(f"/{TOKEN}/level/0/edit", content=body)
         assert answer.status_code == 400, answer.text
         assert "\n" not in answer.json()["error"]
-    assert client.get(f"/{TOKEN}/view/99").status_code == 400
-    assert client.get(f"/{TOKEN}/export/floppy").status_code == 400
+    assert client.get(f"/{TOKEN}/level/0/view/99").status_code == 400
+    assert client.get(f"/{TOKEN}/level/0/export/floppy").status_code == 400
     assert not session.document.done
 
 
 def test_a_failure_of_the_program_is_one_line(session):
     session.edit = lambda command: {}[0]
-    answer = post(TestClient(application(session, TOKEN), base_url=BASE), "edit", {"do": "undo"})
+    answer = post(TestClient(application([session], TOKEN), base_url=BASE), "edit", {"do": "undo"})
     assert (answer.status_code, answer.json()) == (500, {"error": "unexpected KeyError: 0"})
 
 
@@ -103,26 +103,26 @@ def test_what_a_session_says_arrives(client, session, tmp_path, monkeypatch):
     temporary.mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(temporary))
     first = session.revision
-    assert client.get(f"/{TOKEN}/state").json() == session.state()
-    assert client.get(f"/{TOKEN}/poll").json() == session.progress()
-    assert client.get(f"/{TOKEN}/view/2").json() == {"demo": session.demo(2), "state": session.state()}
-    assert client.get(f"/{TOKEN}/demo/2/nearest/5").json() == session.nearest(2, 5)
+    assert client.get(f"/{TOKEN}/level/0/state").json() == session.state()
+    assert client.get(f"/{TOKEN}/level/0/poll").json() == session.progress()
+    assert client.get(f"/{TOKEN}/level/0/view/2").json() == {"demo": session.demo(2), "state": session.state()}
+    assert client.get(f"/{TOKEN}/level/0/demo/2/nearest/5").json() == session.nearest(2, 5)
     said = post(client, "edit", {"do": "name", "demo": 1, "step": 4, "option": 3}).json()
     assert (said["revision"] > first, said["demo"], said["done"]) == (True, 1, True)
     while session.behind:
         time.sleep(0.01)
-    assert client.get(f"/{TOKEN}/state").json() == session.state()
+    assert client.get(f"/{TOKEN}/level/0/state").json() == session.state()
     assert post(client, "save", {}).json() == {"message": session.save()}
-    sent = client.get(f"/{TOKEN}/export/csv")
+    sent = client.get(f"/{TOKEN}/level/0/export/csv")
     assert "segments.csv" in sent.headers["content-disposition"]
     assert len(sent.text.splitlines()) == 1 + sum(session.demos.lengths)
-    sent = client.get(f"/{TOKEN}/export/elan")
+    sent = client.get(f"/{TOKEN}/level/0/export/elan")
     assert "segments.zip" in sent.headers["content-disposition"]
     assert {*ZipFile(BytesIO(sent.content)).namelist()} >= {f"{name}.eaf" for name in session.demos.names}
-    client.get(f"/{TOKEN}/export/floppy")
+    client.get(f"/{TOKEN}/level/0/export/floppy")
     assert not list(temporary.iterdir()), "an export leaves files behind"
     assert post(client, "refit", {}).status_code == 200
-    assert client.get(f"/{TOKEN}/poll").json()["refit"]["running"]
+    assert client.get(f"/{TOKEN}/level/0/poll").json()["refit"]["running"]
 
 
 def test_a_port_that_is_taken_is_named_and_tokens_differ():
@@ -147,7 +147,7 @@ def test_an_interrupt_saves_and_ends_with_one_line(run, file, tmp_path):
         with httpx2.Client(base_url=address, trust_env=False) as client, socket.socket() as idle:
             idle.connect(("127.0.0.1", httpx2.URL(address).port))
             asked = {"do": "paint", "demo": 0, "start": 0, "stop": 5, "option": 2}
-            assert client.post("edit", json=asked).status_code == 200
+            assert client.post("level/0/edit", json=asked).status_code == 200
             process.terminate()
             said, err = process.communicate(timeout=HANGS)
     assert (process.returncode, err) == (0, "")

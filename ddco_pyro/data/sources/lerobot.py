@@ -19,9 +19,9 @@ import cv2
 import numpy as np
 
 from ddco_pyro.data.arrays import PICTURES, LazyArray, Observed, channels_last, turned
-from ddco_pyro.data.demonstration import Attribute, Demonstration
+from ddco_pyro.data.demonstration import DIMENSION_NAMES, Attribute, Demonstration
 from ddco_pyro.data.errors import DemonstrationsError, damaged
-from ddco_pyro.data.labels import LABEL_NAMES
+from ddco_pyro.data.labels import EXCLUDE, LABEL_NAMES, SOURCE, UNKNOWN
 from ddco_pyro.data.sources import Source
 from ddco_pyro.data.sources.metadata import (
     check_count,
@@ -55,6 +55,8 @@ SUBTASK, TASK = "subtask_index", "task_index"
 MOST_NAMES = 10_000
 """Most tasks, or subtasks, that have names."""
 ANNOTATIONS = Path("meta") / "lerobot_annotations.json"
+WHO = "subtask" + SOURCE
+"""The column, and the label, of who says what a step's subtask is, where a person labelled."""
 IMAGES_AT_ONCE = 32
 _NO_CONTROL = {"timestamp", "frame_index", "episode_index", "index", "task_index", "image", "video", "string"}
 """Names and types of features that are never the control."""
@@ -94,11 +96,14 @@ class LeRobot:
         self._episodes = _episodes(folder)
         check_count(folder, self.info.get("total_episodes"), len(self._episodes), "meta/episodes")
         self._frequency = rate({"fps": self.info.get("fps")})
-        self._annotated, subtasks = self._annotations() if SUBTASK not in self.features else ({}, [])
+        self._noted, self._annotated = dict[int, dict[str, Any]](), dict[int, list[tuple[int, int]]]()
+        subtasks = self._annotations() if SUBTASK not in self.features else []
         changing = any(len(row.get("tasks") or ()) > 1 for row in self._episodes.values())
         self._labels = {"subtask": SUBTASK} | ({"task": TASK} if changing else {})
         names = {name: self._named(name) for name in self._labels}
         names |= {"subtask": subtasks} if subtasks else {}
+        if WHO in self.features:
+            self._labels[WHO], names[WHO] = WHO, self.features[WHO].get("names")
         self._names = {name: each for name, each in names.items() if each}
         files = {self._path("data_path", index, "data") for index in self._episodes}  # some may be missing
         self.data_files = tuple(sorted(path.relative_to(folder) for path in files))
@@ -108,11 +113,16 @@ class LeRobot:
         about: dict[str, Attribute] = {"robot_type": robot} if isinstance(robot, str) else {}
         if self._names:
             about[LABEL_NAMES] = json.dumps(self._names)
+        keys = {**self.keys, **({self._actions[0]: "control"} if len(self._actions) == 1 else {})}
+        named = {key: _dimensions(self.features[feature]) for feature, key in keys.items()}
+        about[DIMENSION_NAMES] = json.dumps({key: each for key, each in named.items() if each})
+        left_out = tuple(f"demo_{index}" for index, noted in self._noted.items() if noted.get(EXCLUDE))
         meta = sorted((folder / "meta").rglob("*.parquet"))
         more = (folder / path for path in (ANNOTATIONS, *self.data_files))
         files = (folder / "meta" / "info.json", *meta, *(path for path in more if path.is_file()))
         names = tuple(f"demo_{index}" for index in self._episodes)
-        return Source(names, self._read, files, {}, self._frequency, about, self.keys)
+        masks = {EXCLUDE: left_out} if left_out else {}
+        return Source(names, self._read, files, masks, self._frequency, about, self.keys)
 
     def _check_actions(self) -> None:
         types = {name: about.get("dtype") if isinstance(about, dict) else None for name, about in self.features.items()}
@@ -126,21 +136,27 @@ class LeRobot:
                     f"{', '.join(there) or 'none'}; import the control with --action{such}"
                 )
 
-    def _annotations(self) -> tuple[dict[int, list[tuple[int, int]]], list[str]]:
-        """The subtasks of each annotated episode as (first step, number of its name), and the names."""
+    def _annotations(self) -> list[str]:
+        """Read the subtasks of each annotated episode as (first step, number of its name), -1 for none.
+
+        :returns: the names.
+        """
         path = self.folder / ANNOTATIONS
         if not path.is_file() or self._frequency is None:
-            return {}, []
-        names, found = dict[str, int](), dict[int, list[tuple[int, int]]]()
+            return []
+        names = dict[str, int]()
         try:
             for episode, noted in json.loads(path.read_text(encoding="utf-8"))["episodes"].items():
-                atoms = [atom for atom in noted.get("atoms", ()) if atom["style"] == "subtask" and atom["content"]]
+                atoms = [atom for atom in noted.get("atoms", ()) if atom["style"] == "subtask"]
+                self._noted[int(episode)] = noted
                 for atom in sorted(atoms, key=lambda atom: float(atom["timestamp"])):
-                    number = names.setdefault(str(atom["content"]), len(names))
-                    found.setdefault(int(episode), []).append((round(atom["timestamp"] * self._frequency), number))
+                    text = atom["content"]
+                    number = names.setdefault(str(text), len(names)) if text else UNKNOWN
+                    start = round(atom["timestamp"] * self._frequency)
+                    self._annotated.setdefault(int(episode), []).append((start, number))
         except (*_DAMAGE, AttributeError, OverflowError, RecursionError) as error:
             raise damaged(path, "", error) from error
-        return found, list(names)
+        return list(names)
 
     def _named(self, kind: str) -> list[str]:
         """The names of tasks, or subtasks, by number; empty where no table names them."""
@@ -192,6 +208,8 @@ class LeRobot:
         about: dict[str, Attribute] = {"episode_index": index}
         if isinstance(tasks, Sequence) and len(tasks):
             about["task"] = "; ".join(map(str, tasks))
+        noted = self._noted.get(index, {})
+        about |= {key: noted[key] for key in ("flag", "note") if isinstance(noted.get(key), bool | str)}
         return Demonstration.stored(name, observations, joined(controls, f"{self.folder}: {name}"), labels, about)
 
     def _check(self, rows: _Rows, index: int) -> None:
@@ -335,6 +353,14 @@ def _episodes(folder: Path) -> dict[int, dict[str, Any]]:
     if not episodes:
         raise DemonstrationsError(f"{folder}: meta/episodes holds no episodes; at least one is needed")
     return dict(sorted(episodes.items()))
+
+
+def _dimensions(feature: dict[str, Any]) -> list[str]:
+    """The names of a vector's dimensions; empty where there are none."""
+    names = feature.get("names")
+    if isinstance(names, dict):
+        names = next((each for each in names.values() if isinstance(each, list)), None)
+    return [str(name) for name in names or ()] if len(feature["shape"]) == 1 else []
 
 
 def _info(path: Path) -> dict[str, Any]:

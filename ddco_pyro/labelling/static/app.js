@@ -1,15 +1,16 @@
 // The page: what the server says, what a person does, and the keys.
 import { Look, element, onScheme, percent, within } from "./drawing.js";
-import { List, Options, alike, optionName, readout, summary } from "./panels.js";
+import { List, Options, Signals, agrees, alike, optionName, readout, summary } from "./panels.js";
 import { Timeline } from "./timeline.js";
 
 const $ = id => document.getElementById(id), EVERY = 1000, SOON = 150, ALIKE = 250;
-let state = null, demo = null, wanted = null, cursor = 0, playing = null, painting = null, moving = null, waiting = Promise.resolve(), asked = 0, silent = false;
+const SPEEDS = [.25, .5, 1, 2, 4];
+let level = 0, state = null, demo = null, wanted = null, cursor = 0, playing = null, painting = null, moving = null, waiting = Promise.resolve(), asked = 0, silent = false, looping = false, fromHere = false;
 
 async function ask(path, body) {
   let answer, found;
   try {
-    answer = await fetch(path, body === undefined ? {} : { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
+    answer = await fetch(`level/${level}/${path}`, body === undefined ? {} : { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
     found = await answer.json();
   } catch { throw new Error(body === undefined ? "the server does not answer" : "the server does not answer; what you did last may be lost"); }
   if (!answer.ok) throw new Error(found.error);
@@ -31,16 +32,22 @@ const seek = step => {
 };
 async function neighbours() {
   const { index } = demo, segment = within(demo.segments, cursor), found = await tried(() => ask(`demo/${index}/nearest/${cursor}`));
-  if (found && demo.index === index && within(demo.segments, cursor).start === segment.start) alike($("nearest"), state, found, demo.pictures, (other, step) => open(other, step));
-  history.replaceState(null, "", `#${index}/${cursor}`);
+  if (found && demo.index === index && within(demo.segments, cursor).start === segment.start) alike($("nearest"), state, found, demo.cameras.length && `level/${level}`, (other, step) => open(other, step));
+  history.replaceState(null, "", `#${index}/${cursor}${level ? `/${level}` : ""}`);
 }
 
-const timeline = new Timeline($("timeline"), { seek, split: step => edit({ do: "split", demo: demo.index, step }), drop, menu: (x, y) => menu(x, y) });
+const timeline = new Timeline($("timeline"), { seek, split: step => edit({ do: "split", demo: demo.index, step }), drop, menu: (x, y) => menu(x, y), level: number => enter(number), other: (other, x, y) => compare(other, x, y) });
 const look = new Look($("look"), 280, 190);
-const list = new List($("list"), $("find"), $("count"), index => open(index));
+const list = new List($("list"), $("find"), $("sort"), $("filter"), $("count"), index => open(index));
 const options = new Options($("options"), {
   name: number => act(number), rename: (number, text) => edit({ do: "rename", option: number, text }), add: text => edit({ do: "new", text }),
+  colour: (number, colour) => edit({ do: "colour", option: number, colour }),
+  more: (number, x, y) => popup(x, y, option(number), [
+    ...state.names.map((name, n) => [`Merge into ${name}`, () => edit({ do: "drop", option: number, into: n + 1 }, `${option(number)} merged into ${name}, seen`)]).filter((_, n) => n + 1 !== number),
+    ["Delete", () => edit({ do: "drop", option: number }, `${option(number)} deleted, seen`)],
+  ]),
 });
+const signals = new Signals($("signals"), () => { timeline.show(demo, state, signals.chosen); });
 function render(keep = true) {
   document.title = `Labelling ${state.title}`;
   $("title").textContent = state.title;
@@ -51,11 +58,17 @@ function render(keep = true) {
   document.querySelector("[data-do=redo]").disabled = !state.can_redo;
   list.show(state, demo.index, keep);
   options.show(state);
-  const { name, accepted, held_out: held, reason } = state.demos[demo.index];
+  const { name, accepted, held_out: held, reason, marks, people, done_by: done } = state.demos[demo.index];
   $("name").textContent = name;
+  $("task").textContent = demo.task;
+  for (const mark of ["exclude", "flag"]) document.querySelector(`[data-do=${mark}]`).setAttribute("aria-pressed", marks[mark] === true);
+  if (document.activeElement !== $("note")) $("note").value = marks.note ?? "";
+  document.querySelector("[data-do=from_here]").setAttribute("aria-pressed", fromHere);
+  document.querySelector("[data-do=loop]").setAttribute("aria-pressed", looping);
+  $("scratch").hidden = !state.scratch;
   document.querySelector("[data-do=accept]").hidden = accepted; document.querySelector("[data-do=reopen]").hidden = !accepted;
-  $("reason").textContent = [accepted && "accepted", held && "held out", reason].filter(Boolean).join(" · ");
-  timeline.show(demo, state); look.show(demo, demo.segments, state.colours);
+  $("reason").textContent = [marks.exclude && "excluded", accepted && "accepted", held && "held out", people.length && `of ${people.join(" and ")}`, done.length && `accepted by ${done.join(", ")}`, reason].filter(Boolean).join(" · ");
+  signals.show(demo.numbers?.names ?? []); timeline.show(demo, state, signals.chosen); look.show(demo, demo.segments, state.colours, `level/${level}`);
   $("timeline").setAttribute("aria-valuemin", 0); $("timeline").setAttribute("aria-valuemax", demo.steps - 1);
   seek(cursor);
 }
@@ -72,20 +85,31 @@ function status({ refit, warnings, dirty }) {
 async function show(index, step, keep = true) {
   wanted = { index, step: step ?? (index === wanted?.index ? wanted.step : undefined), keep };
   const found = await ask(`view/${index}`);
-  if (found.demo.index !== wanted.index || found.state.revision < (state?.revision ?? 0)) return;
+  if (found.demo.index !== wanted.index || found.state.levels[level] !== found.state.level || found.state.revision < (state?.revision ?? 0)) return;
   if (state && state.refit.done < found.state.refit.done) say(`Refit ${found.state.refit.done} is done${change(state.summary, found.state.summary)}`);
   [state, demo, silent, cursor] = [found.state, found.demo, false, wanted.step ?? cursor];
   wanted.step = undefined;
   render(wanted.keep && list.active === index);
 }
 async function begin() {
-  const found = await ask("state"), [, index, step] = location.hash.match(/^#(\d+)\/(\d+)$/) ?? [];
+  const [, index, step, on] = location.hash.match(/^#(\d+)\/(\d+)(?:\/(\d+))?$/) ?? [];
+  level = Number(on ?? 0);
+  const found = await ask("state");
   if (index < found.demos.length) await show(Number(index), Number(step)); else await show(found.order[0], 0);
 }
 const open = (index, step = 0, keep = true) => tried(async () => { stop(); await show(index, step, keep); });
 
+const enter = number => tried(async () => {  // another level of the same demonstration
+  if (number === level) return;
+  stop();
+  [level, state] = [number, null];
+  await show(demo.index, cursor);
+  say(`Level ${state.level}`);
+});
+const compare = ({ annotator, agreement }, x, y) => popup(x, y, annotator, [[`Take the labels of ${annotator}${agreement ? `: ${agrees(agreement)}` : ""}`, () => edit({ do: "take", demo: demo.index, annotator }, `Labels of ${annotator} taken`)]]);
+
 // One edit after the other: each is in the journal when the server answers.
-const DONE = { undo: "Undone", redo: "Done again", split: "Split", merge: "Merged", open: "Left open", move: "Moved", rename: "Renamed", new: "New option", accept: "Accepted", reopen: "Taken back" };
+const DONE = { undo: "Undone", redo: "Done again", split: "Split", merge: "Merged", open: "Left open", move: "Moved", rename: "Renamed", new: "New option", accept: "Accepted", reopen: "Taken back", mark: "Marked", colour: "Coloured", drop: "Dropped", scratch: "Open from the first step", take: "Taken" };
 const edit = (command, words) => waiting = waiting.then(() => tried(async () => {
   const made = typeof command === "function" ? command() : command, at = wanted.index;
   if (!made) return false;
@@ -94,14 +118,16 @@ const edit = (command, words) => waiting = waiting.then(() => tried(async () => 
   say(found.done ? `${words ?? DONE[made.do]} in ${state.demos[found.demo ?? at].name}` : "That changes nothing");
   return found.done;
 }));
-const act = number => edit({ do: "name", demo: demo.index, step: cursor, option: number }, option(number));
+const act = number => edit({ do: "name", demo: demo.index, step: cursor, option: number, from_here: fromHere }, option(number));
+const mark = (name, value) => edit({ do: "mark", demo: demo.index, mark: name, value });
+const toggle = name => mark(name, !state.demos[demo.index].marks[name]);
 const everywhere = number => edit({ do: "everywhere", demo: demo.index, step: cursor, option: number }, `${option(number)} everywhere, as`);
 function drop({ boundary, to }) {
   return boundary === to ? timeline.hold(null) : edit({ do: "move", demo: demo.index, boundary, to }).then(done => { timeline.hold(null); if (done) seek(Math.min(to, demo.steps - 1)); });
 }
 function accept() {  // what is seen; what is accepted stays so
   const { index } = demo, next = () => {
-    const other = state.order.find(one => !state.demos[one].accepted);
+    const other = state.order.find(one => !state.demos[one].accepted && !state.demos[one].marks.exclude);
     if (other === undefined) say("All demonstrations are accepted"); else open(other, 0, false);
   };
   if (state.demos[index].accepted) { next(); return; }
@@ -135,12 +161,13 @@ function release() {  // of what is held: a boundary that moves, or a number tha
 function play() {
   if (playing) { stop(); return; }
   if (cursor >= demo.steps - 1) seek(0);
-  const begin = { step: cursor, time: performance.now() };
+  const { start, stop: end } = within(demo.segments, cursor), begin = { step: cursor, time: performance.now() };
   playing = begin;
   document.querySelector("[data-do=play]").textContent = "Stop";
   const turn = now => {
     if (playing !== begin) return;
     const rate = (state.frequency ?? 20) * Number($("speed").value), at = begin.step + Math.floor(Math.max(now - begin.time, 0) / 1000 * rate);
+    if (looping && !painting && at >= end) { [begin.step, begin.time] = [start, now]; seek(start); requestAnimationFrame(turn); return; }
     if (at !== cursor) seek(at);
     if (painting) timeline.hold({ start: painting.start, stop: cursor + 1, option: painting.option });
     if (at >= demo.steps - 1) { stop(); return; }
@@ -174,13 +201,14 @@ function popup(x, y, name, items) {  // a menu of [text, work]
     event.preventDefault();
   };
 }
+const speed = by => { const at = Math.min(Math.max(SPEEDS.indexOf(Number($("speed").value)) + by, 0), SPEEDS.length - 1); $("speed").value = SPEEDS[at]; if (playing) { play(); play(); } say(`Speed ${SPEEDS[at]} ×`); };
 const menu = (x, y) => popup(x, y, "Segment", [
   ...state.names.map((name, n) => [`${n + 1}  ${name}`, () => act(n + 1)]), ["New option …", () => options.added.focus()],
-  ["Split here  S", commands.split], ["Merge with the next  M", commands.merge], ["Leave open  0", commands.open], ["Accept all  Enter", commands.accept],
+  ["Split here  S", commands.split], ["Merge with the next  M", commands.merge], ["Leave open  0", commands.open], ["Begin from scratch", commands.scratch], ["Accept all  Enter", commands.accept],
 ]);
 addEventListener("pointerdown", event => { if (!$("menu").contains(event.target)) $("menu").hidden = true; });
 const download = format => tried(async () => {  // leaves the page where it is
-  const answer = await fetch(`export/${encodeURIComponent(format)}`);
+  const answer = await fetch(`level/${level}/export/${encodeURIComponent(format)}`);
   if (!answer.ok) throw new Error((await answer.json()).error);
   const name = answer.headers.get("content-disposition").match(/filename="?([^";]+)/)[1], url = URL.createObjectURL(await answer.blob());
   element("a", { href: url, download: name }).click();
@@ -195,19 +223,24 @@ const commands = {
   cancel: () => tried(async () => { if (!state.refit.running) { say("Nothing is under way"); return; } await ask("cancel", {}); await poll(); say("Cancelled; what is shown stays"); }),
   save: () => tried(async () => { say((await ask("save", {})).message); status(Object.assign(state, { dirty: false })); }),
   export: () => { const { left, bottom } = document.querySelector("[data-do=export]").getBoundingClientRect(); popup(left, bottom, "Export", state.formats.map(name => [name, () => download(name)])); },
+  exclude: () => toggle("exclude"), flag: () => toggle("flag"), note: () => $("note").focus(),
+  from_here: () => { fromHere = !fromHere; render(); say(fromHere ? "A name goes from the cursor to the end of the segment" : "A name is of the whole segment"); },
+  scratch: () => edit({ do: "scratch", demo: demo.index }).then(() => { fromHere = true; seek(0); render(); }),
+  loop: () => { looping = !looping; render(); say(looping ? "Playing repeats the segment" : "Playing goes on to the end"); }, slower: () => speed(-1), faster: () => speed(1),
   help: () => $("help").showModal(), find: () => $("find").focus(),
   closer: () => timeline.zoom(.5), wider: () => timeline.zoom(2), all: () => timeline.all(),
   next: () => seek(boundaries().find(step => step > cursor) ?? cursor), previous: () => seek(boundaries().reverse().find(step => step < cursor) ?? 0),
 };
 const KEYS = {
-  " ": "play", j: "next", k: "previous", s: "split", m: "merge", Enter: "accept", g: "uncertain", u: "undo", "/": "find", "?": "help", "+": "closer", "=": "closer", "-": "wider", a: "all", r: "refit", c: "cancel",
+  " ": "play", j: "next", k: "previous", s: "split", m: "merge", Enter: "accept", g: "uncertain", u: "undo", "/": "find", "?": "help", "+": "closer", "=": "closer", "-": "wider", a: "all", r: "refit", c: "cancel", x: "exclude", f: "flag", n: "note", t: "from_here", l: "loop", ",": "slower", ".": "faster",
 };
+$("note").onchange = () => mark("note", $("note").value.trim());
 for (const button of document.querySelectorAll("[data-do]")) button.addEventListener("click", event => {
   commands[button.dataset.do]();
   if (event.detail && demo && !["help", "export"].includes(button.dataset.do)) $("timeline").focus();  // a click leaves the keys to the time line
 });
 addEventListener("keydown", event => {
-  const { target, key, code, shiftKey } = event, digit = code.match(/^(?:Digit|Numpad)(\d)$/)?.[1], typed = target.matches("input:not([type=range]), textarea, select");
+  const { target, key, code, shiftKey } = event, digit = code.match(/^(?:Digit|Numpad)(\d)$/)?.[1], typed = target.matches("input:not([type=range], [type=checkbox], [type=color]), textarea, select");
   if (event.defaultPrevented || $("help").open || !state) return;
   if (typed) { if (key === "Escape" && target !== $("find")) $("timeline").focus(); return; }
   const alone = !event.ctrlKey && !event.metaKey && !event.altKey, graphic = alone || event.getModifierState("AltGraph");

@@ -65,20 +65,26 @@ export function row(context, segments, { place, edge, top, height, colours, name
   }
 }
 
-export class Look {  // a demonstration at a step: its picture, and its path in the colours of the segments
+export class Look {  // a demonstration at a step: its pictures, and its path in the colours of the segments
   constructor(root, width, height) {
-    Object.assign(this, { width, height, wanted: -1, shown: -1, step: 0 });
-    this.picture = element("img", { alt: "", hidden: true, height });
+    Object.assign(this, { root, width, height, cameras: [], step: 0 });
     this.path = element("canvas", { hidden: true });
     Object.assign(this.path.style, { width: `${width}px`, height: `${height}px` });
-    root.replaceChildren(this.picture, this.path);
-    this.picture.onload = this.picture.onerror = () => { this.loading = false; this.load(); };
+    root.replaceChildren(this.path);
   }
-  show(demo, segments, colours) {
-    const { view, paths, numbers } = demo;
-    Object.assign(this, { demo, shown: -1, drawn: null });
-    this.picture.hidden = !demo.pictures; this.path.hidden = !(view && paths?.length);
-    this.picture.alt = `Picture of ${demo.name} at the cursor`;
+  camera(name, number) {
+    const picture = element("img"), made = { picture, number, shown: "", box: element("figure", {}, picture, element("figcaption", { textContent: name })) };
+    picture.onload = picture.onerror = () => { made.loading = false; this.load(made); };
+    this.path.before(made.box);
+    return made;
+  }
+  show(demo, segments, colours, place) {
+    const { view, paths, numbers, cameras } = demo;
+    Object.assign(this, { demo, place, drawn: null });
+    if (String(cameras) !== this.names) { this.cameras.forEach(({ box }) => box.remove()); this.cameras = cameras.map((name, number) => this.camera(name, number)); this.names = String(cameras); }
+    this.root.classList.toggle("several", cameras.length > 1);
+    this.cameras.forEach(({ picture }, number) => { picture.alt = `Picture ${cameras[number]} of ${demo.name} at the cursor`; });
+    this.path.hidden = !(view && paths?.length);
     if (!this.path.hidden) {
       const runs = segments.map(({ start, stop, option, source }) => [start, stop, coloured(colours, source === "open" ? 0 : option)]);
       this.drawn = new Path(numbers.decoded ?? new Numbers(numbers, demo.steps), demo, runs, this.width, this.height);
@@ -88,11 +94,12 @@ export class Look {  // a demonstration at a step: its picture, and its path in 
   at(step) {
     this.step = step;
     this.drawn?.draw(this.path, step, looks.paper, looks.ink);
-    this.load();
+    this.cameras.forEach(one => this.load(one));
   }
-  load() {  // one picture at a time, so that playing shows as many as come
-    if (!this.demo?.pictures || this.loading || this.shown === this.step) return;
-    this.loading = true; this.shown = this.step;
-    this.picture.src = `demo/${this.demo.index}/picture/${this.step}`;
+  load(camera) {  // one picture of a camera at a time, so that playing shows as many as come
+    const wanted = `${this.place}/demo/${this.demo.index}/picture/${camera.number}/${this.step}`;
+    if (camera.loading || camera.shown === wanted) return;
+    camera.loading = true; camera.shown = wanted;
+    camera.picture.src = wanted;
   }
 }

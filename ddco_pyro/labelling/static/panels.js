@@ -7,9 +7,10 @@ const swatch = colour => { const made = element("span", { className: "swatch" })
 export const optionName = (state, option, source) => source === "open" ? "open" : option ? state.names[option - 1] ?? `option ${option}` : "control";
 
 export class List {  // all demonstrations, the most informative first, each with its segments
-  constructor(root, find, count, open) {
-    Object.assign(this, { root, find, count, open, rows: [], order: [] });
-    find.oninput = () => this.filter();
+  constructor(root, find, sort, only, count, open) {
+    Object.assign(this, { root, find, sort, only, count, open, rows: [], order: [] });
+    find.oninput = only.onchange = () => this.filter();
+    sort.onchange = () => { this.order = []; this.show(this.state, this.active, false); };
     find.onkeydown = event => {
       const first = this.shown()[0];
       if (event.key === "Escape") { find.value = ""; this.filter(); root.focus(); }
@@ -29,8 +30,12 @@ export class List {  // all demonstrations, the most informative first, each wit
   }
   shown() { return this.order.filter(index => !this.rows[index].row.hidden); }
   filter() {
-    const words = this.find.value.trim().toLowerCase();
-    this.rows.forEach(({ row, name }) => { row.hidden = !name.textContent.toLowerCase().includes(words); });
+    const words = this.find.value.trim().toLowerCase(), { demos, annotator } = this.state;
+    const kinds = {
+      all: () => true, left: one => !one.accepted && !one.marks.exclude, mine: one => !one.people.length || one.people.includes(annotator),
+      two: one => one.accepted && one.done_by.length, flag: one => one.marks.flag, note: one => one.marks.note, exclude: one => one.marks.exclude,
+    };
+    this.rows.forEach(({ row, name }, index) => { row.hidden = !(name.textContent.toLowerCase().includes(words) && kinds[this.only.value](demos[index])); });
     this.draw();
   }
   show(state, active, keep) {  // keep: the order stays until another demonstration is opened
@@ -40,11 +45,11 @@ export class List {  // all demonstrations, the most informative first, each wit
       row.setAttribute("role", "option"); row.dataset.index = index;
       return { row, name, mark, reason, canvas };
     });
-    if (!keep || !this.order.length) { this.order = state.order; this.root.replaceChildren(...state.order.map(index => this.rows[index].row)); }
+    if (!keep || !this.order.length) { this.order = this.sorted(state); this.root.replaceChildren(...this.order.map(index => this.rows[index].row)); }
     state.demos.forEach((demo, index) => {
       const { row, mark, reason } = this.rows[index], changed = demo.changed && index !== active;
       row.setAttribute("aria-selected", index === active);
-      mark.textContent = [demo.accepted && "✓ accepted", changed && "● changed", demo.held_out && "held out"].filter(Boolean).join("  ");
+      mark.textContent = [demo.marks.exclude && "✗ excluded", demo.marks.flag && "⚑", demo.marks.note && "✎", demo.accepted && "✓ accepted", changed && "● changed", demo.held_out && "held out"].filter(Boolean).join("  ");
       reason.textContent = demo.accepted ? `${demo.steps} steps` : demo.reason;
     });
     this.state = state;
@@ -52,7 +57,12 @@ export class List {  // all demonstrations, the most informative first, each wit
     this.root.setAttribute("aria-activedescendant", `demo-${active}`);
     if (this.active !== active) this.rows[active].row.scrollIntoView({ block: "nearest" });
     this.active = active;
-    this.draw();
+    this.filter();
+  }
+  sorted({ order, demos }) {
+    const by = { wrong: one => -one.expected_wrong, long: one => -one.steps, short: one => one.steps }[this.sort.value];
+    if (this.sort.value === "name") return demos.map((_, index) => index);
+    return by ? [...order].sort((a, b) => by(demos[a]) - by(demos[b])) : order;
   }
   draw() {
     if (!this.state) return;
@@ -68,7 +78,7 @@ export class List {  // all demonstrations, the most informative first, each wit
 }
 
 export class Options {  // names of the options: a key or a click names the segment, a text renames the option
-  constructor(root, calls) {  // calls: name(option), rename(option, text), add(text)
+  constructor(root, calls) {  // calls: name(option), rename(option, text), add(text), colour(option, colour), more(option, x, y)
     Object.assign(this, { root, calls, rows: [] });
     this.added = element("input", { placeholder: "new option", maxLength: 60 });
     this.added.setAttribute("aria-label", "Name of a new option");
@@ -83,20 +93,41 @@ export class Options {  // names of the options: a key or a click names the segm
     while (this.rows.length > names.length) this.rows.pop().row.remove();
     while (this.rows.length < names.length) this.rows.push(this.row(this.rows.length + 1));
     this.rows.forEach(({ button, colour, input }, n) => {
-      colour.style.background = colours[n];
+      colour.value = colours[n];
       button.setAttribute("aria-label", `Name the segment ${names[n]}`);
       if (input.known !== names[n]) input.value = input.known = names[n];
     });
   }
   row(number) {
-    const colour = swatch(""), button = element("button", { type: "button", title: `Name the segment under the cursor (${number})`, onclick: () => this.calls.name(number) }, colour, String(number));
+    const button = element("button", { type: "button", textContent: number, title: `Name the segment under the cursor (${number})`, onclick: () => this.calls.name(number) });
+    const colour = element("input", { type: "color", onchange: () => this.calls.colour(number, colour.value) });
     const input = element("input", { maxLength: 60, onchange: async () => { if (!await this.calls.rename(number, input.value)) input.value = input.known; } });
+    const more = element("button", { type: "button", textContent: "⋯", title: "Merge or delete", onclick: ({ clientX, clientY }) => { const box = more.getBoundingClientRect(); this.calls.more(number, clientX || box.left, clientY || box.bottom); } });
     input.setAttribute("aria-label", `Name of option ${number}`);
-    const row = element("div", {}, button, input);
+    colour.setAttribute("aria-label", `Colour of option ${number}`); more.setAttribute("aria-label", `Merge or delete option ${number}`);
+    const row = element("div", {}, button, colour, input, more);
     this.root.lastChild.before(row);
     return { row, button, colour, input };
   }
 }
+
+const FEW = 6;
+
+export class Signals {  // which numbers are drawn over time
+  constructor(root, changed) { Object.assign(this, { root, changed, names: null, off: new Set() }); }
+  get chosen() { return this.names.map((_, row) => row).filter(row => !this.off.has(this.names[row])); }
+  show(names) {
+    if (String(names) === String(this.names)) return;
+    if (!this.names) this.off = new Set(names.slice(FEW));
+    this.names = names;
+    this.root.replaceChildren(...names.map(name => {
+      const box = element("input", { type: "checkbox", checked: !this.off.has(name), onchange: () => { this.off[box.checked ? "delete" : "add"](name); this.changed(); } });
+      return element("label", {}, box, name);
+    }));
+  }
+}
+
+export const agrees = ({ kappa, boundary_f1: f1, same }) => `κ ${kappa === null ? "–" : kappa.toFixed(2)}, boundary F1 ${f1.toFixed(2)}, same names ${percent(same)}`;
 
 export function readout(root, state, demo, cursor) {
   const segment = within(demo.segments, cursor), rate = state.frequency, boundary = demo.boundaries.find(one => one.step === segment.start), lines = [];
@@ -107,25 +138,31 @@ export function readout(root, state, demo, cursor) {
   lines.push(["steps", `${segment.start} to ${segment.stop - 1}`]);
   if (boundary && !boundary.said && boundary.high > boundary.low) lines.push(["begins at", `${boundary.low} to ${boundary.high}`]);
   for (const level of demo.upper) {
-    const option = level.segments[last(level.segments.map(one => one.start), cursor)].option;
-    lines.push([level.level, option ? level.names[option - 1] : "control", coloured(level.colours, option)]);
+    const { option, source } = level.segments[last(level.segments.map(one => one.start), cursor)];
+    lines.push([level.name, optionName(level, option, source), coloured(level.colours, option)]);
+  }
+  for (const other of demo.others) {
+    const { option, source } = other.segments[last(other.segments.map(one => one.start), cursor)];
+    lines.push([other.annotator, source === "open" ? "–" : other.names[option - 1], source === "open" ? null : coloured(other.colours, option)]);
+    if (other.agreement) lines.push(["", agrees(other.agreement)]);
   }
   const numbers = (demo.numbers?.names ?? []).map((name, row) => [name, demo.numbers.decoded.value(row, cursor).toPrecision(3)]);
   const term = ([name, value, colour]) => element("div", {}, element("dt", { textContent: name }), element("dd", {}, ...(colour ? [swatch(colour)] : []), value));
   root.replaceChildren(element("dl", {}, ...lines.map(term)), element("dl", { className: "numbers" }, ...numbers.map(term)));
 }
 
-export function summary(root, { summary, demos }) {
+export function summary(root, { summary, demos, team }) {
   const { expected_wrong: wrong, one_more: saved, labelled } = summary;
   root.textContent = wrong === null ? `${labelled} of ${demos.length} accepted` : `Expected wrong steps now ${percent(wrong)}`
     + (saved === null ? "" : `; one more demonstration saves ${(100 * saved).toFixed(1)}`);
+  for (const { name, done, of, agreement } of team) root.append(element("span", { className: "mark", textContent: `  ${name}: ${done} of ${of}${agreement ? `, ${agrees(agreement)}` : ""}` }));
 }
 
 export function alike(root, state, found, pictures, open) {
   root.hidden = !found.length;
   root.replaceChildren(element("h3", { textContent: "Alike elsewhere" }), element("div", { className: "bar" }, ...found.map(({ index, start, stop, option }) => {
     const { name } = state.demos[index], middle = (start + stop) >> 1;
-    const button = element("button", { type: "button" }, ...(pictures ? [element("img", { src: `demo/${index}/picture/${middle}`, alt: "", height: 72 })] : []),
+    const button = element("button", { type: "button" }, ...(pictures ? [element("img", { src: `${pictures}/demo/${index}/picture/0/${middle}`, alt: "", height: 72 })] : []),
       element("span", {}, swatch(coloured(state.colours, option)), `${name}, steps ${start} to ${stop - 1}, ${optionName(state, option)}`));
     button.onclick = () => open(index, start);
     return button;

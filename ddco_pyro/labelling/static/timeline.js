@@ -5,7 +5,7 @@ import { coloured, element, looks, row } from "./drawing.js";
 const GUTTER = 108, AXIS = 16, LANE = 18, MAIN = 34, BAND = 14, PLOT = 24, LEAST = 10, NEAR = 6;
 
 export class Timeline {
-  constructor(root, calls) {  // calls: seek(step), split(step), drop({boundary, to}), menu(step, x, y)
+  constructor(root, calls) {  // calls: seek(step), split(step), drop({boundary, to}), menu(x, y), level(number), other(other, x, y)
     Object.assign(this, { root, calls, from: 0, to: 1, cursor: 0, preview: null, asked: false, stale: true });
     this.canvas = element("canvas"); this.line = element("i", { className: "cursor" }); this.ghost = element("i", { className: "ghost", hidden: true });
     root.append(this.canvas, this.ghost, this.line);
@@ -28,14 +28,21 @@ export class Timeline {
       event.preventDefault();
     }, { passive: false });
   }
-  show(demo, state) {
+  show(demo, state, chosen) {
     if (this.demo?.index !== demo.index) [this.from, this.to] = [0, demo.steps];
     Object.assign(this, { demo, state });
     demo.heights ??= bytes(demo.probability);
     for (const one of demo.boundaries) one.heights ??= bytes(one.density);
     if (demo.numbers) demo.numbers.decoded ??= new Numbers(demo.numbers, demo.steps);
-    this.rows = demo.numbers?.names ?? [];
-    this.lanes = AXIS + demo.upper.length * (LANE + 3) + MAIN + BAND + 4;
+    let top = AXIS;
+    this.rows = chosen; this.bands = [];
+    const add = (lane, name, call) => { this.bands.push({ lane, name, top, call }); top += LANE + 3; };
+    const levels = above => demo.upper.filter(one => one.above === above).forEach(one => add(one, one.name, () => this.calls.level(one.level)));
+    levels(true);
+    for (const other of demo.others) add(other, other.annotator, (x, y) => this.calls.other(other, x, y));
+    this.main = top; top += MAIN + BAND + 4;
+    levels(false);
+    this.lanes = top;
     this.height = this.lanes + this.rows.length * PLOT;
     this.root.style.height = `${this.height}px`;
     this.redraw();
@@ -70,11 +77,13 @@ export class Timeline {
   }
   near(event) {  // the boundary that is pointed at
     const box = this.root.getBoundingClientRect(), x = event.clientX - box.left, y = event.clientY - box.top;
-    if (y > this.lanes || x < GUTTER) return null;
+    if (y < this.main || y > this.main + MAIN + BAND || x < GUTTER) return null;
     return this.demo.boundaries.map(one => [Math.abs(this.x(one.step) - x), one.step]).filter(([far]) => far <= NEAR).sort((a, b) => a[0] - b[0])[0]?.[1] ?? null;
   }
   down(event) {
     if (event.button || !this.demo) return;
+    const y = event.clientY - this.root.getBoundingClientRect().top, band = this.bands.find(({ top }) => y >= top && y < top + LANE);
+    if (band) { event.preventDefault(); event.stopPropagation(); band.call(event.clientX, event.clientY); return; }
     this.root.setPointerCapture(event.pointerId);
     const boundary = this.near(event);
     this.drag = { boundary };
@@ -102,7 +111,7 @@ export class Timeline {
     this.ghost.hidden = !held;
     if (!held) return;
     const [start, stop] = held.boundary === undefined ? [held.start, held.stop] : [held.boundary, held.to].sort((a, b) => a - b);
-    const left = Math.max(this.x(start), GUTTER), top = this.lanes - MAIN - BAND - 4, colours = this.state.colours;
+    const left = Math.max(this.x(start), GUTTER), top = this.main, colours = this.state.colours;
     const after = this.demo.segments[last(this.demo.segments.map(one => one.start), held.boundary - (held.to > held.boundary ? 1 : 0))];
     const colour = coloured(colours, held.option ?? after?.option ?? 0);
     Object.assign(this.ghost.style, { left: `${left}px`, width: `${Math.max(this.x(stop) - left, 1)}px`, top: `${top}px`, height: `${MAIN}px`, background: colour });
@@ -113,13 +122,12 @@ export class Timeline {
     const edge = Math.min(this.x(demo.steps), width), label = (text, y) => { context.fillStyle = looks.soft; context.fillText(text, 0, y, GUTTER - 8); };
     context.fillStyle = looks.soft;
     axis(context, this.from, this.to, place, state.frequency);
-    let top = AXIS;
-    for (const level of [...demo.upper].reverse()) {
-      label(level.level, top + LANE / 2);
-      row(context, level.segments, { place, edge, top, height: LANE, colours: level.colours, names: option => option ? level.names[option - 1] : "control" });
-      top += LANE + 3;
+    for (const { lane, name, top } of this.bands) {
+      label(name, top + LANE / 2);
+      row(context, lane.segments, { place, edge, top, height: LANE, colours: lane.colours, names: option => option ? lane.names[option - 1] : "control" });
     }
-    label(state.level, top + MAIN / 2);
+    let top = this.main;
+    label(demo.others.length ? state.annotator : state.level, top + MAIN / 2);
     const names = option => option ? state.names[option - 1] : "control";
     row(context, demo.segments, { place, edge, top, height: MAIN, colours: state.colours, names, heights: demo.heights });
     top += MAIN;
@@ -140,8 +148,7 @@ export class Timeline {
       context.fill();
     }
     context.restore();
-    top += BAND + 4;
-    this.rows.forEach((name, number) => this.plot(context, number, name, top + number * PLOT, width, label));
+    this.rows.forEach((number, place) => this.plot(context, number, demo.numbers.names[number], this.lanes + place * PLOT, width, label));
   }
   plot(context, number, name, top, width, label) {
     const { numbers, steps } = this.demo, values = numbers.decoded, wide = Math.min(width, this.x(steps)), pixel = Math.max(this.each, 1) / this.each;

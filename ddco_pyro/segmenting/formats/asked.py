@@ -27,6 +27,7 @@ class Asked:
     :param demos: the path of the demonstrations; ``source`` is the same, open.
     :param level: the level whose options are subtasks.
     :param baselines: names of further labels, ``<level>_<baseline>``.
+    :param annotator: who labelled; empty where no one did.
     :param same_order: leave out demonstrations whose options follow another order than most, rather than refuse.
     """
 
@@ -39,6 +40,7 @@ class Asked:
     level: str
     baselines: tuple[str, ...] = ()
     same_order: bool = False
+    annotator: str = ""
 
     @cached_property
     def names(self) -> list[str]:

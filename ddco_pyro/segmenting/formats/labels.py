@@ -10,12 +10,13 @@ from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
+import h5py
 import numpy as np
 
 from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.files import whole_file
 from ddco_pyro.data.hdf5 import attributes_of, opened, written
-from ddco_pyro.data.labels import BOUNDARY, LABEL_NAMES, SOURCE, label_names
+from ddco_pyro.data.labels import BOUNDARY, EXCLUDE, LABEL_NAMES, SOURCE, label_names
 from ddco_pyro.errors import BadInput
 from ddco_pyro.names import choice_names
 from ddco_pyro.segmenting.formats.asked import Asked
@@ -105,11 +106,29 @@ def write_labels(path: Path, out: Path, segmented: Segmented) -> None:
                     del group[name]
                 for name, values in labels.items():
                     group.create_dataset(name, data=values).attrs[OURS] = SIGNATURE
+                for mark in ("flag", "note"):
+                    file["data"][demo.name].attrs.pop(mark, None)
+                    if mark in (marks := segmented.marks.get(demo.name, {})):
+                        file["data"][demo.name].attrs[mark] = marks[mark]
+            _write_mask(file, [name for name, marks in segmented.marks.items() if EXCLUDE in marks])
             if (names := _names(segmented)) != label_names(attributes_of(file["data"]) | attributes_of(file)):
                 holder = file if LABEL_NAMES in file.attrs else file["data"]
                 holder.attrs[LABEL_NAMES] = json.dumps(names)
             if not in_place:
                 file.attrs[COPIED] = _digest(path)
+
+
+def _write_mask(file: h5py.File, left_out: list[str]) -> None:
+    """Write the mask of the demonstrations that a person leaves out, and take them out of other masks."""
+    masks = file.get("mask", {})
+    members = {mask: [name.decode() for name in masks[mask][()]] for mask in masks if mask != EXCLUDE}
+    kept = {mask: [name for name in own if name not in left_out] for mask, own in members.items()}
+    changed = {mask: own for mask, own in kept.items() if own != members[mask]}
+    for mask, own in {**changed, EXCLUDE: left_out}.items():
+        if mask in masks:
+            del file[f"mask/{mask}"]
+        if own:
+            file[f"mask/{mask}"] = np.array(own, "S")
 
 
 def _names(segmented: Segmented) -> dict[str, list[str]]:
@@ -132,16 +151,3 @@ def _copied_from(copy: Path) -> str | None:
     with suppress(DemonstrationsError), opened(copy) as file:
         return str(file.attrs.get(COPIED))
     return None
-
-
-def has_labels(path: Path, segmented: Segmented) -> bool:
-    """Whether a file has these labels and names."""
-    with opened(path) as file:
-        if label_names(attributes_of(file["data"]) | attributes_of(file)) != _names(segmented):
-            return False
-        for demo in segmented.segments:
-            group = file["data"].get(f"{demo.name}/labels", {}) if demo.name in file["data"] else {}
-            for name, values in labels_of(demo).items():
-                if name not in group or not np.array_equal(group[name], values):
-                    return False
-    return True

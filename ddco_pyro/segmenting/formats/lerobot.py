@@ -9,24 +9,35 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow
 from pyarrow import parquet
 
 from ddco_pyro.data.files import whole_folder, write_text
-from ddco_pyro.data.sources.lerobot import ANNOTATIONS, SUBTASK, LeRobot
+from ddco_pyro.data.labels import SOURCE, UNKNOWN
+from ddco_pyro.data.sources.lerobot import ANNOTATIONS, SUBTASK, WHO, LeRobot
 from ddco_pyro.data.sources.metadata import inside
 from ddco_pyro.errors import BadInput
 from ddco_pyro.segmenting.formats.asked import Asked, Run
-from ddco_pyro.segmenting.segments import Segmented
+from ddco_pyro.segmenting.segments import SOURCES, Segmented, Segments
 
 PERSISTENT, EVENTS = "language_persistent", "language_events"
 ATOM = ("role", "content", "style", "timestamp", "tool_calls")
+WHOSE = "subtask_annotator"
 
-
-FEATURES = {name: {"dtype": "language", "shape": [1], "names": None} for name in (PERSISTENT, EVENTS)}
+LANGUAGE = {"dtype": "language", "shape": [1], "names": None}
+FEATURES = {PERSISTENT: LANGUAGE, EVENTS: LANGUAGE}
 """The entries of the columns of :func:`write_subtasks` in ``meta/info.json``."""
+PEOPLE = {
+    WHO: {"dtype": "int64", "shape": [1], "names": list(SOURCES)},
+    WHOSE: {"dtype": "string", "shape": [1], "names": None},
+}
+"""The entries of further columns where a person labelled: who says what a frame's subtask is, and the annotator."""
+
+COPIED = "copied_from"
+"""In ``meta/lerobot_annotations.json`` of a labelled copy: the dataset that was copied."""
 
 
 def check(asked: Asked) -> None:
@@ -48,27 +59,39 @@ def check_bare(asked: Asked) -> None:
     check(asked)
 
 
+def is_copy(out: Path, dataset: Path) -> bool:
+    """Whether a folder is a labelled copy of a dataset."""
+    return _origin(out) == str(dataset.resolve())
+
+
+def _origin(folder: Path) -> str:
+    """The dataset that a folder is a labelled copy of; empty where it is none."""
+    path = folder / ANNOTATIONS
+    return str(json.loads(path.read_text(encoding="utf-8")).get(COPIED, "")) if path.is_file() else ""
+
+
 @contextmanager
-def _copied(asked: Asked, segmented: Segmented) -> Iterator[tuple[LeRobot, dict[int, list[Run]]]]:
-    """A copy that the block adds to, and the subtasks of each episode by its index.
+def _copied(asked: Asked, segmented: Segmented) -> Iterator[tuple[LeRobot, dict[int, tuple[Segments, list[Run]]]]]:
+    """A copy that the block adds to, and each episode with its subtasks, by its index.
 
     Videos are hard links where the file system has them, else copies.
     """
     with whole_folder(asked.out) as temporary:
         folder = LeRobot(asked.demos).folder
         shutil.copytree(folder, temporary, dirs_exist_ok=True, copy_function=_link, ignore_dangling_symlinks=True)
-        runs = {int(demo.name.removeprefix("demo_")): asked.runs(demo) for demo in segmented.segments}
+        runs = {int(demo.name.removeprefix("demo_")): (demo, asked.runs(demo)) for demo in segmented.segments}
         yield LeRobot(temporary), runs
 
 
 def write_subtasks(asked: Asked, segmented: Segmented) -> str:
     """Each row holds all subtasks of its episode in ``language_persistent``, as LeRobot 0.6 and newer read them.
 
-    A subtask lasts from its ``timestamp``, the time of its first frame, to the next subtask. The page on which
-    LeRobot's users label datasets keeps the same in ``meta/lerobot_annotations.json``. Each episode has a row group of
-    its own, as in LeRobot's files.
+    A subtask lasts from its ``timestamp``, the time of its first frame, to the next one; an entry without ``content``
+    is a gap. The page on which LeRobot's users label datasets keeps the same in ``meta/lerobot_annotations.json``.
+    Subtasks that are there are replaced, and other language stays. Where a person labelled, further columns say who
+    says what each frame is (:data:`PEOPLE`). Each episode has a row group of its own, as in LeRobot's files.
     """
-    episodes = {}
+    episodes, features = dict[str, Any](), dict[str, Any]()
     with _copied(asked, segmented) as (dataset, subtasks):
         for path in dataset.data_files:
             file = inside(dataset.folder, path)
@@ -76,21 +99,29 @@ def write_subtasks(asked: Asked, segmented: Segmented) -> str:
             file.unlink()  # it may be a link
             writer = None
             for episode, rows in _episodes(table, subtasks):
-                for name, values in _columns(rows["timestamp"], _options(subtasks[episode]), asked.names).items():
-                    rows = rows.append_column(name, values)
+                demo, runs = subtasks[episode]
+                for name, values in _columns(asked, rows, demo, runs).items():
+                    rows = rows.drop_columns([name] if name in rows.column_names else []).append_column(name, values)
+                rows = rows.drop_columns([SUBTASK] if SUBTASK in rows.column_names else [])
                 writer = writer or parquet.ParquetWriter(file, rows.schema)
                 writer.write_table(rows)
-                atoms = rows[PERSISTENT][0].as_py()
-                episodes[str(episode)] = {"atoms": [{key: atom[key] for key in ATOM} for atom in atoms]}
+                features = {name: about for name, about in {**FEATURES, **PEOPLE}.items() if name in rows.column_names}
+                atoms = [atom for atom in rows[PERSISTENT][0].as_py() if atom["style"] == "subtask"]
+                marks = segmented.marks.get(demo.name, {})
+                episodes[str(episode)] = {"atoms": [{key: atom[key] for key in ATOM} for atom in atoms], **marks}
             assert writer is not None  # a file of a dataset holds an episode
             writer.close()
-        write_text(dataset.folder / ANNOTATIONS, json.dumps({"version": 2, "episodes": episodes}, indent=1) + "\n")
-        info = {**dataset.info, "features": {**dataset.features, **FEATURES}}
+        about = {"version": 2, "episodes": episodes, COPIED: _origin(dataset.folder) or str(asked.demos.resolve())}
+        write_text(dataset.folder / ANNOTATIONS, json.dumps(about, indent=1) + "\n")
+        before = {name: feature for name, feature in dataset.features.items() if name != SUBTASK}
+        info = {**dataset.info, "features": {**before, **features}}
         write_text(dataset.folder / "meta" / "info.json", json.dumps(info, indent=4) + "\n")
     return str(asked.out)
 
 
-def _episodes(table: pyarrow.Table, subtasks: Mapping[int, list[Run]]) -> Iterator[tuple[int, pyarrow.Table]]:
+def _episodes(
+    table: pyarrow.Table, subtasks: Mapping[int, tuple[Segments, list[Run]]]
+) -> Iterator[tuple[int, pyarrow.Table]]:
     """The rows of each episode in a data file."""
     if "timestamp" not in table.column_names:
         raise BadInput("the data files have no column timestamp; subtasks begin at times of frames")
@@ -98,41 +129,55 @@ def _episodes(table: pyarrow.Table, subtasks: Mapping[int, list[Run]]) -> Iterat
     bounds = [0, *(np.flatnonzero(np.diff(index)) + 1).tolist(), len(index)]
     for start, stop in pairwise(bounds):
         rows, episode = table.slice(start, stop - start), int(index[start])
-        if episode not in subtasks or subtasks[episode][-1][2] != len(rows):
+        if episode not in subtasks or len(subtasks[episode][0]) != len(rows):
             raise BadInput(f"the data files have rows of episode {episode} that meta/episodes does not name")
         yield episode, rows
 
 
-def _options(runs: list[Run]) -> np.ndarray:
-    """The option of each frame of an episode [T]."""
-    return np.concatenate([np.full(stop - start, option) for option, start, stop in runs])
+def _options(runs: list[Run], steps: int) -> np.ndarray:
+    """The option of each frame of an episode [T], -1 for none."""
+    options = np.full(steps, UNKNOWN)
+    for option, start, stop in runs:
+        options[start:stop] = option
+    return options
 
 
-def _columns(times: pyarrow.ChunkedArray, options: np.ndarray, names: list[str]) -> dict[str, pyarrow.Array]:
-    """The new columns of an episode: the same list of subtasks on each row, and no events.
-
-    :param times: of its frames [T].
-    :param options: the option of each frame [T].
-    :param names: the subtask of each option.
-    """
-    starts = np.flatnonzero(np.diff(options, prepend=-1))
-    text = pyarrow.string()
-    entries = {
-        "role": pyarrow.array(["assistant"] * len(starts)),
-        "content": pyarrow.array([names[option] for option in options[starts]]),
-        "style": pyarrow.array(["subtask"] * len(starts)),
-        "timestamp": times.combine_chunks().take(pyarrow.array(starts)),
-        "camera": pyarrow.nulls(len(starts), text),
-        "tool_calls": pyarrow.nulls(len(starts), pyarrow.list_(text)),
+def _columns(asked: Asked, rows: pyarrow.Table, demo: Segments, runs: list[Run]) -> dict[str, Any]:
+    """The new columns of an episode: the same list of language on each row, no events, and who says so."""
+    options, times, there = _options(runs, len(rows)), rows["timestamp"].to_pylist(), PERSISTENT in rows.column_names
+    starts = np.flatnonzero(np.diff(options, prepend=UNKNOWN)).tolist()
+    entries: list[dict[str, Any]] = [
+        {
+            "role": "assistant",
+            "content": None if options[start] == UNKNOWN else asked.names[options[start]],
+            "style": "subtask",
+            "timestamp": times[start],
+            "camera": None,
+            "tool_calls": None,
+        }
+        for start in starts
+    ]
+    text, clock = pyarrow.string(), rows["timestamp"].type
+    fields = {"role": text, "content": text, "style": text, "timestamp": clock, "camera": text}
+    kind = pyarrow.struct({**fields, "tool_calls": pyarrow.list_(text)}.items())
+    if there:
+        kind = rows.schema.field(PERSISTENT).type.value_type
+        entries += [entry for entry in rows[PERSISTENT][0].as_py() if entry["style"] != "subtask"]
+        entries.sort(key=lambda entry: float(entry["timestamp"]))
+    count, steps = len(entries), len(rows)
+    on_each_row = pyarrow.array(entries, kind).take(pyarrow.array(np.tile(np.arange(count), steps)))
+    columns = {
+        PERSISTENT: pyarrow.ListArray.from_arrays(pyarrow.array(np.arange(steps + 1) * count, "int32"), on_each_row)
     }
-    events = {name: values.type for name, values in entries.items() if name != "timestamp"}
-    persistent = pyarrow.StructArray.from_arrays(list(entries.values()), list(entries))
-    on_each_row = persistent.take(pyarrow.array(np.tile(np.arange(len(starts)), len(options))))
-    offsets = np.arange(len(options) + 1, dtype=np.int32)
-    return {
-        PERSISTENT: pyarrow.ListArray.from_arrays(pyarrow.array(offsets * len(starts)), on_each_row),
-        EVENTS: pyarrow.ListArray.from_arrays(pyarrow.array(0 * offsets), pyarrow.array([], pyarrow.struct(events))),
-    }
+    if EVENTS not in rows.column_names:
+        events = pyarrow.struct([kind.field(name) for name in (*fields, "tool_calls") if name != "timestamp"])
+        columns[EVENTS] = pyarrow.array([[]] * steps, pyarrow.list_(events))
+    who = demo.baselines.get(asked.level + SOURCE)
+    if who is not None:
+        said = who != SOURCES.index("proposed")
+        columns[WHO] = pyarrow.array(who.astype(np.int64))
+        columns[WHOSE] = pyarrow.array(np.where(said, asked.annotator, "").tolist())
+    return columns
 
 
 def write_stages(asked: Asked, segmented: Segmented) -> str:
@@ -143,7 +188,7 @@ def write_stages(asked: Asked, segmented: Segmented) -> str:
     with _copied(asked, segmented) as (dataset, subtasks):
         for file in sorted((dataset.folder / "meta" / "episodes").rglob("*.parquet")):
             table = parquet.read_table(file)
-            runs = [subtasks[episode] for episode in table["episode_index"].to_pylist()]
+            runs = [subtasks[episode][1] for episode in table["episode_index"].to_pylist()]
             columns = {
                 "names": pyarrow.array([[asked.names[option] for option, _, _ in each] for each in runs]),
                 "start_frames": pyarrow.array([[start for _, start, _ in each] for each in runs]),
@@ -156,7 +201,7 @@ def write_stages(asked: Asked, segmented: Segmented) -> str:
             known = {key: value for key, value in (table.schema.metadata or {}).items() if key != b"huggingface"}
             file.unlink()  # it may be a link
             parquet.write_table(table.replace_schema_metadata(known), file)
-        every = list(map(_options, subtasks.values()))
+        every = [_options(runs, len(demo)) for demo, runs in subtasks.values()]
         shares = {option: np.mean([np.mean(each == option) for each in every]) for option in asked.order(segmented)}
         proportions = {asked.names[option]: float(share) for option, share in shares.items()}
         path = dataset.folder / "meta" / "temporal_proportions_dense.json"
