@@ -74,6 +74,7 @@ def tabs(browser):
     def opened(address, script=""):
         tab = context.new_page()
         tab.add_init_script(script)
+        tab.on("response", lambda answer: complaints.append(answer.text()) if answer.status == 500 else None)
         tab.on("pageerror", lambda error: complaints.append(str(error)))
         tab.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
         tab.on(

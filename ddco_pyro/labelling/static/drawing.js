@@ -1,7 +1,7 @@
 // The look of the page's canvases: its colours, segments, and a demonstration's picture or path at a step.
 import { Numbers, Path, bright } from "./canvas.js";
 
-export const CONTROL = "#9a9a9a";
+export const CONTROL = "#9a9a9a", AGAIN = 1000;
 export const percent = share => `${(100 * share).toFixed(1)} %`;
 export const coloured = (colours, option) => option ? colours[option - 1] : CONTROL;
 export const within = (segments, step) => segments.find(one => one.start <= step && step < one.stop);
@@ -74,7 +74,8 @@ export class Look {  // a demonstration at a step: its pictures, and its path in
   }
   camera(name, number) {
     const picture = element("img"), made = { picture, number, shown: "", box: element("figure", {}, picture, element("figcaption", { textContent: name })) };
-    picture.onload = picture.onerror = () => { made.loading = false; this.load(made); };
+    picture.onload = () => { made.loading = false; this.load(made); };
+    picture.onerror = () => setTimeout(() => { made.loading = false; made.shown = ""; this.load(made); }, AGAIN);
     this.path.before(made.box);
     return made;
   }
