@@ -100,6 +100,8 @@ class View:
                     f"paint: steps {start} to {stop} are not in {name}, which has {self.document.lengths[name]}"
                 )
             return [(PAINT, name, start, stop, self._option(command, 0) or OPEN)]
+        if do == "scratch":
+            return [(PAINT, name, 0, self.document.lengths[name], OPEN)]
         if do == "move":
             return self._move(name, whole(command, "boundary"), whole(command, "to"))
         step = whole(command, "step")
@@ -109,8 +111,6 @@ class View:
             return [(PAINT, name, start, here.stop, self._option(command, 1))]
         if do == "open":
             return [(PAINT, name, here.start, here.stop, OPEN)]
-        if do == "scratch":
-            return [(PAINT, name, 0, self.document.lengths[name], OPEN)]
         if do == "everywhere":
             option = self._option(command, 1)
             return [

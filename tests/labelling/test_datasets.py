@@ -67,7 +67,7 @@ def contents(folder):
 def test_cameras_names_of_joints_and_the_task_are_those_of_the_dataset(begin, tmp_path):
     demo = begin(tmp_path / "out").demo(0)
     assert (demo["cameras"], demo["task"]) == (["images/wrist", "images/top"], "pull the block")
-    assert demo["numbers"]["names"][:5] == ["state x", "state y", "state grip", "control vx", "control vy"]
+    assert {*demo["numbers"]["names"]} == {"state x", "state y", "state grip", "control vx", "control vy"}
 
 
 def test_a_copy_has_the_labels_in_its_language_with_source_and_annotator(begin, dataset, tmp_path):

@@ -17,9 +17,11 @@ from time_lines import unpacked
 
 from ddco_pyro.cli.label import _fitted
 from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.inspection import inspect
 from ddco_pyro.data.labels import LABEL_NAMES, UNKNOWN
 from ddco_pyro.data.planted import pick_and_place
 from ddco_pyro.data.sources import open_source
+from ddco_pyro.data.starting import starting_spec
 from ddco_pyro.errors import BadInput
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.fitted import load
@@ -260,6 +262,80 @@ def test_open_steps_are_one_segment_which_has_boundaries_at_its_ends_alone(begin
     assert np.flatnonzero(session.document.labels["demo_0"] == OPEN).tolist() == [*range(10, 28)]
 
 
+@pytest.mark.usefixtures("quiet")
+def test_a_dropped_option_is_another_one_or_none_everywhere_and_an_undo_brings_it_back(begin):
+    session = begin()
+    label(session, 0, SAID - 1)
+    for option, text in enumerate(NAMES, start=1):
+        session.edit({"do": "rename", "option": option, "text": text})
+    before = [steps for _, steps in shown(session)]
+    session.edit({"do": "drop", "option": 3, "into": 1})
+    assert session.document.names == ("let go", "carry", "come")
+    np.testing.assert_array_equal(session.document.labels["demo_0"], np.array([0, 1, 2, 1, 3])[SAID])
+    assert {option for _, steps in shown(session) for option, _ in steps} <= {1, 2, 3}
+    session.edit({"do": "undo"})
+    assert session.document.names == NAMES
+    np.testing.assert_array_equal(session.document.labels["demo_0"], SAID)
+    assert shown(session)[0][1] == before[0]
+    session.edit({"do": "drop", "option": 4})  # none everywhere
+    assert (session.document.labels["demo_0"][30:] == FREE).all()
+    assert {option for _, steps in shown(session) for option, _ in steps} <= {1, 2, 3}
+    with pytest.raises(BadInput, match="refit before you write segments"):
+        session.export("csv", session.out.parent)
+
+
+@pytest.mark.usefixtures("quiet")
+def test_from_scratch_each_segment_is_one_edit_that_goes_to_a_change_point(begin, demos):
+    session, truth = begin(), demos[0].labels["phase"]
+    session.edit({"do": "scratch", "demo": 0})
+    for start, _, option in stretches(truth):
+        session.edit({"do": "name", "demo": 0, "step": start, "option": option, "from_here": True})
+    assert len(session.document.done) == 1 + COUNT
+    given = session.document.labels["demo_0"]
+    assert [option for _, _, option in stretches(given - 1)] == [option for _, _, option in stretches(truth)]
+    assert (given == truth + 1).mean() > 0.95
+    near = session.proposals.change_points("demo_0")
+    step = next(step for step in near if step + 1 not in near and 2 <= step < len(truth) - 2)
+    session.edit({"do": "scratch", "demo": 1})
+    session.edit({"do": "scratch", "demo": 0})
+    session.edit({"do": "name", "demo": 0, "step": step, "option": 2, "from_here": True})
+    assert np.flatnonzero(session.document.labels["demo_0"] == 2)[0] == step
+
+
+def test_skills_are_named_at_the_start_and_coloured(run, demos, tmp_path):
+    demos.write(tmp_path / "demos.hdf5")
+    session = Session(replace(run, named={}), tmp_path / "demos.hdf5", tmp_path / "o.hdf5", skills=[*NAMES, "wait"])
+    assert session.state()["names"] == [*NAMES, "wait"]
+    session.edit({"do": "colour", "option": 5, "colour": "#123456"})
+    session.edit({"do": "rename", "option": 5, "text": "idle"})
+    assert session.state()["colours"][4] == "#123456"
+    session.edit({"do": "undo"})
+    assert session.state()["colours"][4] == "#123456"
+    session.journal.close()
+
+
+@pytest.mark.usefixtures("quiet")
+def test_an_excluded_demonstration_is_last_and_in_no_export_and_in_a_mask(begin, demos, tmp_path):
+    session = begin()
+    first = session.state()["order"][0]
+    name = demos.names[first]
+    for mark, value in (("exclude", True), ("flag", True), ("note", "slipped")):
+        session.edit({"do": "mark", "demo": first, "mark": mark, "value": value})
+    session.edit({**paint, "demo": (first + 1) % 5})
+    refitted(session)
+    assert session.state()["order"][-1] == first
+    assert session.state()["demos"][first]["marks"] == {"exclude": True, "flag": True, "note": "slipped"}
+    assert name not in session.export("csv", tmp_path).read_text()
+    session.save()
+    saved = Demonstrations.read(session.out)
+    assert saved.masks["exclude"] == (name,)
+    assert saved[first].attributes["note"] == "slipped"
+    assert name in starting_spec(inspect(session.out), session.out).text.partition("exclude:")[2].partition("\n")[0]
+    session.edit({"do": "mark", "demo": first, "mark": "exclude", "value": False})
+    session.save()
+    assert "exclude" not in Demonstrations.read(session.out).masks
+
+
 def test_what_changes_nothing_is_no_edit(begin):
     session = begin()
     commands = [paint, {"do": "rename", "option": 1, "text": "come"}, {**paint, "demo": 1, "option": 0}]
@@ -312,6 +388,10 @@ def test_an_edit_waits_for_no_other_demonstration(begin, demos, monkeypatch):
         {"do": "rename", "option": 1, "text": "control"},
         {"do": "undo"},
         {"do": "redo"},
+        {"do": "drop", "option": 1, "into": 1},
+        {"do": "colour", "option": 1, "colour": "red"},
+        {"do": "mark", "demo": 0, "mark": "note", "value": True},
+        {"do": "take", "demo": 0, "annotator": "eve"},
         {"do": "accept", "demo": 0},
         {"do": "accept", "demo": 0, "segments": [[1, 1]]},
         {"do": "accept", "demo": 0, "segments": [[0, 1], [0, 2]]},

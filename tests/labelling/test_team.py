@@ -23,9 +23,11 @@ def test_every_demonstration_has_one_annotator_or_two_and_everyone_as_many():
     assert Team("bob", ("ann", "bob", "cat"), 0.2).shares(NAMES) == shares
 
 
-@pytest.mark.parametrize("wrong", [("eve", ("ann", "bob"), 0.0), ("ann", ("ann", "ann"), 0.0), ("a/b", (), 0.0), ("ann", (), 0.5)])
+@pytest.mark.parametrize(
+    "wrong", [("eve", ("ann", "bob"), 0.0), ("ann", ("ann", "ann"), 0.0), ("a/b", (), 0.0), ("ann", (), 0.5)]
+)
 def test_a_team_without_me_or_with_a_name_twice_is_refused(wrong):
-    with pytest.raises(BadInput, match="--annotator|--team"):
+    with pytest.raises(BadInput, match=r"--annotator|--team"):
         Team(*wrong)
 
 
