@@ -16,10 +16,13 @@ import pytest
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.planted import pick_and_place
+from ddco_pyro.fitting.fit import fit
 from ddco_pyro.labelling.background import Background
 from ddco_pyro.labelling.document import FREE, OPEN
 from ddco_pyro.labelling.server import Listening, running
 from ddco_pyro.labelling.session import Session
+from ddco_pyro.labelling.team import Team
+from ddco_pyro.spec import with_overrides
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 
@@ -603,3 +606,66 @@ def test_two_hundred_demonstrations_of_two_thousand_steps_stay_smooth(tabs, run,
         assert tab.evaluate(FRAMES, "play") >= 30
         assert at(tab) > 40
     session.close()
+
+
+def test_a_click_on_a_lane_edits_its_level_and_both_are_saved(tabs, run, file, tmp_path, monkeypatch):
+    monkeypatch.setattr(Background, "_submit", here)
+    linear = {"policy": {"network": "linear"}, "termination": {"network": "linear"}}
+    levels = [{"name": "skill", "count": 4, **linear}, {"name": "stage", "count": 2, **linear}]
+    fitted = fit(with_overrides(run.spec, {"hierarchy.levels": levels, "training.epochs": 3}))
+    lower = Session(fitted, file, tmp_path / "labels.hdf5")
+    upper = Session(fitted, file, tmp_path / "labels.hdf5", "stage", first=lower)
+    lower.beside, upper.beside = [upper], [lower]
+    listening = Listening.at()
+    with running([lower, upper], listening):
+        tab = tabs(listening.address)
+        heading = tab.get_by_role("heading", level=2).text_content()
+        tab.mouse.click(*point(tab, 5, 45, below=24))
+        said(tab, "Level stage")
+        assert tab.get_by_role("heading", level=2).text_content() == heading
+        playwright.expect(tab.get_by_label("Name of option 3")).to_have_count(0)
+        keys(tab, "2")
+        said(tab, "option 2 in")
+        assert (upper.document.labels[heading] == 2).any()
+        tab.mouse.click(*point(tab, 5, 45, below=75))
+        said(tab, "Level skill")
+        keys(tab, "x", "3")
+        said(tab, "option 3 in")
+        tab.get_by_role("button", name="Save").click()
+        said(tab, "labels.hdf5")
+    saved = Demonstrations.read(tmp_path / "labels.hdf5")
+    (demo,) = (demo for demo in saved if demo.name == heading)
+    assert ((demo.labels["stage"] == 2).any(), (demo.labels["skill"] == 3).any()) == (True, True)
+    assert saved.masks["exclude"] == (heading,)
+    for session in (lower, upper):
+        session.close()
+
+
+def test_the_page_shows_another_annotators_time_line_and_takes_it_with_a_click(tabs, run, file, tmp_path, monkeypatch):
+    monkeypatch.setattr(Session, "refit", lambda session: None)
+    sessions = [
+        Session(replace(run, named={}), file, tmp_path / f"labels_{me}.hdf5", team=Team(me, ("ann", "bob"), 1.0))
+        for me in ("ann", "bob")
+    ]
+    for demo in range(6):
+        sessions[0].edit({"do": "paint", "demo": demo, "start": 0, "stop": 9, "option": 3})
+    with served(sessions[1]) as address:
+        tab = tabs(address)
+        tab.get_by_role("slider", name="Step").focus()
+        keys(tab, "f", "n")
+        tab.keyboard.type("look again")
+        keys(tab, "Enter", "Escape")
+        said(tab, "Marked")
+        tab.mouse.click(*point(tab, 5, 45, below=24))
+        tab.get_by_role("menuitem", name="Take the labels of ann").click()
+        said(tab, "Labels of ann taken")
+        playwright.expect(tab.locator("#summary")).to_contain_text("ann: 0 of 6, κ")
+        tab.get_by_label("Show").select_option("flag")
+        playwright.expect(items(tab).and_(tab.locator(":visible"))).to_have_count(1)
+        name = tab.get_by_role("heading", level=2).text_content()
+        assert (sessions[1].document.labels[name][:9] == 3).all()
+        assert sessions[1].document.marks[name] == {"flag": True, "note": "look again"}
+        sheet = tab.locator("#timeline").bounding_box()
+        assert sheet["y"] + sheet["height"] <= 850, "the time line is in view"
+    for session in sessions:
+        session.journal.close()
