@@ -576,7 +576,7 @@ class Session:
 
         :param names: the person's options before.
         :param shown: of each step, before.
-        :param into: the option, as it was before, that a dropped one is merged into; 0 for none.
+        :param into: the earlier number of the option that a dropped one is merged into; 0 for none.
         """
         now = self.document.names
         numbers = np.array([0, *(now.index(name) + 1 if name in now else 0 for name in names)])
