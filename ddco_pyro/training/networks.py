@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -220,10 +221,5 @@ def nearest_widths(hidden: Sequence[int], target: int, parameters: Callable[[tup
     def scaled(width: int) -> tuple[int, ...]:
         return tuple(max(1, round(size * width / widest)) for size in hidden)
 
-    low, high = 1, 2  # the first width that has enough parameters lies above low and at or below high
-    while parameters(scaled(high)) < target:
-        low, high = high, 2 * high
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (middle, high) if parameters(scaled(middle)) < target else (low, middle)
-    return min(scaled(low), scaled(high), key=lambda sizes: abs(parameters(sizes) - target))
+    enough = 1 + bisect_left(range(1, MOST_PARAMETERS), target, key=lambda width: parameters(scaled(width)))
+    return min(scaled(enough - 1), scaled(enough), key=lambda sizes: abs(parameters(sizes) - target))
