@@ -58,6 +58,12 @@ def fit(
     spec: SpecPath,
     out: Annotated[Path | None, written(out_folder, "The run folder; by default runs/SPEC-TIME.")] = None,
     overrides: Overrides = [],  # noqa: B006
+    library: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RUN", help="A run of other tasks, at whose options this one begins; SPEC then says what differs."
+        ),
+    ] = None,
     jobs: Annotated[
         int | None,
         typer.Option(
@@ -82,6 +88,8 @@ def fit(
     An unfinished run of the same spec in --out is continued, with any number of processes. Under torchrun processes
     share each gradient step, at most training.shards of them.
 
+    With --library one demonstration is enough: all that there are train, from the options of another run.
+
     With --seeds the fit and its baselines are repeated, in --jobs processes, with other training seeds: other first
     weights, clusters and orders of the same demonstrations. RUN/seeds has a run for each.
     """
@@ -94,7 +102,12 @@ def fit(
             with suppress(BadInput, Failed):  # the first process reports an error that all have
                 follow(ranks)
             return
-        loaded = load_spec(spec, overrides, allow_code)
+        if library is None:
+            loaded = load_spec(spec, overrides, allow_code)
+        else:
+            from ddco_pyro.fitting.library import for_new_task
+
+            loaded = for_new_task(spec, library, overrides, allow_code)
         if ranks.size > 1 and jobs not in (None, 1):
             raise SpecError(f"--jobs {jobs}: the processes of torchrun train together; leave --jobs out")
         jobs = 1 if ranks.size > 1 else -1 if jobs is None else jobs

@@ -23,6 +23,7 @@ from ddco_pyro.events import OnEvent, ignore
 from ddco_pyro.fitting.digest import record, recorded
 from ddco_pyro.fitting.evaluation import evaluate, marginal
 from ddco_pyro.fitting.fitted import Fit, left_out, load
+from ddco_pyro.fitting.library import dimensions_for, library_of, prior_of
 from ddco_pyro.fitting.names import accepted, matched, read_names, write_names
 from ddco_pyro.fitting.run import Clock, claim, claimed, is_finished, write_model
 from ddco_pyro.inference import compile_all
@@ -31,9 +32,9 @@ from ddco_pyro.metrics import write_table
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec, load_spec, with_overrides
 from ddco_pyro.training.data import demonstrations as read_demonstrations
-from ddco_pyro.training.data import dimensions, known_demonstrations, refuse_unfit, seen, train_and_valid
+from ddco_pyro.training.data import known_demonstrations, refuse_unfit, seen, train_and_valid
 from ddco_pyro.training.labels import used
-from ddco_pyro.training.networks import Dimensions, check_models, check_networks, model_name, parameters
+from ddco_pyro.training.networks import check_models, check_networks, model_name, parameters
 from ddco_pyro.training.optimizers import optimizer_of
 from ddco_pyro.training.processes import Ranks, device_of, repeatable
 from ddco_pyro.training.restarts import train_model, training_began
@@ -102,7 +103,9 @@ def fit(
             if demonstrations is not None:
                 spec = with_overrides(spec, {"demonstrations.path": str(path_of(demonstrations, "demonstrations"))})
             demos = known_demonstrations(spec)
-        models = check_models(spec, dimensions(spec, demos))
+        models = check_models(spec, dimensions_for(spec, demos))
+        for its, _ in models.values():
+            library_of(its)  # or it is refused
         if demos is not None:
             refuse_unfit(spec, demos)
             used(spec, demos)
@@ -116,7 +119,7 @@ def fit(
             with clock("demonstrations"):
                 demos = read_demonstrations(spec, on_event)
             # the control decides the baselines too
-            models = check_models(spec, Dimensions.of(demos, spec.control.relative_to))
+            models = check_models(spec, dimensions_for(spec, demos))
         if folder is not None:
             if demos is not None:
                 record(folder, demos)
@@ -161,7 +164,7 @@ def _fit_models(
     clock = clock or Clock()
     spec, *_ = next(iter(models.values()))
     specs = {other: its for other, (its, _) in list(models.items())[1:]}
-    split, size = train_and_valid(spec, demos), Dimensions.of(demos, spec.control.relative_to)
+    split, size = train_and_valid(spec, demos), dimensions_for(spec, demos)
     later = {other for other, its in specs.items() if _shares_recogniser(its)}
 
     def baseline(other: str) -> Callable[..., Fit]:
@@ -177,7 +180,8 @@ def _fit_models(
     with run_all(calls, workers, "trained a baseline", on_event, True, True, waiting) as fitted_beside:
         with clock("training"):
             free, checkpoints = max(1, workers.number() - len(beside)), folder and folder / "checkpoints"
-            trained = train_model(spec, size, split["train"], on_event, checkpoints, split.get("valid"), name, free)
+            prior, held_out = prior_of(spec, on_event, Workers(free)), split.get("valid")
+            trained = train_model(spec, size, split["train"], on_event, checkpoints, held_out, name, free, prior)
         specs |= {other: _with_recogniser(specs[other], trained.summary["recogniser"]) for other in later}
         with clock("baselines"):
             here = {other: baseline(other)(on_event, workers) for other in specs if other not in beside}
@@ -230,8 +234,8 @@ def _fit_models(
 
 def _contains(spec: Spec, baseline: Spec) -> bool:
     """Whether a hierarchy contains a baseline, a mixture of the same policies that is trained in the same way."""
-    if spec.hierarchy is None or baseline.hierarchy is None:
-        return False
+    if spec.hierarchy is None or baseline.hierarchy is None or spec.training.library is not None:
+        return False  # of a library the two have priors of their own
     return baseline.training == spec.training and baseline.control == spec.control
 
 
@@ -293,7 +297,7 @@ def fit_beside(
         record(folder, demos, recorded(folder.parent.parent))
         if is_finished(folder):
             return load(folder, allow_code=True)
-    models = {name: (spec, check_networks(spec, Dimensions.of(demos, spec.control.relative_to)))}
+    models = {name: (spec, check_networks(spec, dimensions_for(spec, demos)))}
     return replace(_fit_models(models, demos, folder, on_event, workers, name=name), given=None)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, cast
 
 import pyro
@@ -78,7 +78,9 @@ class EliminatedAHMM(TorchDistribution):
             return torch.where(chain.alive.unsqueeze(-1), controls, 0.0)
 
 
-def bayesian_ahmm(hierarchy: Hierarchy, priors: Mapping[str, TorchDistribution], batch: Batch) -> Outputs:
+def bayesian_ahmm(
+    hierarchy: Hierarchy, priors: Mapping[str, TorchDistribution] | Callable[[], Mapping[str, Tensor]], batch: Batch
+) -> Outputs:
     """The AHMM with priors on its weights, as a Pyro program: options and terminations are eliminated (§4.1).
 
     Bind hierarchy and priors with :func:`functools.partial` for a guide, SVI or NUTS. Each prior is a site with the
@@ -94,10 +96,14 @@ def bayesian_ahmm(hierarchy: Hierarchy, priors: Mapping[str, TorchDistribution],
     >>> len(trace.stochastic_nodes) == len(weights), trace.nodes["controls"]["value"].shape
     (True, torch.Size([6, 10, 2]))
 
-    :param priors: a distribution of each parameter by its name, with the parameter's shape as event shape.
+    :param priors: a distribution of each parameter by its name, with the parameter's shape as event shape; or a Pyro
+        program that draws parameters by name, such as that of a library (:class:`~ddco_pyro.training.prior.Prior`).
     :return: the networks' outputs under the drawn weights.
     """
-    drawn = {name: pyro.sample(name.replace(".", "_"), prior) for name, prior in priors.items()}
+    if isinstance(priors, Mapping):
+        drawn = {name: pyro.sample(name.replace(".", "_"), prior) for name, prior in priors.items()}
+    else:
+        drawn = dict(priors())
     weights = {name: weight.to(hierarchy.get_parameter(name).dtype) for name, weight in drawn.items()}
     outputs: Outputs = functional_call(hierarchy, weights, (batch.inputs,))
     with pyro.plate("demonstrations", len(batch), dim=-1):

@@ -185,6 +185,11 @@ class Hierarchy(nn.Module):
         """The policies of each level, lowest first, and the meta-policy."""
         return [*(level.policy for level in self.option_levels()), self.meta_policy]
 
+    def named_callers(self) -> dict[str, Caller]:
+        """The callers by the place of their network in :meth:`networks`."""
+        levels = {f"levels.{number}.policy": level.policy for number, level in enumerate(self.option_levels())}
+        return levels | {"meta_policy": self.meta_policy}
+
     def option_levels(self) -> list[Level]:
         return [level for level in self.levels if isinstance(level, Level)]
 

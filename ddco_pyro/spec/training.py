@@ -67,6 +67,19 @@ class LabelsSpec(Model):
     """A recogniser that the labelled steps train, for steps without labels and for other demonstrations; null: none."""
 
 
+class LibrarySpec(Model):
+    """A library: a run whose model is the prior of this one. Encoder, scaling and kinds of controls are the run's."""
+
+    run: Text
+    """The run folder. Its model, or one of its baselines, has the same observations, control and networks."""
+    ridge: Annotated[float, Field(ge=0)] | None = None
+    """As many steps that say what the library's weights say: the precision of a normal prior centred there, in units of
+    1/σ² for means of controls whose σ does not depend on the state. Training begins there. Null: the strength that the
+    library's own tasks chose. 0: weights begin by ``starts``, with the ridges of ``optimizer``."""
+    spread: Positive = 20.0
+    """As many controls that have the library's σ, of each option and dimension."""
+
+
 Layerwise = Annotated[
     bool | Literal["segments"], nested((), lambda value: value, "true, false, or segments", ("segments",))
 ]
@@ -122,6 +135,14 @@ class TrainingSpec(Model):
     """Device of the networks: ``cpu``, ``cuda`` (a GPU), or ``auto`` (a GPU if there is one)."""
     labels: LabelsSpec | None = None
     """Labels that fix active options in some demonstrations; null: none."""
+    library: LibrarySpec | None = None
+    """A run of other tasks: training begins at its model, which is the prior of this one, whatever ``starts`` says.
+    Null: none."""
+
+    @property
+    def begins_at_library(self) -> bool:
+        """Whether the weights begin at those of a library, which are the centre of their prior."""
+        return self.library is not None and self.library.ridge != 0
 
     @property
     def takes_gradient_steps(self) -> bool:

@@ -17,6 +17,7 @@ from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec
 from ddco_pyro.training.labels import Labels
 from ddco_pyro.training.networks import Dimensions, build_hierarchy
+from ddco_pyro.training.prior import Prior
 from ddco_pyro.training.processes import device_of
 from ddco_pyro.training.stages import starts_of
 
@@ -32,6 +33,7 @@ class TrainingData:
     :param scaling: the state of the fitted scaling of the control.
     :param labels: the labels that say which options are active; None where there are none.
     :param recogniser: the state of the recogniser that the labels train.
+    :param library: the prior that a library is (``training.library``).
     """
 
     spec: Spec
@@ -43,17 +45,20 @@ class TrainingData:
     scaling: State
     labels: Labels | None = None
     recogniser: State | None = None
+    library: Prior | None = None
 
     def hierarchy(self, restart: int, state: State | None = None) -> Hierarchy:
         """A restart's hierarchy in evaluation mode, with its networks on the spec's device.
 
-        :param state: of the hierarchy; None for the restart's first weights.
+        :param state: of the hierarchy; None for the restart's first weights, which may be those of a library.
         """
         hierarchy = build_hierarchy(self.spec, self.dimensions, self.seed(restart))
         hierarchy.encoder.load_state_dict(self.encoder)
         hierarchy.scaling.load_state_dict(self.scaling)
         if hierarchy.recogniser is not None and self.recogniser is not None:
             hierarchy.recogniser.load_state_dict(self.recogniser)
+        if state is None and self.library is not None and self.library.ridge:
+            hierarchy.load_state_dict(dict(self.library.model.named_parameters()), strict=False)
         if state is not None:
             hierarchy.load_state_dict(state)
         return hierarchy.place(device_of(self.spec.training)).eval()

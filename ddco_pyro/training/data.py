@@ -73,12 +73,15 @@ def train_and_valid(spec: Spec, demos: Demonstrations) -> dict[str, Demonstratio
 def tuning_split(spec: Spec, dimensions: Dimensions, train: Demonstrations) -> tuple[Demonstrations, Demonstrations]:
     """The training demonstrations of a model in those that it is fitted to, and those that it is tuned by.
 
-    With ``training.tune_fraction: 0`` both are all of them where EM trains the model, which needs no early stopping.
+    With ``training.tune_fraction: 0`` both are all of them where EM trains the model or a library is its prior, which
+    needs no early stopping.
     A mask ``tune`` names those that it is tuned by, in place of a draw.
     """
     fraction = spec.training.tune_fraction
-    if fraction == 0 and optimizer_of(spec.training.optimizer, check_networks(spec, dimensions)) == "em":
-        return train, train
+    if fraction == 0:
+        optimizer = optimizer_of(spec.training.optimizer, check_networks(spec, dimensions))
+        if optimizer == "em" or spec.training.library is not None:
+            return train, train
     if "tune" in train.masks:
         train = replace(train, masks={"valid": train.masks["tune"]})
     return train.split(fraction, spec.seed)

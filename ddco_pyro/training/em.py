@@ -5,7 +5,8 @@ its gradient g in every output, and the posterior in every table (the E-step). T
 
     (Σ_t h_t x_t x_t^T + R) (W' - W) = Σ_t x_t g_t^T - R W
 
-where h is the information that the posterior expects of an output and R a ridge. For the mean of a Gaussian, clipped or
+where h is the information that the posterior expects of an output and R a ridge. With a library W - W0 stands for W on
+the right (:class:`~ddco_pyro.training.prior.Prior`). For the mean of a Gaussian, clipped or
 not, this is the weighted least squares of the M-step (for a clipped one: of the censored moments, by Fisher's
 identity). For switches and terminations it is one Fisher scoring step. For categories and gates h is at least Fisher's
 information, one matrix for each output in place of one for each pair. σ follows in closed form.
@@ -20,6 +21,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -34,6 +36,9 @@ from ddco_pyro.model.networks.perceptrons import Mlp, StackedLinear
 from ddco_pyro.model.outputs import TERMINATION_BOUND, CallerOutputs, Outputs
 from ddco_pyro.model.tables import Tables
 from ddco_pyro.spec import RidgeSpec
+
+if TYPE_CHECKING:
+    from ddco_pyro.training.prior import Prior
 
 LARGEST = 3.0
 """The most that a weight of a logit changes in a step: Fisher scoring overshoots where a logistic curve is flat."""
@@ -140,14 +145,20 @@ class Linear:
     """One network of K linear maps, its weights in float64, the bias as the last row: [K, F, n].
 
     :param ridge: of all outputs but those whose ridge is in units of 1/σ².
+    :param library: the same network of a library, at whose weights the prior is centred; None for 0.
     """
 
-    def __init__(self, network: nn.Module, ridge: float, trained: bool) -> None:
+    def __init__(self, network: nn.Module, ridge: float, trained: bool, library: nn.Module | None = None) -> None:
         assert isinstance(network, Mlp)  # is_linear
-        (layer,) = network.layers
-        assert isinstance(layer, StackedLinear)
-        self.layer, self.ridge, self.trained, self.reads = layer, ridge, trained, tuple(network.reads)
-        self.weight = torch.cat([layer.weight.detach(), layer.bias.detach()], dim=1).double().cpu()
+        self.ridge, self.trained, self.reads = ridge, trained, tuple(network.reads)
+        self.layer = _layer(network)
+        self.weight = _weight(self.layer)
+        self._center = torch.zeros_like(self.weight) if library is None else _weight(_layer(library))
+
+    @property
+    def away(self) -> Tensor:
+        """The weights, from the centre of their prior."""
+        return self.weight - self._center
 
     def store(self) -> None:
         """Give the network these weights."""
@@ -156,14 +167,45 @@ class Linear:
             self.layer.bias.copy_(self.weight[:, -1:])
 
 
-class Std:
-    """σ of a caller's continuous dimensions, [K, C] float64, except where it depends on the state."""
+def _layer(network: nn.Module) -> StackedLinear:
+    assert isinstance(network, Mlp)  # is_linear
+    (layer,) = network.layers
+    assert isinstance(layer, StackedLinear)
+    return layer
 
-    def __init__(self, caller: Caller, trained: bool) -> None:
+
+def _weight(layer: StackedLinear) -> Tensor:
+    return torch.cat([layer.weight.detach(), layer.bias.detach()], dim=1).double().cpu()
+
+
+class Std:
+    """σ of a caller's continuous dimensions, [K, C] float64, except where it depends on the state.
+
+    :param count: how many controls the prior of σ stands for, of each copy and dimension.
+    :param library: the same caller of a library, whose σ these controls have; None where ``count`` is 0.
+    """
+
+    def __init__(self, caller: Caller, trained: bool, count: float = 0.0, library: Caller | None = None) -> None:
         assert caller.std is not None
-        self.module, self.trained = caller.std, trained
-        copies = caller.copies
-        self.value = self.module.table().detach().double().expand(copies, -1).clone()
+        self.module, self.trained, self.count = caller.std, trained, count
+        self.value = _stds(caller)
+        self._known = None if library is None else _stds(library)
+
+    @property
+    def learned(self) -> list[int]:
+        return [*self.module.own, *self.module.shared]
+
+    @property
+    def penalty(self) -> float:
+        """Minus the log-density of log σ under 1/σ² ~ Gamma(c/2, c s²/2), up to a constant."""
+        if self._known is None:
+            return 0.0
+        value, known = self.value[:, self.learned], self._known[:, self.learned]
+        return self.count * float((value.log() + 0.5 * (known / value).square()).sum())
+
+    def squares(self, places: Sequence[int]) -> Tensor | float:
+        """The sum of squares that the prior stands for, [K, C']."""
+        return 0.0 if self._known is None else self.count * self._known[:, list(places)].square()
 
     def updated(self, value: Tensor, square: Tensor, count: Tensor, places: Sequence[int]) -> Tensor:
         """A table of σ [K, C] with those at these places from sums of squares [K, C'] and counts [K]."""
@@ -188,6 +230,11 @@ class Std:
                 module.raw_own.copy_(raw[:, module.own])
 
 
+def _stds(caller: Caller) -> Tensor:
+    assert caller.std is not None
+    return caller.std.table().detach().double().cpu().expand(caller.copies, -1).clone()
+
+
 class Expectation:
     """EM steps of some networks of a hierarchy.
 
@@ -195,6 +242,7 @@ class Expectation:
     :param score: what is maximised of a piece of the demonstrations.
     :param discovering: d has levels 1 to d alone under a uniform meta-policy.
     :param roughly: whether the end is a start alone, for which :data:`MOST` steps and :data:`ROUGHLY` are enough.
+    :param prior: that of a library, in place of the ridges; None without one.
     :ivar steps: steps of the demonstrations that are learned from, once the first step has begun.
     :ivar value: the penalised log-likelihood of the weights that the last step began at.
     :ivar gain: the larger gain of the last two steps, nats per step; a stretched one that gains nothing may have gone
@@ -210,16 +258,23 @@ class Expectation:
         ridge: RidgeSpec,
         discovering: int | None = None,
         roughly: bool = False,
+        prior: Prior | None = None,
     ) -> None:
         self.model, self._score, self._discovering, self._ridge = model, score, discovering, ridge
-        self._roughly, self.steps = roughly, 0
-        levels = {f"levels.{number}.policy": level.policy for number, level in enumerate(model.option_levels())}
-        self._callers = {**levels, "meta_policy": model.meta_policy}
+        self._roughly, self.steps, self._bias = roughly, 0, BIAS
+        centers: Mapping[str, nn.Module] = {}
+        if prior is not None and prior.ridge:
+            self._ridge = RidgeSpec(policy=prior.ridge, gate=prior.ridge)
+            self._bias, centers = prior.ridge, prior.model.networks()
+        self._callers = model.named_callers()
         self._networks: dict[str, Linear] = {}
         for name, network in model.networks().items():
-            self._networks[name] = Linear(network, ridge.gate, f"{name}.".startswith(trained))
+            trains = f"{name}.".startswith(trained)
+            self._networks[name] = Linear(network, self._ridge.gate, trains, centers.get(name))
+        known: Mapping[str, Caller] = {} if prior is None else prior.model.named_callers()
+        spread = 0.0 if prior is None else prior.spread
         self._stds = {
-            name: Std(caller, self._networks[name].trained)
+            name: Std(caller, self._networks[name].trained, spread, known.get(name))
             for name, caller in self._callers.items()
             if caller.std is not None
         }
@@ -236,6 +291,10 @@ class Expectation:
         """The penalised log-likelihood of all demonstrations, nats."""
         value, sums = self._expect(batch)
         return value + self._penalty(sums)
+
+    def log_prior(self, batch: Batch) -> float:
+        """The log-density of the prior of what is trained, up to a constant, nats."""
+        return self._penalty(self._expect(batch)[1])
 
     def step(self, batch: Batch) -> float:
         """One EM step over the demonstrations; their log-likelihood before the step, nats.
@@ -298,25 +357,30 @@ class Expectation:
         for name, network in self._networks.items():
             if not network.trained:
                 continue
-            weight, log_stds = network.weight, 0.0
-            each = _penalties(weight, network.ridge)
+            away, log_stds = network.away, 0.0
+            each = self._penalties(away, network.ridge)
             caller = self._callers.get(name)
             choices = each.shape[1] if caller is None else caller.sizes[0]
-            each[:, choices:] = _penalties(weight[..., choices:], self._ridge.policy)
+            each[:, choices:] = self._penalties(away[..., choices:], self._ridge.policy)
             for group in sums[name].groups.values():
                 if group.std:
                     std, places = self._stds[name], list(group.std)
-                    sigma = std.value[:, places]
-                    each[:, group.columns] = _penalties(weight[..., group.columns], self._ridge.policy) / sigma.square()
-                    learned = [place for place in places if place in (*std.module.own, *std.module.shared)]
+                    squares = self._penalties(away[..., group.columns], self._ridge.policy)
+                    each[:, group.columns] = squares / std.value[:, places].square()
+                    learned = [place for place in places if place in std.learned]
                     log_stds += float(std.value[:, learned].log().sum())
-            policy = 0.5 * float(each[:, choices:].sum()) + self._prior_count(weight) * log_stds
+            policy = 0.5 * float(each[:, choices:].sum()) + self._prior_count(away) * log_stds
+            policy += self._stds[name].penalty if name in self._stds else 0.0
             total -= 0.5 * float(each[:, :choices].sum()) + float(self.model.power) * policy
         return total
 
     def _prior_count(self, weight: Tensor) -> int:
-        """How many numbers a mean's prior N(0, σ²/ρ) is of: the weights without the bias."""
-        return weight.shape[1] - 1 if self._ridge.policy else 0
+        """How many numbers a mean's prior N(W0, σ²/ρ) is of: the weights, with the bias where a library has one."""
+        return weight.shape[1] - (self._bias == BIAS) if self._ridge.policy else 0
+
+    def _penalties(self, away: Tensor, ridge: float) -> Tensor:
+        """Σ_f ρ_f W_f² of each copy and output, [K, n]."""
+        return (_ridges(away.shape[1], ridge, self._bias).unsqueeze(-1) * away.square()).sum(1)
 
     def _expect(self, batch: Batch) -> tuple[float, dict[str, Sums]]:
         """The E-step: the score, and the sums that the M-step solves for each network that is trained."""
@@ -395,6 +459,8 @@ class Expectation:
                     learned[name] = [Information(slice(0, 1), asked * ending * (1 - ending) * slope.square())]
             for reads, x in xs.items():
                 its = [name for name in of if name in sums and self._networks[name].reads == reads]
+                if not its:
+                    continue  # none of those that read these vectors is trained
                 gradients = x.gradients([of[name] for name in its])
                 pairs = [(name, group) for name in its for group in learned.get(name, ())]
                 each = [group.weight.flatten(0, 1).flatten(1) for _, group in pairs]
@@ -415,22 +481,23 @@ class Expectation:
             value = None if std is None else std.value
             for place, information in own.information.items():
                 group, columns = own.groups[place], own.groups[place].columns
-                gradient, weight = own.gradient[..., columns], network.weight[..., columns]
+                gradient, away = own.gradient[..., columns], network.away[..., columns]
                 if group.std:
                     assert std is not None
                     scale = std.value[:, list(group.std)].unsqueeze(1)  # [K, 1, n]
-                    ridge = _ridges(weight.shape[1], self._ridge.policy)
+                    ridge = _ridges(away.shape[1], self._ridge.policy, self._bias)
                     solved = torch.linalg.solve(
-                        information + ridge.diag(), scale.square() * gradient - ridge.unsqueeze(-1) * weight
+                        information + ridge.diag(), scale.square() * gradient - ridge.unsqueeze(-1) * away
                     )
                     count = own.counts[place]
-                    square = self._squares(std, own.std, group, information, count, gradient, weight, solved)
+                    square = self._squares(std, own.std, group, information, count, gradient, away, solved)
+                    square, count = square + std.squares(group.std), count + self._prior_count(away) + std.count
                     assert value is not None
-                    value = std.updated(value, square, count + self._prior_count(weight), group.std)
+                    value = std.updated(value, square, count, group.std)
                 else:
                     emitted = name in self._callers and columns.start >= self._callers[name].sizes[0]
                     strength = self._ridge.policy if emitted else network.ridge
-                    solved = _damped(information, gradient, weight, strength)
+                    solved = _damped(information, gradient, away, _ridges(away.shape[1], strength, self._bias))
                 change[..., columns] = solved
             network.weight = network.weight + change
             if std is not None and std.trained and value is not None:
@@ -438,34 +505,28 @@ class Expectation:
 
     def _squares(
         self, std: Std, of_std: Tensor | float, group: Information, information: Tensor, count: Tensor,
-        gradient: Tensor, weight: Tensor, change: Tensor,
+        gradient: Tensor, away: Tensor, change: Tensor,
     ) -> Tensor:  # fmt: skip
-        """Σ w E[(a - W'^T x)²] + Σ_f ρ_f W'_f² of each copy and dimension, [K, n], from the gradient in σ (Fisher's
-        identity).
+        """Σ w E[(a - W'^T x)²] + Σ_f ρ_f (W' - W0)_f² of each copy and dimension, [K, n], from the gradient in σ
+        (Fisher's identity).
         """
         assert isinstance(of_std, Tensor)
         sigma = std.value[:, list(group.std)]
         before = sigma.square() * (count.unsqueeze(1) + sigma * of_std[:, list(group.std)])
         moved = (change * (information @ change)).sum(1) - 2 * sigma.square() * (change * gradient).sum(1)
-        return before + moved + _penalties(weight + change, self._ridge.policy)
+        return before + moved + self._penalties(away + change, self._ridge.policy)
 
 
 @cache
-def _ridges(features: int, ridge: float) -> Tensor:
+def _ridges(features: int, ridge: float, bias: float) -> Tensor:
     """The ridge of each feature, [F]."""
-    return torch.tensor([max(ridge, BIAS)] * (features - 1) + [BIAS], dtype=torch.float64)
+    return torch.tensor([max(ridge, BIAS)] * (features - 1) + [bias], dtype=torch.float64)
 
 
-def _penalties(weight: Tensor, ridge: float) -> Tensor:
-    """Σ_f ρ_f W_f² of each copy and output, [K, n]."""
-    return (_ridges(weight.shape[1], ridge).unsqueeze(-1) * weight.square()).sum(1)
-
-
-def _damped(information: Tensor, gradient: Tensor, weight: Tensor, ridge: float) -> Tensor:
+def _damped(information: Tensor, gradient: Tensor, away: Tensor, ridges: Tensor) -> Tensor:
     """A Fisher scoring step [K, F, n], at most :data:`LARGEST` in any weight of a copy."""
-    each = _ridges(weight.shape[1], ridge)
-    right = gradient - each.unsqueeze(-1) * weight
-    step = torch.linalg.solve(information + each.diag(), right.mT.unsqueeze(-1)).squeeze(-1).mT
+    right = gradient - ridges.unsqueeze(-1) * away
+    step = torch.linalg.solve(information + ridges.diag(), right.mT.unsqueeze(-1)).squeeze(-1).mT
     most = step.abs().amax((1, 2), keepdim=True)
     return step * (LARGEST / most.clamp(min=LARGEST))
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
@@ -142,15 +142,16 @@ class Way:
     ordered: bool = False
 
 
-WAYS: Mapping[Start, Way] = {
+WAYS: Mapping[Start | Literal["library"], Way] = {
     "vq": Way(),
     "vq_controls": Way(controls=True),
     "windows": Way(controls=True, windowed=True),
     "equal_parts": Way("parts", ordered=True),
     "mixture": Way(controls=True, memoryless=True),
     "random": Way(""),
+    "library": Way(""),
 }
-"""Every way to begin, by its name in a spec."""
+"""Every way to begin, by its name in a spec, and that of a model with a library (``training.library``)."""
 
 
 # --- labels and clusters ----------------------------------------------------------------------------------------------

@@ -123,7 +123,7 @@ class StageTraining:
         optimizer = optimizer_of(self.spec.optimizer, model)
         if optimizer == "em":
             ridge, discovering = self.spec.optimizer.ridge, stage.discovering
-            self.whole = Expectation(model, stage.trained, self._score, ridge, discovering, roughly=not last)
+            self.whole = Expectation(model, stage.trained, self._score, ridge, discovering, not last, data.library)
         elif optimizer == "lbfgs":
             gradient = partial(backward, self.objective)
             self.whole = QuasiNewton(model, gradient, self.spec.optimizer.weight_decay)
@@ -258,12 +258,14 @@ class StageTraining:
         """
         train, model = self.data.train, self.data.hierarchy(self.restart.progress.restart, self.restart.states["best"])
         if isinstance(self.whole, Expectation):
-            score = Expectation(model, EVERYTHING, self._score, self.spec.optimizer.ridge).objective(train)
+            ridge, library = self.spec.optimizer.ridge, self.data.library
+            score = Expectation(model, EVERYTHING, self._score, ridge, prior=library).objective(train)
         else:
             with torch.no_grad():
                 pieces = train.pieces(model.steps_at_once)
                 tables = ((self.objective.tables(model, piece, rows), piece.lengths) for rows, piece in pieces)
                 score = sum(float(self.objective.values(*pair).sum()) for pair in tables)
+                score += 0.0 if self.data.library is None else float(self.data.library.log_density(model))
         return score / train.steps
 
     def end(self, cap: int | None) -> None:
@@ -276,7 +278,8 @@ class StageTraining:
 def backward(objective: Objective, model: Hierarchy, batch: Batch, rows: Tensor, steps: int | None = None) -> float:
     """Add the gradient of the loss of some demonstrations to the parameters' gradients.
 
-    The loss is minus the objective per step. A batch that is long is processed in pieces.
+    The loss is minus the objective per step, and minus the log-prior of a library per step of all training
+    demonstrations. A batch that is long is processed in pieces.
 
     :param rows: the demonstrations, [M].
     :param steps: of the minibatch of which the demonstrations are a shard; None where they are all of it.
@@ -291,6 +294,11 @@ def backward(objective: Objective, model: Hierarchy, batch: Batch, rows: Tensor,
             raise objective.diverged(tables, piece.lengths, rows[part])
         (-value / (steps or batch.steps)).backward()  # posteriors weight the networks' gradients
         total += float(value.detach())
+    if (library := objective.data.library) is not None:
+        share = batch.steps / objective.data.train.steps  # of the prior, which all demonstrations have once
+        prior = share * library.log_density(model)
+        (-prior / (steps or batch.steps)).backward()  # type: ignore[no-untyped-call]
+        total += float(prior.detach())
     return total / objective.likelihoods
 
 

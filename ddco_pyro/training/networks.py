@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import nn
 
@@ -18,6 +19,7 @@ from ddco_pyro.data.controls import (
     control_dimensions,
     control_parts,
     refuse_unknown_dimensions,
+    same,
 )
 from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
 from ddco_pyro.model.encoder import Shapes
@@ -59,6 +61,26 @@ class Dimensions:
             raise DemonstrationsError(all_constant(control))
         shapes, size = demonstrations.observation_shapes, demonstrations.control_size
         return cls(shapes, size, max(demonstrations.lengths), constant, control)
+
+    def like(self, model: Hierarchy, name: str) -> Dimensions:
+        """With the kinds of control of a fitted model, which is to be the prior of another one.
+
+        :param name: of the model, for errors.
+        :raises DemonstrationsError: observations or the control have other shapes, or a dimension varies here alone.
+        """
+        scaling, shapes = model.scaling, model.encoder.shapes
+        wrong = [key for key, shape in shapes.items() if tuple(self.shapes[key]) != shape]
+        if wrong or self.control_size != scaling.size:
+            place = f"obs/{wrong[0]}" if wrong else "actions"
+            here, there = (self.shapes[wrong[0]], shapes[wrong[0]]) if wrong else (self.control_size, scaling.size)
+            raise DemonstrationsError(f"{place}: has shape {here} at each step, and in {name} {there}")
+        others = sorted({*range(scaling.size)} - {*scaling.varying.tolist()})
+        constant = dict(zip(others, scaling.constant.tolist(), strict=True))
+        for dimension, value in constant.items():
+            if not same(np.array(self.constant.get(dimension, np.nan)), np.array(value)):
+                text = f"control dimension {dimension} is not always {value:g}, as in {name}"
+                raise DemonstrationsError(f"{text}; the library's tasks have to vary it")
+        return replace(self, steps=model.steps, constant=constant, parts=scaling.parts)
 
 
 def build_hierarchy(spec: Spec, dimensions: Dimensions, seed: int | None = None) -> Hierarchy:

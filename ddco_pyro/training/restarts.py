@@ -26,25 +26,28 @@ import torch
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.errors import BadInput
 from ddco_pyro.events import OnEvent, RestartDiverged, RestartStopped, TrainingBegan, TrainingEnded, ignore
-from ddco_pyro.inference.engines import STEPS, TRAJECTORIES, EngineCheck, compare_engines
+from ddco_pyro.inference.engines import STEPS, TRAJECTORIES, EngineCheck, compare_engines, log_likelihood
 from ddco_pyro.inference.paths import segment
 from ddco_pyro.jobs import Workers, run_all
 from ddco_pyro.metrics import Recogniser
-from ddco_pyro.model.batch import encode, refuse_unusable
+from ddco_pyro.model.batch import Batch, encode, refuse_unusable
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.seeding import seeded
+from ddco_pyro.model.tables import Tables
 from ddco_pyro.spec import Spec, with_overrides
 from ddco_pyro.training.checkpoint import Progress, Restart, TrainingData, copy_of
 from ddco_pyro.training.data import tuning_split
+from ddco_pyro.training.em import Expectation
 from ddco_pyro.training.labels import Labels
 from ddco_pyro.training.loop import train
 from ddco_pyro.training.networks import Dimensions, build_hierarchy, model_name
 from ddco_pyro.training.objective import TrainingError
 from ddco_pyro.training.optimizers import optimizer_of
+from ddco_pyro.training.prior import Prior
 from ddco_pyro.training.processes import Ranks, described, device_of, one_thread
 from ddco_pyro.training.recognition import recognise
 from ddco_pyro.training.ridge import cross_validated
-from ddco_pyro.training.stages import plan, starts_of
+from ddco_pyro.training.stages import EVERYTHING, plan, starts_of
 
 SOUNDING, BY_GRADIENT = 5, 50
 """Epochs of the last stage before restarts are compared: of EM, and of gradient steps."""
@@ -75,18 +78,19 @@ def train_model(
     held_out: Demonstrations | None = None,
     name: str | None = None,
     jobs: int = 1,
+    library: Prior | None = None,
 ) -> Trainer:
     """Train a spec's model on demonstrations, of which ``training.tune_fraction`` are used to tune.
 
     :param held_out: demonstrations to be evaluated; networks have to be able to read them.
     :param name: of the model in events.
-    :param checkpoints: as of :class:`Trainer`, and so are the others.
+    :param checkpoints: as of :class:`Trainer`, and so are ``jobs`` and ``library``.
     :raises DemonstrationsError: a number is too large for networks.
     :raises TrainingError: a log-likelihood is not finite, or the engines disagree.
     """
     with one_thread():
         split = tuning_split(spec, dimensions, demos)
-        trainer = Trainer(spec, dimensions, *split, checkpoints, on_event, jobs)
+        trainer = Trainer(spec, dimensions, *split, checkpoints, on_event, jobs, library)
         if held_out is not None:
             refuse_unusable(held_out, trainer.hierarchy.encoder, trainer.hierarchy.scaling)
         trainer.check_engines()
@@ -118,6 +122,7 @@ class Trainer:
     :param checkpoints: the folder for a checkpoint of each restart; None for nowhere.
     :param jobs: processes that train restarts side by side, each a whole one; -1 is one for each core. The result is
         the same for any number. Under ``torchrun`` its processes train each restart together (:func:`follow`).
+    :param library: the prior that the spec's ``training.library`` is.
     :raises DemonstrationsError: a number is too large for networks.
     :raises SpecError: the demonstrations lack the labels that the spec names, or have more labels than options.
     """
@@ -131,18 +136,27 @@ class Trainer:
         checkpoints: Path | None = None,
         on_event: OnEvent = ignore,
         jobs: int = 1,
+        library: Prior | None = None,
     ) -> None:
         self.spec, self.checkpoints, self.on_event, self.ranks = spec, checkpoints, on_event, Ranks.here()
         self.jobs = Workers(jobs).number(len(starts_of(spec)))
         self.hierarchy = build_hierarchy(spec, dimensions)
         encoder, scaling = self.hierarchy.encoder, self.hierarchy.scaling
-        encoder.fit(train)
-        scaling.fit(train)
-        encoded = encode(train, encoder, scaling), encode(tune, encoder, scaling)
+        if library is None:
+            encoder.fit(train)
+            scaling.fit(train)
+        else:
+            encoder.load_state_dict(library.model.encoder.state_dict())
+            scaling.load_state_dict(library.model.scaling.state_dict())
+        known = library is not None
+        encoded = encode(train, encoder, scaling, known), encode(tune, encoder, scaling, known)
         fitted = encoder.state_dict(), scaling.state_dict()
-        self.data = TrainingData(spec, dimensions, *encoded, train.names, *fitted, Labels.of(spec, train, tune))
+        labels = Labels.of(spec, train, tune)
+        self.data = TrainingData(spec, dimensions, *encoded, train.names, *fitted, labels, library=library)
         self.ridge = ridge = spec.training.optimizer.ridge.policy
-        if self._optimizer == "em" and spec.training.optimizer.ridge.cross_validated:
+        if library is not None and library.ridge:
+            self.ridge = library.ridge
+        elif self._optimizer == "em" and spec.training.optimizer.ridge.cross_validated:
             self.ridge = cross_validated(self.hierarchy, encoded[0], ridge, self.data.seed(0))
             raised = with_overrides(spec, {"training.optimizer.ridge.policy": self.ridge})
             self.data = replace(self.data, spec=raised)
@@ -159,6 +173,8 @@ class Trainer:
     def check_engines(self) -> None:
         """Compare the engines before any training, on a few of the training demonstrations.
 
+        EM's log-prior of a library is compared with that of the Pyro program, at random weights and at the library's.
+
         :raises TrainingError: they disagree, or a network gives values that are not finite.
         """
         batch = self.data.train
@@ -170,12 +186,29 @@ class Trainer:
                 "before any training a network gives values that are NaN or infinite; look at its code, or at the "
                 "ranges of the observations (ddco-pyro inspect)"
             )
-        self.check = check = compare_engines(outputs, few.actions, few.lengths)
+        check = compare_engines(outputs, few.actions, few.lengths)
+        if self.data.library is not None and self._optimizer == "em":
+            gap = self._prior_gap(self.data.library, few)
+            check = check._replace(value=max(check.value, gap))
+        self.check = check
         if not check.agrees:
             raise TrainingError(
                 f"the engines disagree (value {check.value:.1e}, gradient {check.gradient:.1e}): "
                 "this is a defect; use inference.engine=enumerate and report it"
             )
+
+    def _prior_gap(self, library: Prior, batch: Batch) -> float:
+        """The relative difference between EM's log-prior and the program's; densities have constants of their own."""
+
+        def score(tables: Tables, piece: Batch, rows: torch.Tensor) -> torch.Tensor:
+            return log_likelihood(tables, piece.lengths).sum()
+
+        models = self.hierarchy, self.data.hierarchy(0, {**self.hierarchy.state_dict(), **copy_of(library.model)})
+        ridge = self.spec.training.optimizer.ridge
+        by_em = [Expectation(one, EVERYTHING, score, ridge, prior=library).log_prior(batch) for one in models]
+        with torch.no_grad():
+            by_program = [float(library.log_density(one)) for one in models]
+        return abs(by_em[1] - by_em[0] - by_program[1] + by_program[0]) / max(1.0, abs(by_program[1] - by_program[0]))
 
     def run(self) -> Hierarchy:
         """Train, and return the best restart's hierarchy in evaluation mode.

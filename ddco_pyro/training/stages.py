@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from ddco_pyro.spec import Spec, Start
 from ddco_pyro.training.initialization import WAYS
@@ -44,8 +44,10 @@ class Stage:
     memoryless: bool = False
 
 
-def starts_of(spec: Spec) -> tuple[Start, ...]:
+def starts_of(spec: Spec) -> tuple[Start | Literal["library"], ...]:
     """The ways in which the restarts of a model begin. A policy without options has random weights alone."""
+    if spec.training.begins_at_library:
+        return ("library",)
     starts: tuple[Start, ...] = spec.training.starts
     if spec.hierarchy is None:
         starts = tuple(start for start in starts if start == "random") or ("random",)
@@ -57,6 +59,8 @@ def plan(spec: Spec, depth: int, restart: int = 0) -> list[Stage]:
     training = spec.training
     if depth == 0:
         return [Stage("policy", None, None, EVERYTHING)]
+    if training.begins_at_library:
+        return [Stage("joint", None, None, EVERYTHING)]
     stages: list[Stage] = []
     way = WAYS[starts_of(spec)[restart]]
     mixed = way.memoryless

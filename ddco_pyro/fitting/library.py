@@ -1,0 +1,152 @@
+"""Libraries: which model of a run is the prior of a new task's, and how strong a prior its own tasks choose."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.files import json_text, write_text
+from ddco_pyro.errors import BadInput
+from ddco_pyro.evaluation.inferred import infer
+from ddco_pyro.events import OnEvent, ignore
+from ddco_pyro.fitting.fitted import Fit, load
+from ddco_pyro.jobs import Workers, run_all
+from ddco_pyro.spec import Spec, SpecError, load_spec, user_code, with_overrides
+from ddco_pyro.spec.yaml import dump_yaml, read_mapping
+from ddco_pyro.training.data import dimensions, train_and_valid
+from ddco_pyro.training.networks import Dimensions
+from ddco_pyro.training.prior import Prior
+from ddco_pyro.training.restarts import train_model
+
+STRENGTHS = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
+"""The ridges among which the tasks of a library choose."""
+
+TASK = "task"
+"""The attribute of a demonstration that says of which task it is."""
+
+STORED = "library.json"
+"""The file of a run with the strength that its tasks have chosen."""
+
+
+def library_of(spec: Spec) -> Fit | None:
+    """The model of a spec's library that has the same networks: of the run, or of one of its baselines.
+
+    :raises RunError: there is no such run.
+    :raises SpecError: no model of the run has the same observations, control and networks.
+    """
+    if (given := spec.training.library) is None:
+        return None
+    run = load(given.run, allow_code=bool(user_code(spec)))
+    models = [run, *run.baselines.values()]
+    for one in models:
+        if _model(one.spec) == _model(spec):
+            return one
+    nearest = min(models, key=lambda one: sum(_model(one.spec)[key] != own for key, own in _model(spec).items()))
+    differing = next(key for key, own in _model(spec).items() if _model(nearest.spec)[key] != own)
+    raise SpecError(
+        f"training.library.run: {given.run} has no model with this {differing}; take observations, control and "
+        f"networks of {Path(given.run) / 'spec.yaml'} (ddco-pyro fit NEW.yaml --library {given.run} does)"
+    )
+
+
+def _model(spec: Spec) -> Mapping[str, Any]:
+    """What two specs have in common where the weights of one are a prior of the other's."""
+    return {key: getattr(spec, key) for key in ("observations", "control", "hierarchy", "baseline")}
+
+
+def dimensions_for(spec: Spec, demos: Demonstrations | None = None) -> Dimensions:
+    """The dimensions of the demonstrations that a spec names, with the kinds of control of its library.
+
+    :raises DemonstrationsError: the library's model cannot read the demonstrations.
+    """
+    size, library = dimensions(spec, demos), library_of(spec)
+    return size if library is None else size.like(library.hierarchy, library.place)
+
+
+def prior_of(spec: Spec, on_event: OnEvent = ignore, workers: Workers = Workers(1)) -> Prior | None:  # noqa: B008
+    """The prior that a spec's library is; None without one.
+
+    :raises BadInput: the spec leaves the strength to a library of a single task.
+    """
+    given, library = spec.training.library, library_of(spec)
+    if given is None or library is None:
+        return None
+    ridge = _strength(library, given.spread, on_event, workers) if given.ridge is None else given.ridge
+    return Prior(library.hierarchy, ridge, given.spread)
+
+
+def for_new_task(path: Path, run: Path, overrides: Iterable[str] = (), allow_code: bool = False) -> Spec:
+    """The spec of a library's run with what a file says of a new task, which trains on all demonstrations there are.
+
+    :raises SpecError: the file or the run's spec cannot be read, or together they are no valid spec.
+    """
+    alone = {
+        "compare_with": [],
+        "demonstrations": {"valid_fraction": 0, "leave_one_out": False, "hold_out_by": None, "exclude": []},
+        "training": {"tune_fraction": 0, "library": {"run": str(run)}},
+    }
+    said = [f"{key}={dump_yaml(value)}" for part in (alone, read_mapping(path, "spec")) for key, value in _leaves(part)]
+    return load_spec(run / "spec.yaml", [*said, *overrides], allow_code)
+
+
+def _leaves(data: Mapping[str, Any], place: str = "") -> Iterable[tuple[str, Any]]:
+    """The key paths in plain data, with their values."""
+    for key, value in data.items():
+        if isinstance(value, dict) and value:
+            yield from _leaves(value, f"{place}{key}.")
+        else:
+            yield f"{place}{key}", value
+
+
+# --- the strength that the library's tasks choose ---------------------------------------------------------------------
+
+
+def _strength(library: Fit, spread: float, on_event: OnEvent, workers: Workers) -> float:
+    """The ridge with which a task that is left out is predicted best from one demonstration, kept with the library.
+
+    For each task the model is fitted without it. Each of :data:`STRENGTHS` then adapts that model to the task's first
+    demonstration, and its others are predicted.
+
+    :raises BadInput: the demonstrations are of a single task.
+    """
+    kept = library.run_folder / STORED
+    if kept.exists():
+        return float(json.loads(kept.read_text(encoding="utf-8"))["ridge"])
+    demos = train_and_valid(library.spec, library.demonstrations)["train"]
+    by_task = defaultdict[str, list[str]](list)
+    for demo in demos:
+        by_task[str(demo.attributes.get(TASK, ""))].append(demo.name)
+    tasks = {task: names for task, names in by_task.items() if len(names) > 1}
+    if len(tasks) < 2:
+        text = f"{library.run_folder}: has demonstrations of {len(tasks)} task(s) with two or more, by the attribute"
+        raise BadInput(f"{text} {TASK!r}; say how strong a prior it is: training.library.ridge=30")
+    calls = {task: partial(_predicted, library.spec, demos, names, spread) for task, names in tasks.items()}
+    with run_all(calls, workers, "trained without a task") as found:
+        nats = np.mean([values for _, values in found], axis=0)
+    ridge = STRENGTHS[int(np.argmax(nats))]
+    about = {"ridge": ridge, "tasks": len(tasks), "nats_per_step": dict(zip(map(str, STRENGTHS), nats, strict=True))}
+    write_text(kept, json_text(about))
+    return ridge
+
+
+def _predicted(spec: Spec, demos: Demonstrations, names: Sequence[str], spread: float) -> list[float]:
+    """log p(ξ) per step of a task's demonstrations but the first, by a library without the task, for each strength."""
+    others = demos.select(name for name in demos.names if name not in names)
+    model = train_model(spec, Dimensions.of(others, spec.control.relative_to), others).hierarchy
+    first, rest = demos.select(names[:1]), demos.select(names[1:])
+    size = Dimensions.of(first, spec.control.relative_to).like(model, "the other tasks")
+    found = []
+    for ridge in STRENGTHS:
+        given = {"training.library": {"run": "the other tasks", "ridge": ridge}, "training.tune_fraction": 0}
+        prior = Prior(model, ridge, spread)
+        adapted = train_model(with_overrides(spec, given), size, first, library=prior).hierarchy
+        total = sum(float(piece.log_likelihood.sum()) for piece in infer(adapted, rest))
+        found.append(total / sum(rest.lengths))
+    return found
