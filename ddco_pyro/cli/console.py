@@ -277,6 +277,14 @@ def seeds(metrics: Metrics) -> None:
         show(Table(["Method", "mean", "95 % interval", "range"], rows, title=title))
 
 
+def library(fitted: Fit) -> None:
+    """Say how strong a prior the library of a fit is, and who chose that."""
+    given, ridge = fitted.spec.training.library, fitted.metrics.training.raised_ridge
+    if given is not None and ridge is not None:
+        chosen = ", which its own tasks chose" if given.ridge is None else ""
+        say(f"the weights begin at {given.run} and are drawn towards it by a ridge of {ridge:g}{chosen}")
+
+
 def names(fit: Fit) -> None:
     """The names in ``names.yaml``, with their agreement with labels, and the line there that takes proposed ones."""
     found = {(one.level, one.option): one for one in fit.metrics.named_by_labels}

@@ -154,6 +154,7 @@ def fit_and_report(
             fitted = repeat(fitted, seeds, progress, jobs)
     from ddco_pyro.report import write_report  # imports matplotlib, after the fit
 
+    console.library(fitted)
     console.skills(fitted)
     console.names(fitted)
     console.warnings(fitted)

@@ -180,7 +180,7 @@ def _fit_models(
     with run_all(calls, workers, "trained a baseline", on_event, True, True, waiting) as fitted_beside:
         with clock("training"):
             free, checkpoints = max(1, workers.number() - len(beside)), folder and folder / "checkpoints"
-            prior, held_out = prior_of(spec, on_event, Workers(free)), split.get("valid")
+            prior, held_out = prior_of(spec, Workers(free)), split.get("valid")
             trained = train_model(spec, size, split["train"], on_event, checkpoints, held_out, name, free, prior)
         specs |= {other: _with_recogniser(specs[other], trained.summary["recogniser"]) for other in later}
         with clock("baselines"):

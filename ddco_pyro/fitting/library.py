@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
@@ -15,7 +16,6 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import json_text, write_text
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.inferred import infer
-from ddco_pyro.events import OnEvent, ignore
 from ddco_pyro.fitting.fitted import Fit, load
 from ddco_pyro.jobs import Workers, run_all
 from ddco_pyro.spec import Spec, SpecError, load_spec, user_code, with_overrides
@@ -25,11 +25,14 @@ from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.prior import Prior
 from ddco_pyro.training.restarts import train_model
 
-STRENGTHS = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
+STRENGTHS = (3.0, 10.0, 30.0, 100.0, 300.0)
 """The ridges among which the tasks of a library choose."""
 
 TASK = "task"
 """The attribute of a demonstration that says of which task it is."""
+
+MOST_TASKS = 5
+"""Tasks that are left out in turn, at most."""
 
 STORED = "library.json"
 """The file of a run with the strength that its tasks have chosen."""
@@ -70,7 +73,7 @@ def dimensions_for(spec: Spec, demos: Demonstrations | None = None) -> Dimension
     return size if library is None else size.like(library.hierarchy, library.place)
 
 
-def prior_of(spec: Spec, on_event: OnEvent = ignore, workers: Workers = Workers(1)) -> Prior | None:  # noqa: B008
+def prior_of(spec: Spec, workers: Workers = Workers(1)) -> Prior | None:  # noqa: B008
     """The prior that a spec's library is; None without one.
 
     :raises BadInput: the spec leaves the strength to a library of a single task.
@@ -78,7 +81,7 @@ def prior_of(spec: Spec, on_event: OnEvent = ignore, workers: Workers = Workers(
     given, library = spec.training.library, library_of(spec)
     if given is None or library is None:
         return None
-    ridge = _strength(library, given.spread, on_event, workers) if given.ridge is None else given.ridge
+    ridge = _strength(library, given.spread, workers) if given.ridge is None else given.ridge
     return Prior(library.hierarchy, ridge, given.spread)
 
 
@@ -108,11 +111,11 @@ def _leaves(data: Mapping[str, Any], place: str = "") -> Iterable[tuple[str, Any
 # --- the strength that the library's tasks choose ---------------------------------------------------------------------
 
 
-def _strength(library: Fit, spread: float, on_event: OnEvent, workers: Workers) -> float:
+def _strength(library: Fit, spread: float, workers: Workers) -> float:
     """The ridge with which a task that is left out is predicted best from one demonstration, kept with the library.
 
-    For each task the model is fitted without it. Each of :data:`STRENGTHS` then adapts that model to the task's first
-    demonstration, and its others are predicted.
+    For each of :data:`MOST_TASKS` tasks the model is fitted without it, from the first of its starts. Each of
+    :data:`STRENGTHS` then adapts that model to the task's first demonstration, and its others are predicted.
 
     :raises BadInput: the demonstrations are of a single task.
     """
@@ -127,11 +130,12 @@ def _strength(library: Fit, spread: float, on_event: OnEvent, workers: Workers) 
     if len(tasks) < 2:
         text = f"{library.run_folder}: has demonstrations of {len(tasks)} task(s) with two or more, by the attribute"
         raise BadInput(f"{text} {TASK!r}; say how strong a prior it is: training.library.ridge=30")
-    calls = {task: partial(_predicted, library.spec, demos, names, spread) for task, names in tasks.items()}
+    chosen = list(tasks)[:: math.ceil(len(tasks) / MOST_TASKS)]
+    calls = {task: partial(_predicted, library.spec, demos, tasks[task], spread) for task in chosen}
     with run_all(calls, workers, "trained without a task") as found:
         nats = np.mean([values for _, values in found], axis=0)
     ridge = STRENGTHS[int(np.argmax(nats))]
-    about = {"ridge": ridge, "tasks": len(tasks), "nats_per_step": dict(zip(map(str, STRENGTHS), nats, strict=True))}
+    about = {"ridge": ridge, "tasks": chosen, "nats_per_step": dict(zip(map(str, STRENGTHS), nats, strict=True))}
     write_text(kept, json_text(about))
     return ridge
 
@@ -139,6 +143,7 @@ def _strength(library: Fit, spread: float, on_event: OnEvent, workers: Workers) 
 def _predicted(spec: Spec, demos: Demonstrations, names: Sequence[str], spread: float) -> list[float]:
     """log p(ξ) per step of a task's demonstrations but the first, by a library without the task, for each strength."""
     others = demos.select(name for name in demos.names if name not in names)
+    spec = with_overrides(spec, {"training.starts": spec.training.starts[:1]})
     model = train_model(spec, Dimensions.of(others, spec.control.relative_to), others).hierarchy
     first, rest = demos.select(names[:1]), demos.select(names[1:])
     size = Dimensions.of(first, spec.control.relative_to).like(model, "the other tasks")

@@ -142,14 +142,19 @@ class Objective:
         return likelihood(tables)
 
     def tune(self, model: Hierarchy) -> float:
-        """The objective per step of the tuning demonstrations: the mean, or the median over demonstrations."""
-        tune = self.data.tune
+        """The objective per step of the tuning demonstrations: the mean, or the median over demonstrations.
+
+        Where those are all that train, the log-prior of a library is part of it.
+        """
+        tune, training, prior = self.data.tune, self.data.spec.training, 0.0
         with torch.no_grad():
             each = self.ranks.each(partial(self._tuned, model, *piece) for piece in tune.pieces(model.steps_at_once))
             values = list(chain.from_iterable(each))
-        if self.data.spec.training.tune_by == "median":
-            return median(value / steps for value, steps in zip(values, tune.lengths.tolist(), strict=True))
-        return sum(values) / tune.steps
+            if self.data.library is not None and training.tune_fraction == 0:
+                prior = float(self.data.library.log_density(model)) / tune.steps
+        if training.tune_by == "median":
+            return prior + median(value / steps for value, steps in zip(values, tune.lengths.tolist(), strict=True))
+        return prior + sum(values) / tune.steps
 
     def _tuned(self, model: Hierarchy, rows: Tensor, batch: Batch) -> list[float]:
         values = self.values(self.tables(model, batch, rows, tuning=True), batch.lengths) / self.likelihoods

@@ -27,7 +27,7 @@ from ddco_pyro.spec.networks import SETTINGS, Network, UserNetworkSpec
 from ddco_pyro.spec.spec import MODEL
 
 ROOT = Path(__file__).parents[2]
-MOST = 110
+MOST = 114
 PATH = re.compile(r"([a-z_]+(?:\.[a-z_0-9{}]+)*)(?:=(.*))?", re.DOTALL)
 """A key path, or ``path=value`` of ``--set``."""
 
