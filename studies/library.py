@@ -6,13 +6,11 @@ python -m studies.library    # records its demonstrations and fits it: runs/meta
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.fitting.library import dimensions_for, prior_of
-from ddco_pyro.jobs import Workers
 from ddco_pyro.spec import load_spec, with_overrides
 from ddco_pyro.training.checkpoint import Progress, Restart
 from ddco_pyro.training.loop import StageTraining
@@ -69,20 +67,14 @@ WORLD = NewTasks()
 
 
 def make() -> Fit:
-    """Record the demonstrations of the library, and fit it with the strengths of its priors."""
+    """Record the demonstrations of the library, and fit options and baselines to all of its tasks together."""
     files = {task: RUNS / "library_demonstrations" / f"{task}.hdf5" for task in TASKS}
     for task, path in files.items():
         path.parent.mkdir(parents=True, exist_ok=True)
         if not path.exists():
             WORLD.collect(task, SEEDS, EACH, path)
     demos = [_named(demo, task) for task, path in files.items() for demo in Demonstrations.read(path)]
-    spec = load_spec(SPEC)
-    fitted = fit(spec, Demonstrations(tuple(demos)), LIBRARY)
-    for one in (fitted, *fitted.baselines.values()):
-        given = {"training.library": {"run": str(LIBRARY.relative_to(Path.cwd()))}, "compare_with": []}
-        prior = prior_of(with_overrides(one.spec, given), workers=Workers(-1))
-        print(one.name, "" if prior is None else prior.ridge)
-    return fitted
+    return fit(load_spec(SPEC), Demonstrations(tuple(demos)), LIBRARY)
 
 
 def _named(demo: Demonstration, task: str) -> Demonstration:
