@@ -97,7 +97,8 @@ def refuse_unfit(spec: Spec, demos: Demonstrations) -> None:
         if why := network_input(observed.shape[1:], observed.dtype)[1]:
             raise DemonstrationsError(f"obs/{key} {why}")
     training = spec.training
-    if training.tune_fraction > 0 or training.optimizer.name != "em" or spec.compare_with:  # or one is enough
+    needs_no_tuning = training.library is not None or (training.optimizer.name == "em" and not spec.compare_with)
+    if training.tune_fraction > 0 or not needs_no_tuning:  # or one is enough
         check_trained(train_and_valid(spec, demos)["train"].names)
 
 

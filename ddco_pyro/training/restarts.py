@@ -187,7 +187,7 @@ class Trainer:
                 "ranges of the observations (ddco-pyro inspect)"
             )
         check = compare_engines(outputs, few.actions, few.lengths)
-        if self.data.library is not None and self._optimizer == "em":
+        if self.data.library is not None and self.data.library.ridge and self._optimizer == "em":
             gap = self._prior_gap(self.data.library, few)
             check = check._replace(value=max(check.value, gap))
         self.check = check

@@ -150,6 +150,7 @@ def test_a_ridge_of_0_leaves_the_weights_alone():
     demos, _ = plant(truth, 4, 30, seed=1)
     spec = with_overrides(spec, {"training.library": {"run": "known", "ridge": 0, "spread": 5}, "training.epochs": 20})
     trainer = Trainer(spec, Dimensions.of(demos), demos, demos, library=Prior(library, 0.0, 5.0))
+    trainer.check_engines()
     trainer.run()
     assert [restart["start"] for restart in trainer.summary["restarts"]["each"]] == ["vq"]
     assert trainer.hierarchy.encoder.state_dict().keys() == library.encoder.state_dict().keys()
