@@ -15,7 +15,9 @@ from typing import Annotated, Any, ClassVar, Generic, NamedTuple, TypeVar
 from pydantic import (
     BaseModel,
     ConfigDict,
+    Discriminator,
     Field,
+    Tag,
     TypeAdapter,
     ValidationError,
     model_validator,
@@ -422,7 +424,11 @@ class Mean(Record):
     interval: tuple[Finite, Finite] | None
 
 
-Measure = Rate | Mean
+def _kind(measure: Any) -> str:
+    return "[Rate]" if isinstance(measure, Rate) or (isinstance(measure, dict) and "rate" in measure) else "[Mean]"
+
+
+Measure = Annotated[Annotated[Rate, Tag("[Rate]")] | Annotated[Mean, Tag("[Mean]")], Discriminator(_kind)]
 """A measure of episodes."""
 
 

@@ -31,7 +31,7 @@ from ddco_pyro.drawing.shown import frames, in_words, jpeg, positions, projectio
 from ddco_pyro.drawing.words import duration, number, percent
 from ddco_pyro.evaluation.options import diagnose
 from ddco_pyro.fitting.fitted import Fit
-from ddco_pyro.metrics import NamedByLabel, Use
+from ddco_pyro.metrics import Alike, NamedByLabel, Use
 from ddco_pyro.names import numbered_name, option_name
 from ddco_pyro.report.inputs import deciding
 from ddco_pyro.segmenting.segments import Segmented
@@ -210,6 +210,8 @@ def section(fit: Fit, every: Sequence[Skill], shown: Shown, segmented: Segmented
         for choice, one in present.items():
             facts = _facts(one.use, one.share, one.found, counts, names, segmented.frequency)
             facts |= {f"Label {labels}, agreement": told for labels, told in one.labels.items()}
+            if near := _nearest(choice, fit.metrics.divergences[place], names):
+                facts["Most like"] = near
             if finding := whole.get((1 + place, choice)):
                 facts["No skill"] = finding.deed(segmented.frequency)
             facts |= {what: values[choice] for what, values in reads.get(level, {}).items() if choice in values}
@@ -249,6 +251,15 @@ def _facts(
         "Comes after": _frequent(counts[:, use.choice], [*names, "start"]),
         "Comes before": _frequent(counts[use.choice], [*names, "end"]),
     }
+
+
+def _nearest(choice: int, pairs: Sequence[Alike], names: Sequence[str]) -> str:
+    """The option from which an option's policy differs least, in words; empty for the only one, and for control."""
+    known = [(one.divergence, *one.options) for one in pairs if choice in one.options and one.divergence is not None]
+    if not known:
+        return ""
+    apart, first, second = min(known)
+    return f"{option_name(first if second == choice else second, names)}, {number(apart)} nats per step apart"
 
 
 def _frequent(counts: np.ndarray, names: Sequence[str], most: int = 2) -> str:
