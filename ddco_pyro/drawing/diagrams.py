@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -179,23 +180,30 @@ def paths_of_options(paths: Sequence[np.ndarray], options: Sequence[np.ndarray])
     return svg(WIDTH, WIDTH / 2, "Trajectories coloured by option", parts)
 
 
-def curves(values: Mapping[str, Sequence[np.ndarray]], colour: str) -> Markup:
-    """A panel for each name: lines over the steps since the onset.
+def curves(
+    values: Mapping[str, Sequence[np.ndarray]],
+    looks: Sequence[Mapping[str, Any]],
+    columns: int = 2,
+    width: float = 1.5 * CELL,
+) -> Markup:
+    """A panel for each name: lines over time, between the largest and the smallest number.
 
-    :param values: of each instance [T_n].
+    :param values: of each line [T_n].
+    :param looks: attributes of the lines, in turn.
     """
-    columns, width, height = min(2, len(values)), 1.5 * CELL, 0.8 * CELL
+    columns, height = min(columns, len(values)), 0.9 * CELL
     parts: list[str] = []
     for place, (name, each) in enumerate(values.items()):
         low, high = min(array.min() for array in each), max(array.max() for array in each)
         longest = max(max(map(len, each)) - 1, 1)
         parts.append(f'<g transform="translate({width * (place % columns):.0f},{height * (place // columns):.0f})">')
-        parts.append(f'<rect x="2" y="16" width="{width - 6:.0f}" height="{height - 20:.0f}" class="faint"/>')
-        parts.append(_text(4, 11, f"{name} ({low:.3g} to {high:.3g})", "start"))
-        for array in each:
-            across = 5 + (width - 12) * np.arange(len(array)) / longest
-            down = height - 8 - (height - 28) * (array - low) / ((high - low) or 1)
-            parts.append(line(np.stack([across, down], axis=1), stroke=colour, stroke_width=1.2, opacity=0.75))
+        parts.append(f'<rect x="2" y="16" width="{width - 8:.0f}" height="{height - 22:.0f}" class="faint"/>')
+        parts += [_text(2, 11, name, "start"), _text(width - 9, 26, f"{high:.3g}", "end", "soft")]
+        parts.append(_text(width - 9, height - 9, f"{low:.3g}", "end", "soft"))
+        for array, look in zip(each, cycle(looks), strict=False):
+            across = 6 + (width - 50) * np.arange(len(array)) / longest
+            down = height - 11 - (height - 33) * (array - low) / ((high - low) or 1)
+            parts.append(line(np.stack([across, down], axis=1), stroke_width=1.2, opacity=0.75, **look))
         parts.append("</g>")
     rows = -(-len(values) // columns)
-    return svg(columns * width, rows * height, "Numbers since the onset", parts)
+    return svg(columns * width, rows * height, "Numbers over time", parts)

@@ -338,7 +338,7 @@ class Shown:
             for one in chosen[:INSTANCES]
         ]
         values = {f"control[{n}]": [array[:, n].astype(float) for array in every] for n in range(every[0].shape[1])}
-        return Drawing(curves(values, option_colour(choice)), caption)
+        return Drawing(curves(values, [{"stroke": option_colour(choice)}]), caption)
 
 
 def sheet_of(pictures: Sequence[Observed], chosen: Sequence[Instance], where: str) -> Picture:

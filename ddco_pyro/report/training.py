@@ -3,18 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.ticker import MaxNLocator
 
 from ddco_pyro.data.likeness import reasons_told
-from ddco_pyro.drawing.figures import INK, blank, save
-from ddco_pyro.drawing.page import Code, Columns, Facts, Folded, Section, note
+from ddco_pyro.drawing.diagrams import WIDTH, curves
+from ddco_pyro.drawing.page import Code, Columns, Drawing, Facts, Folded, Section, note
 from ddco_pyro.drawing.words import number, rate
 from ddco_pyro.evaluation import verdicts
 from ddco_pyro.evaluation.options import degeneracies
@@ -24,7 +18,8 @@ from ddco_pyro.names import method
 from ddco_pyro.spec import dump_spec
 
 COLUMNS = 4
-TUNE = "#c2410c"
+LOOKS = ({"stroke": "var(--ink)"}, {"stroke": "#c2410c", "stroke_dasharray": "4 1.5"})
+"""Of training and of tuning demonstrations."""
 
 STAGES = {
     "vq": "“From clusters” trains each option of a level on a cluster of steps, so that options differ from the "
@@ -48,92 +43,43 @@ def _stage_name(name: str) -> str:
     return f"level {level} {how}" if how else whole.get(name, name)
 
 
-@dataclass(frozen=True)
-class Curves:
-    """One stage of one model: for each restart an array of (epoch, train, tune) [E, 3], nats per step."""
-
-    model: str
-    stage: str
-    restarts: Sequence[np.ndarray]
-
-    @property
-    def title(self) -> str:
-        """Model and stage in words."""
-        return f"{method(self.model)}: {_stage_name(self.stage)}"
-
-
 def learning(fit: Fit) -> Section | None:
     """Learning curves of the model and its baselines; None where there is no history."""
-    fits = {fit.name: fit, **fit.baselines}
-    paths = {name: one.run_folder / "history.csv" for name, one in fits.items()}
-    curves = read_curves({name: path for name, path in paths.items() if path.exists()})
-    if not curves:
+    stages: dict[tuple[str, str], dict[str, list[tuple[float, float]]]] = {}
+    for name, one in {fit.name: fit, **fit.baselines}.items():
+        path = one.run_folder / "history.csv"
+        rows = read_table(path, _epoch, refit(path.parent, "it and metrics.json")) if path.exists() else []
+        for stage, restart, values in rows:
+            stages.setdefault((name, stage), {}).setdefault(restart, []).append(values)
+    if not stages:
         return None
+    panels = {
+        f"{method(name)}: {_stage_name(stage)}": _cut([np.array(epochs) for epochs in restarts.values()])
+        for (name, stage), restarts in stages.items()
+    }
     caption = (
-        "Log-likelihood per step over epochs. Each stage of training has a panel with a scale of its own, and each "
-        "restart a pair of lines. A steep start may be cut off."
+        "Log-likelihood per step over epochs of training (solid) and tuning demonstrations (dashed). Each stage of "
+        "training has a panel with a scale of its own, and each restart a pair of lines. A steep start is cut off."
     )
-    alt = "Learning curves of the stages " + ", ".join(curve.title for curve in curves)
-    names = list(dict.fromkeys(curve.stage for curve in curves))
+    names = dict.fromkeys(stage for _, stage in stages)
     kinds = dict.fromkeys(name.partition("-")[0] for name in names)
     explained = [STAGES[kind] for kind in kinds if kind in STAGES]
     explained.append(f"In history.csv and on the console the stages are {', '.join(names)}.")
-    picture = save(draw_curves(curves), fit.run_folder / "figures" / "learning.png", alt, caption)
-    return Section("learning", "Learning curves", [picture, note(" ".join(explained))], folded=True)
+    drawing = Drawing(curves(panels, LOOKS, COLUMNS, WIDTH / COLUMNS), caption)
+    return Section("learning", "Learning curves", [drawing, note(" ".join(explained))], folded=True)
 
 
-def read_curves(histories: Mapping[str, Path]) -> list[Curves]:
-    """The stages in ``history.csv`` of each model, in the order of training."""
-    curves = []
-    for model, path in histories.items():
-        rows = read_table(path, _epoch, refit(path.parent, "it and metrics.json"))
-        for stage in dict.fromkeys(stage for stage, _, _ in rows):
-            own = [(restart, values) for name, restart, values in rows if name == stage]
-            numbers = dict.fromkeys(restart for restart, _ in own)
-            restarts = [np.array([values for restart, values in own if restart == number]) for number in numbers]
-            curves.append(Curves(model, stage, restarts))
-    return curves
+def _epoch(row: Mapping[str, str]) -> tuple[str, str, tuple[float, float]]:
+    """The stage, the restart, and the log-likelihoods of an epoch."""
+    return row["stage"], row["restart"], (float(row["train"]), float(row["tune"]))
 
 
-def _epoch(row: Mapping[str, str]) -> tuple[str, int, list[float]]:
-    """The stage, restart and numbers of an epoch."""
-    return row["stage"], int(row["restart"]), [float(row[key]) for key in ("epoch", "train", "tune")]
-
-
-def draw_curves(curves: Sequence[Curves]) -> Figure:
-    """A panel for each stage, a pair of lines for each restart."""
-    columns = min(COLUMNS, len(curves))
-    rows = -(-len(curves) // columns)
-    figure = blank(0.4 + 2.1 * rows)
-    panels = figure.subplots(rows, columns, squeeze=False)
-    for axes, stage in zip(panels.flat, curves, strict=False):
-        _panel(axes, stage)
-    for axes in panels.flat[len(curves) :]:
-        axes.set_visible(False)
-    for axes in panels[:, 0]:
-        axes.set_ylabel("nats per step")
-    lines = [Line2D([], [], color=INK), Line2D([], [], color=TUNE, linestyle=(0, (4, 1.5)))]
-    figure.legend(lines, ["training demonstrations", "tuning demonstrations"], loc="outside lower center", ncols=2)
-    return figure
-
-
-def _panel(axes: Axes, stage: Curves) -> None:
-    alpha = 1.0 if len(stage.restarts) == 1 else 0.6
-    for curve in stage.restarts:
-        axes.plot(curve[:, 0], curve[:, 1], color=INK, linewidth=1.1, alpha=alpha)
-        axes.plot(curve[:, 0], curve[:, 2], color=TUNE, linewidth=1.1, alpha=alpha, linestyle=(0, (4, 1.5)))
-    limits = _limits(np.concatenate([curve[:, 1:] for curve in stage.restarts]))
-    axes.set(title=stage.title, xlabel="epoch", ylim=limits)
-    axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
-
-
-def _limits(values: np.ndarray) -> tuple[float, float]:
-    """Limits that cut off a steep rise of the first epochs, which would flatten the rest."""
-    low, bottom, top = float(values.min()), float(np.percentile(values, 10)), float(values.max())
-    if top - low > 3 * (top - bottom) > 0:
-        low = top - 3 * (top - bottom)
-    margin = 0.05 * (top - low) or 1.0
-    return low - margin, top + margin
+def _cut(restarts: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Both lines of each restart [E, 2], above a steep rise of the first epochs, which would flatten the rest."""
+    every = np.concatenate(restarts)
+    bottom, top = np.percentile(every, 10), every.max()
+    least = top - 3 * (top - bottom) if top > bottom else every.min()
+    return [values for epochs in restarts for values in np.maximum(epochs, least).T]
 
 
 # --- doubts -----------------------------------------------------------------------------------------------------------
