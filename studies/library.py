@@ -37,7 +37,7 @@ TASKS = (
 EACH, SEEDS = 10, range(70_000_000, 70_000_500)
 """Demonstrations of each task, and the seeds of the expert's episodes."""
 
-SPEC, LIBRARY = ROOT / "studies" / "library_task.yaml", RUNS / "library"
+SPEC, LIBRARY = ROOT / "specs" / "metaworld_library.yaml", RUNS / "library"
 
 CHOOSING = ("levels.0.termination.", "meta_policy.")
 """What is trained where options are frozen."""
