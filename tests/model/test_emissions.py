@@ -280,8 +280,10 @@ def test_probabilities_sum_to_one_and_other_values_have_none(kind):
         "binary": torch.cartesian_prod(torch.arange(2.0), torch.arange(2.0)),
         "categorical": torch.arange(4.0).unsqueeze(1),
     }[kind].double()
-    total = sum(emission.log_density(action.expand(2, 3, size)).exp() for action in every)
-    torch.testing.assert_close(total, torch.ones_like(total))
+    each = torch.stack([emission.log_density(action.expand(2, 3, size)).exp() for action in every])
+    torch.testing.assert_close(each.sum(0), torch.ones_like(each[0]))
+    for k in range(2):
+        assert torch.equal(emission.log_density(emission.mode[..., k, :])[..., k].exp(), each.max(0)[0][..., k])
     for other in (torch.full((2, 3, size), 0.5), torch.full((2, 3, size), -1.0), torch.full((2, 3, size), 7.0)):
         assert (emission.log_density(other.double()) == -INF).all()
 
