@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ddco_pyro.data.arrays import NUMBERS, usable
 from ddco_pyro.data.demonstration import number
+from ddco_pyro.data.tasks import one_hot
 from ddco_pyro.errors import BadInput, check_whole
 from ddco_pyro.inference.logspace import arrive
 from ddco_pyro.model.ahmm import Acting, Tabulated, choose
@@ -22,7 +23,7 @@ from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs, States
 from ddco_pyro.model.tables import Step, complete
 from ddco_pyro.names import option_name
-from ddco_pyro.spec import OptionExecution
+from ddco_pyro.spec import TASK, OptionExecution
 
 ControlExecution = Literal["mean", "sample"]
 
@@ -234,7 +235,10 @@ class Window:
         if key not in observation:
             known = ", ".join(sorted(map(str, observation)))
             raise ObservationError(f"the observation has no {key!r} (it has: {known})")
-        value = numbers(f"observation {key!r}", observation[key], tuple(shape))
+        given = observation[key]
+        if key == TASK and isinstance(given, str):
+            given = one_hot(given, self.encoder.tasks)
+        value = numbers(f"observation {key!r}", given, tuple(shape))
         if key in self.encoder.images and value.dtype != np.uint8:
             raise ObservationError(f"observation {key!r} is {value.dtype}, it has to be uint8")
         return value

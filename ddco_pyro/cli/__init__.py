@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import wraps
 from pathlib import Path
 from shutil import get_terminal_size
@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal, get_type_hints
 import typer
 
 from ddco_pyro.data.files import Output, check_outputs
+from ddco_pyro.errors import BadInput
 
 NARROW = get_terminal_size().columns < 60
 """Whether tables of help would cut the names of options: help is plain text then."""
@@ -82,7 +83,29 @@ SpecPath = Annotated[Path, typer.Argument(metavar="SPEC", help="The spec, a YAML
 Overrides = Annotated[
     list[str], typer.Option("--set", metavar="KEY=VALUE", help="Override a key of the spec; repeatable.")
 ]
+Wheres = Annotated[
+    list[str],
+    typer.Option(
+        "--where",
+        metavar="ATTRIBUTE=VALUE",
+        help="Only demonstrations with this value of an attribute, such as task=reach; repeatable.",
+    ),
+]
 RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="The folder of a finished fit.")]
 AllowCode = Annotated[
     bool, typer.Option("--allow-code", help="Import the user code (module:name) that the spec names.")
 ]
+
+
+def where_of(wheres: Iterable[str]) -> dict[str, list[str]]:
+    """The values of each attribute that ``--where`` names.
+
+    :raises BadInput: one of them is no ``ATTRIBUTE=VALUE``.
+    """
+    where: dict[str, list[str]] = {}
+    for text in wheres:
+        attribute, _, value = text.partition("=")
+        if not attribute or not value:
+            raise BadInput(f"--where {text}: write ATTRIBUTE=VALUE, such as task=reach")
+        where.setdefault(attribute, []).append(value)
+    return where

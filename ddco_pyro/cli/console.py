@@ -14,7 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemaini
 from rich.text import Text
 
 from ddco_pyro.data.arrays import LARGEST
-from ddco_pyro.data.controls import described, notes
+from ddco_pyro.data.controls import described, few, notes
 from ddco_pyro.data.errors import printable
 from ddco_pyro.drawing import words
 from ddco_pyro.drawing.page import Table
@@ -344,6 +344,10 @@ def inspection(facts: Inspection) -> None:
     ]
     for line in lines:
         say(printable(line))
+    if facts.several:
+        _tasks(facts)
+    elif facts.tasks:
+        say(printable(f"tasks: {few([*facts.tasks])}" if len(facts.tasks) < 4 else f"tasks: {len(facts.tasks)}"))
     rows = [
         [field.place, str(list(field.shape)), str(field.dtype), _range(field), _notes(field)]
         for field in facts.fields.values()
@@ -351,6 +355,25 @@ def inspection(facts: Inspection) -> None:
     show(Table(["", "a step", "type", "range", "notes"], [list(map(printable, row)) for row in rows], range(5)))
     for line in (*facts.notes, *(f"problem: {problem}" for problem in facts.problems)):
         say(printable(line))
+
+
+def _tasks(facts: Inspection) -> None:
+    """A row for each task: its demonstrations, their steps, and the arrays that only some tasks have."""
+    partial = [field for field in facts.fields.values() if field.demonstrations < len(facts.lengths)]
+    rows = []
+    for task, names in facts.tasks.items():
+        steps = [facts.lengths[name] for name in names]
+        has = [field.place for field in partial if {*names} <= {*field.having}]
+        row = [
+            task or "none",
+            str(len(names)),
+            f"{min(steps)} to {max(steps)}",
+            f"{np.median(steps):g}",
+            ", ".join(has),
+        ]
+        rows.append(list(map(printable, row)))
+    head = ["task", "demonstrations", "steps", "median", "only some have"]
+    show(Table(head, rows, {0, 4}))
 
 
 def annotators(found: Mapping[str, Annotators], tolerance: int) -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from ddco_pyro.cli import AllowCode, Overrides, SpecPath, out_file, out_stream, written
+from ddco_pyro.cli import AllowCode, Overrides, SpecPath, Wheres, out_file, out_stream, where_of, written
 from ddco_pyro.data.files import write_text
 from ddco_pyro.data.formats import FORMATS
 from ddco_pyro.errors import BadInput, Failed, command
@@ -21,6 +21,9 @@ from ddco_pyro.spec.yaml import read_yaml
 if TYPE_CHECKING:
     from ddco_pyro.data.inspection import Inspection
     from ddco_pyro.data.starting import Decided
+    from ddco_pyro.data.tasks import Where
+
+NOTHING: Where = {}
 
 SourcePath = Annotated[
     Path, typer.Argument(metavar="FILE", help=f"Demonstrations: {', '.join(about.text for about in FORMATS.values())}.")
@@ -55,6 +58,7 @@ def inspect(
     against: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Compare labels with those of another annotator instead.")
     ] = None,
+    wheres: Wheres = [],  # noqa: B006
     tolerance: Annotated[int, typer.Option(min=0, help="Steps between boundaries that match, for --against.")] = 5,
 ) -> None:
     """Print the contents of a file: keys, shapes, lengths, ranges, NaN, constant dimensions, masks, a starting spec."""
@@ -65,7 +69,7 @@ def inspect(
     from ddco_pyro.data.inspection import inspect as look
     from ddco_pyro.data.starting import starting_spec
 
-    facts = look(file, form)
+    facts = look(file, form, where=where_of(wheres))
     if as_json:
         print(json.dumps(facts.as_json(), indent=1))
         return
@@ -114,13 +118,14 @@ def init(
     segments: Annotated[
         int | None, typer.Option(min=1, help="The same by the number of segments in a demonstration.")
     ] = None,
+    wheres: Wheres = [],  # noqa: B006
     force: Annotated[bool, typer.Option("--force", help="Replace a file that is there already.")] = False,
 ) -> None:
     """Write a commented spec for a file of demonstrations, ready to fit.
 
     Without --segment or --segments, options do not switch within half a second, or five steps, all the time.
     """
-    write_spec(file, out, hold_out_by, segment, segments, force)
+    write_spec(file, out, hold_out_by, segment, segments, force, where_of(wheres))
     print(f"{out}: fit it with: {command('fit', out, '--out', f'runs/{out.stem}')}")
 
 
@@ -131,6 +136,7 @@ def write_spec(
     segment: str | None = None,
     segments: int | None = None,
     force: bool = False,
+    where: Where = NOTHING,
 ) -> None:
     """Write the spec of ``init``, and print what was decided."""
     from ddco_pyro.data.inspection import inspect as look
@@ -139,7 +145,7 @@ def write_spec(
 
     if out.exists() and not force:
         raise BadInput(f"{out}: exists; choose another --out, or replace it with --force")
-    facts = look(file)
+    facts = look(file, where=where)
     refuse_foreign(file)
     starting = starting_spec(facts, file, hold_out_by)
     spec = parse_spec(read_yaml(starting.text))
@@ -175,7 +181,9 @@ def _decided(spec: Spec, facts: Inspection, segment: str | None, segments: int |
 
 
 def import_(
-    source: SourcePath,
+    sources: Annotated[
+        list[Path], typer.Argument(metavar="FILE...", help="Demonstrations, as inspect takes them; several are pooled.")
+    ],
     out: Annotated[Path, written(out_file, "The HDF5 file to write.")],
     form: FormatOption = None,
     observations: Annotated[
@@ -190,6 +198,7 @@ def import_(
         ),
     ] = [],  # noqa: B006
     mask: Annotated[str | None, typer.Option(help="Import only the demonstrations of this mask (filter key).")] = None,
+    wheres: Wheres = [],  # noqa: B006
     videos: Annotated[bool, typer.Option("--videos", help="Decode the videos of a LeRobot dataset too.")] = False,
     image_size: Annotated[
         int | None, typer.Option(min=8, max=4096, help="Scale pictures to so many pixels in height and width.")
@@ -218,8 +227,9 @@ def import_(
         bool, typer.Option("--skip-broken", help="Leave out demonstrations that cannot be used, and list them.")
     ] = False,
 ) -> None:
-    """Write demonstrations of another format into this project's layout.
+    """Write demonstrations of another format, or of several files, into this project's layout.
 
+    Of several files, each is a task unless the demonstrations name theirs. What only some have is left out, and said.
     With --labels, FILE may have this layout already.
     """
     from ddco_pyro.cli import console
@@ -231,9 +241,10 @@ def import_(
         raise BadInput("--fps, --columns and --unit are about the table of --labels; give it, or --hz for another rate")
     size = (image_size, image_size) if image_size else None
     table = LabelTable(labels, _columns(columns), unit, fps) if labels else None
-    choice = Choice(tuple(observations), mask, videos, size, hz, skip_broken, tuple(actions), table)
+    where = where_of(wheres)
+    choice = Choice(tuple(observations), mask, videos, size, hz, skip_broken, tuple(actions), table, where)
     with console.Progress("importing") as progress:
-        imported = import_demonstrations(source, out, form, choice, lambda *done: progress(DemonstrationsDone(*done)))
+        imported = import_demonstrations(sources, out, form, choice, lambda *done: progress(DemonstrationsDone(*done)))
     for name, reason in imported.left_out.items():
         print(f"left out {name}: {reason}", file=sys.stderr)
     for line in imported.notes:

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ddco_pyro.cli import AllowCode, Overrides, SpecPath, out_folder, written
+from ddco_pyro.cli import AllowCode, Overrides, SpecPath, Wheres, out_folder, where_of, written
 from ddco_pyro.errors import BadInput, Failed, command
 from ddco_pyro.events import Event, Log
 from ddco_pyro.jobs import Workers
-from ddco_pyro.spec import Spec, SpecError, dump_spec, load_spec, spec_schema, user_code
+from ddco_pyro.spec import Spec, SpecError, dump_spec, load_spec, spec_schema, user_code, with_overrides
 
 if TYPE_CHECKING:
     from ddco_pyro.fitting.fitted import Fit
@@ -64,6 +64,7 @@ def fit(
             metavar="RUN", help="A run of other tasks, at whose options this one begins; SPEC then says what differs."
         ),
     ] = None,
+    wheres: Wheres = [],  # noqa: B006
     jobs: Annotated[
         int | None,
         typer.Option(
@@ -108,6 +109,8 @@ def fit(
             from ddco_pyro.fitting.library import for_new_task
 
             loaded = for_new_task(spec, library, overrides, allow_code)
+        if wheres:
+            loaded = with_overrides(loaded, {"demonstrations.where": where_of(wheres)})
         if ranks.size > 1 and jobs not in (None, 1):
             raise SpecError(f"--jobs {jobs}: the processes of torchrun train together; leave --jobs out")
         jobs = 1 if ranks.size > 1 else -1 if jobs is None else jobs

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import webbrowser
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from ddco_pyro.cli import AllowCode, demos
+from ddco_pyro.cli import AllowCode, Wheres, demos, where_of
 from ddco_pyro.cli.starting import refuse_other
 from ddco_pyro.data.files import Output, check_outputs
 from ddco_pyro.errors import BadInput
@@ -43,6 +44,7 @@ def label(
         float, typer.Option(min=0, max=1, help="The share of demonstrations that two annotators label.")
     ] = 0.0,
     level: Level = None,
+    wheres: Wheres = [],  # noqa: B006
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page; 0 is any that is free.")] = 0,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")] = True,
     allow_code: AllowCode = False,
@@ -73,7 +75,8 @@ def label(
 
     people = Team(annotator, tuple(filter(None, team.split(","))), twice)
     names = _names(skills)
-    run = paths[0] if len(paths) == 2 else _fitted(file, len(names))
+    where = where_of(wheres)
+    run = paths[0] if len(paths) == 2 else _fitted(file, len(names), where)
     listening = Listening.at(port)
 
     def ready() -> None:
@@ -83,9 +86,9 @@ def label(
 
     with one_thread():  # a demonstration is inferred sooner so, and a refit has a core of its own
         fit = load(run, allow_code)
-        first = Session(fit, file, place, level, names, people)
+        first = Session(fit, file, place, level, names, people, where=where)
         others = [own for own in fit.names if own != first.level]
-        sessions = [first, *(Session(fit, file, place, own, (), people, first) for own in others)]
+        sessions = [first, *(Session(fit, file, place, own, (), people, first, where) for own in others)]
         for session in sessions:
             session.beside = [other for other in sessions if other is not session]
             session.journal.at(listening.address)
@@ -104,7 +107,7 @@ def _names(skills: str | None) -> list[str]:
     return names
 
 
-def _fitted(file: Path, count: int = 0) -> Path:
+def _fitted(file: Path, count: int = 0, where: Mapping[str, Sequence[str]] = {}) -> Path:
     """A run fitted to the file, without baselines and report; a finished one is used again.
 
     Of a dataset of another library, the numbers are imported for it.
@@ -127,7 +130,7 @@ def _fitted(file: Path, count: int = 0) -> Path:
         if foreign and not numbers.exists():
             import_demonstrations(file, numbers)
         if not spec.exists():
-            demos.write_spec(numbers, spec)
+            demos.write_spec(numbers, spec, where=where)
         options = [f"hierarchy.levels.0.count={count}"] if count else []
         with console.Progress() as progress:
             fit(load_spec(spec, ["compare_with=[]", *options]), None, run, progress)

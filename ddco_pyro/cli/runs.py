@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ddco_pyro.cli import BRACKET, KINDS, AllowCode, Overrides, RunPath, out_folder, written
+from ddco_pyro.cli import BRACKET, KINDS, AllowCode, Overrides, RunPath, Wheres, out_folder, where_of, written
 from ddco_pyro.data.files import Output, check_outputs
 from ddco_pyro.errors import BadInput
 from ddco_pyro.segmenting.formats import FORMATS, check_format, write_format
@@ -144,6 +144,7 @@ def segment(
         ),
     ] = False,
     level: Annotated[str | None, typer.Option(help="The level that gives the subtasks; the lowest by default.")] = None,
+    wheres: Wheres = [],  # noqa: B006
     fps: Annotated[
         float | None,
         typer.Option(min=0.001, help="Steps per second; by default the control frequency that DEMOS says."),
@@ -189,7 +190,7 @@ def segment(
     fit = load(run, allow_code)
     if level is not None and fit.names and level not in fit.names:
         raise BadInput(f"--level: there is no level {level!r} (there is: {', '.join(fit.names)})")
-    with open_source(demos) as source, console.Progress("segmenting") as progress:
+    with open_source(demos, where=where_of(wheres)) as source, console.Progress("segmenting") as progress:
         beside = baseline_labels(fit) if baselines else ()
         subtasks = level or next(iter(fit.names), "")
         asked = [

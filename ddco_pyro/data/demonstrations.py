@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from numbers import Real
 from pathlib import Path
 from typing import overload
 
-import numpy as np
-
-from ddco_pyro.data.demonstration import Attribute, Demonstration, check, needed
-from ddco_pyro.data.division import problems_of_masks, split_by_masks, unknown
+from ddco_pyro.data.demonstration import NOTHING, Attribute, Demonstration, check, needed
+from ddco_pyro.data.division import drawn, problems_of_masks, split_by_masks, unknown
 from ddco_pyro.data.errors import DemonstrationsError
+from ddco_pyro.data.hdf5 import natural
+from ddco_pyro.data.labels import BOUNDARY, LABEL_NAMES, SOURCE, label_names
 from ddco_pyro.data.memory import refuse_too_much
 from ddco_pyro.data.sources import open_source, refuse_foreign
 from ddco_pyro.data.sources.robomimic import frequency_of, robomimic_file, write_demonstration
+from ddco_pyro.data.tasks import NAMES, TASKS, Where, are_several, chosen, of_tasks, task_of, with_task
 from ddco_pyro.errors import check_whole, path_of
 
 
@@ -62,15 +64,18 @@ class Demonstrations(Sequence[Demonstration]):
         observations: Sequence[str] | None = None,
         labels: Sequence[str] | None = None,
         exclude: Sequence[str] = (),
+        where: Where = NOTHING,
     ) -> Demonstrations:
         """The demonstrations in an HDF5 file, ``demo_2`` before ``demo_10``.
 
         :param observations: keys to read; all if None, and none if empty.
         :param labels: names of the ground-truth labels to read; likewise.
         :param exclude: names of demonstrations that are not read and are removed from masks.
+        :param where: attributes and values, such as ``{"task": ["reach"]}``: others are not read either.
         :raises DemonstrationsError: the file cannot be read, lacks something asked for, or does not fit into memory.
         """
-        with stored(path_of(path, "demonstrations"), observations, labels, exclude) as (found, masks, attributes):
+        whole = path_of(path, "demonstrations")
+        with stored(whole, observations, labels, exclude, where) as (found, masks, attributes):
             refuse_too_much(
                 needed(found, copies=0), "reading it", "read only some observations, or scale pictures down"
             )
@@ -123,6 +128,11 @@ class Demonstrations(Sequence[Demonstration]):
         return int(self.demonstrations[0].actions.shape[1])
 
     @property
+    def tasks(self) -> tuple[str, ...]:
+        """The task of each demonstration, in order; empty texts where none is named."""
+        return tuple(task_of(demo.attributes) for demo in self.demonstrations)
+
+    @property
     def frequency(self) -> float | None:
         """Control steps per second, Hz; None if unknown."""
         return frequency_of(self.attributes)
@@ -143,7 +153,7 @@ class Demonstrations(Sequence[Demonstration]):
         """Training and validation demonstrations, at least one each.
 
         The split follows the masks ``train`` and ``valid``; one mask leaves the rest to the other. Without these masks,
-        ``valid_fraction`` of the demonstrations are drawn with ``seed`` for validation.
+        ``valid_fraction`` of the demonstrations of each task are drawn with ``seed`` for validation.
 
         :raises DemonstrationsError: one part is empty, the masks overlap, or the fraction is not from 0 to below 1.
         """
@@ -152,11 +162,39 @@ class Demonstrations(Sequence[Demonstration]):
             raise DemonstrationsError(f"valid_fraction={valid_fraction!r}: has to be a number from 0 to below 1")
         masks = self.masks
         if not masks.keys() & {"train", "valid"}:
-            number = min(max(round(valid_fraction * len(self)), 1), len(self) - 1)
-            drawn = np.random.default_rng(seed).permutation(len(self))[:number]
-            masks = {"valid": tuple(self.names[index] for index in sorted(drawn))}
+            masks = {"valid": drawn({demo.name: demo.attributes for demo in self}, valid_fraction, seed)}
         train, valid = split_by_masks(self.names, masks)
         return self.select(train), self.select(valid)
+
+
+def with_tasks(demos: Demonstrations, tasks: Sequence[str] = ()) -> Demonstrations:
+    """Demonstrations with the observation ``task``.
+
+    :param tasks: of its numbers; if empty, those of the demonstrations in alphabetical order.
+    :raises DemonstrationsError: a demonstration names no task, and no tasks are given.
+    """
+    for name, task in zip(demos.names, demos.tasks, strict=True):
+        if not (task or tasks):
+            wanted = " or ".join(NAMES)
+            raise DemonstrationsError(f"observations: task: {name} names none; give it the attribute {wanted}")
+    tasks = tasks or sorted({*demos.tasks}, key=natural)
+    each = tuple(with_task(demo, tasks) for demo in demos)
+    return replace(demos, demonstrations=each, attributes={**demos.attributes, TASKS: json.dumps(tasks)})
+
+
+def with_labels_of_tasks(demos: Demonstrations) -> Demonstrations:
+    """Demonstrations of several tasks with labels that differ between tasks, unless the file names them."""
+    known = label_names(demos.attributes)
+    labels = [key for key in demos[0].labels if key not in known and not key.endswith((BOUNDARY, SOURCE))]
+    if not labels or not are_several(demos.tasks):
+        return demos
+    each, names = [dict(demo.labels) for demo in demos], dict[str, list[str]]()
+    for key in labels:
+        values, names[key] = of_tasks(demos.tasks, [demo.labels[key] for demo in demos])
+        each = [{**own, key: new} for own, new in zip(each, values, strict=True)]
+    parts = tuple(Demonstration.stored(**{**vars(demo), "labels": own}) for demo, own in zip(demos, each, strict=True))
+    about = {**demos.attributes, LABEL_NAMES: json.dumps(known | names)}
+    return replace(demos, demonstrations=parts, attributes=about)
 
 
 def not_demonstrations(given: object) -> DemonstrationsError:
@@ -173,9 +211,15 @@ Stored = tuple[list[Demonstration], dict[str, tuple[str, ...]], Mapping[str, Att
 
 @contextmanager
 def stored(
-    path: Path, observations: Sequence[str] | None, labels: Sequence[str] | None, exclude: Sequence[str]
+    path: Path,
+    observations: Sequence[str] | None,
+    labels: Sequence[str] | None,
+    exclude: Sequence[str],
+    where: Where = NOTHING,
 ) -> Iterator[Stored]:
     """The demonstrations of an HDF5 file, open, without the excluded ones; no observation is read.
+
+    :param where: as :func:`~ddco_pyro.data.tasks.chosen` takes it.
 
     :raises DemonstrationsError: the file cannot be read, or lacks something asked for.
     """
@@ -188,5 +232,9 @@ def stored(
         if set(exclude) == set(source.names):
             raise DemonstrationsError("demonstrations.exclude: leaves every demonstration out; keep some")
         demos = [source.read(name, observations, labels) for name in source.names if name not in exclude]
-        masks = {mask: tuple(name for name in names if name not in exclude) for mask, names in source.masks.items()}
+        left_out = {*exclude}
+        if where:
+            names = chosen({demo.name: demo.attributes for demo in demos}, where)
+            left_out, demos = {*source.names} - {*names}, [demo for demo in demos if demo.name in names]
+        masks = {mask: tuple(name for name in names if name not in left_out) for mask, names in source.masks.items()}
         yield demos, masks, source.attributes

@@ -6,9 +6,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from ddco_pyro.data.demonstration import Attribute
 from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.hdf5 import natural
+from ddco_pyro.data.tasks import Known, by_task, by_value
 from ddco_pyro.errors import nearest
 
 LEAST = 3
@@ -36,24 +36,14 @@ def split_by_masks(names: Sequence[str], masks: Mapping[str, Sequence[str]]) -> 
     return train, valid
 
 
-def with_values(
-    attribute: str, known: Mapping[str, Mapping[str, Attribute]], fraction: float, seed: int
-) -> dict[str, tuple[str, ...]]:
+def with_values(attribute: str, known: Known, fraction: float, seed: int) -> dict[str, tuple[str, ...]]:
     """Demonstrations to hold out by some values of an attribute, about a fraction of all: their names by value.
 
     :param known: the attributes of each demonstration by its name.
     :param seed: draws the order in which values are tried.
     :raises DemonstrationsError: a demonstration lacks the attribute, or all have one value.
     """
-    members: dict[str, tuple[str, ...]] = {}
-    for name, own in known.items():
-        if attribute not in own:
-            there = ", ".join(dict.fromkeys(key for one in known.values() for key in one)) or "none"
-            raise DemonstrationsError(
-                f"{name} has no attribute {attribute!r}{nearest(attribute, own)}; there is: {there}"
-            )
-        value = str(own[attribute])
-        members[value] = (*members.get(value, ()), name)
+    members = {value: tuple(names) for value, names in by_value(attribute, known).items()}
     if len(members) == 1:
         (value,) = members
         raise DemonstrationsError(f"attribute {attribute!r} is {value} in all demonstrations; hold out by another one")
@@ -65,6 +55,21 @@ def with_values(
             chosen[values[place]], number = members[values[place]], more
     chosen = chosen or dict([min(members.items(), key=lambda one: len(one[1]))])
     return {value: chosen[value] for value in values if value in chosen}
+
+
+def drawn(known: Known, fraction: float, seed: int) -> tuple[str, ...]:
+    """Demonstrations to hold out, about a fraction of those of each task: at least one of each that has two.
+
+    Those that are alone with their task are one more group.
+
+    :param known: the attributes of each demonstration by its name.
+    """
+    random, held_out, tasks = np.random.default_rng(seed), set[str](), by_task(known).values()
+    alone = [name for names in tasks if len(names) == 1 for name in names]
+    for names in (*(names for names in tasks if len(names) > 1), alone):
+        number = min(max(round(fraction * len(names)), 1), len(names) - 1)
+        held_out |= {names[place] for place in random.permutation(len(names))[:number]}
+    return tuple(name for name in known if name in held_out)
 
 
 def check_division(names: Sequence[str], masks: Mapping[str, Sequence[str]]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -11,13 +12,16 @@ import numpy as np
 
 from ddco_pyro.data.annotations import LabelTable, labels_of_table
 from ddco_pyro.data.arrays import NUMBERS, LazyArray, Observed, is_picture, network_input
+from ddco_pyro.data.controls import few
 from ddco_pyro.data.demonstration import Demonstration, check, check_values
 from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.labels import BOUNDARY, LABEL_NAMES, SOURCE, UNKNOWN
 from ddco_pyro.data.pictures import resized
 from ddco_pyro.data.sources import Source, open_source
+from ddco_pyro.data.sources.folder import open_pooled
 from ddco_pyro.data.sources.metadata import FREQUENCY
 from ddco_pyro.data.sources.robomimic import robomimic_file, write_demonstration
+from ddco_pyro.data.tasks import Where, task_of
 from ddco_pyro.errors import BadInput, nearest
 
 
@@ -34,6 +38,7 @@ class Choice:
     :param skip_broken: whether unusable demonstrations are left out rather than refused.
     :param actions: names in the source of the arrays that are the control together; if empty, the usual ones.
     :param labels: a table of segments that become labels.
+    :param where: attributes and values of the demonstrations to import; all if empty.
     """
 
     observations: tuple[str, ...] = ()
@@ -44,6 +49,7 @@ class Choice:
     skip_broken: bool = False
     actions: tuple[str, ...] = ()
     labels: LabelTable | None = None
+    where: Where = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -65,22 +71,25 @@ class Imported:
 
 
 def import_demonstrations(
-    source: str | Path,
+    source: str | Path | Sequence[Path],
     out: Path,
     form: str | None = None,
     choice: Choice = Choice(),
     on_demonstration: Callable[[int, int], None] = lambda done, total: None,
 ) -> Imported:
-    """Write the demonstrations of a file or folder into ``out``, whole or not at all.
+    """Write the demonstrations of a file or folder, or of several that are pooled, into ``out``, whole or not at all.
 
-    Memory holds one demonstration at a time, of pictures a block.
+    Of several tasks, observations that only some have are left out unless they are chosen. Memory holds one
+    demonstration at a time, of pictures a block.
 
     :raises DemonstrationsError: the source cannot be read, or a demonstration cannot be used.
     :raises BadInput: ``out`` exists, or the table of labels does not fit.
     """
     if out.exists():
         raise BadInput(f"{out}: is there already; choose another --out, or remove it")
-    with open_source(source, form, choice.actions) as whole:
+    paths = [Path(source)] if isinstance(source, str | Path) else [*source]
+    pooled = open_pooled(paths, form, choice.actions, choice.where) if len(paths) > 1 else None
+    with pooled or open_source(paths[0], form, choice.actions, choice.where) as whole:
         table, counts, notes = None, dict[str, int](), list[str]()
         if choice.labels:
             whole = replace(whole, frequency=choice.labels.rate or whole.frequency)
@@ -90,27 +99,29 @@ def import_demonstrations(
         names, masks, rate = _names(whole, choice), dict[str, tuple[str, ...]](), choice.hz or whole.frequency
         about = {**whole.attributes, **({FREQUENCY: rate} if rate else {})}
         about |= {LABEL_NAMES: table.names} if table else {}
-        about |= {"source": Path(source).name, "source_format": whole.format}
-        left_out = _unusable(whole, names, choice)  # before pictures are decoded
+        about |= {"source": ", ".join(path.name for path in paths), "source_format": whole.format}
+        alone = _of_some_tasks(whole, names)
+        chosen = partial(_chosen, whole, choice=choice, alone=alone)
+        left_out = _unusable(names, chosen)  # before pictures are decoded
         _refuse(left_out, names, choice)
         first: Demonstration | None = None
         with robomimic_file(out, about, masks) as data:
             for number, name in enumerate(names):
                 if name not in left_out:
                     try:
-                        demo = _chosen(whole, name, choice)
+                        demo = chosen(name)
                         check_values(demo, pictures=choice.skip_broken)
                         write_demonstration(data, demo)
                     except DemonstrationsError as error:
                         left_out[name] = error
                         _refuse(left_out, names, choice)
                     else:
-                        notes = notes if first else [*_unread(whole.read(name), demo.observations), *notes]
+                        notes = notes if first else [*_unread(whole.read(name), demo.observations, alone), *notes]
                         first = first or demo
                 on_demonstration(number + 1, len(names))
             if first is None:
                 why = next(iter(left_out.values()), "there is none")
-                raise DemonstrationsError(f"{source}: none of its demonstrations can be used: {why}")
+                raise DemonstrationsError(f"{paths[0]}: none of its demonstrations can be used: {why}")
             written = tuple(name for name in whole.names if name in data)
             kept = {mask: tuple(name for name in members if name in data) for mask, members in whole.masks.items()}
             masks |= {mask: members for mask, members in kept.items() if members}
@@ -118,13 +129,32 @@ def import_demonstrations(
     return Imported(out, written, reasons, tuple(notes), counts)
 
 
-def _unusable(source: Source, names: Sequence[str], choice: Choice) -> dict[str, DemonstrationsError]:
+def _of_some_tasks(source: Source, names: Sequence[str]) -> dict[str, str]:
+    """The observations that not all of several tasks have, or not of one shape, and why they are left out."""
+    tasks: dict[str, dict[str, tuple[int, ...]]] = {}  # the shape of each key in each
+    for name in names:
+        with suppress(DemonstrationsError):  # which is told where it is used
+            demo = source.read(name)
+            own = tasks.setdefault(task_of(demo.attributes), {})
+            own |= {key: array.shape[1:] for key, array in demo.observations.items() if key not in own}
+    reasons = {}
+    for key in dict.fromkeys(key for own in tasks.values() for key in own):
+        shapes = {task: own[key] for task, own in tasks.items() if key in own}
+        if len(shapes) < len(tasks):
+            reasons[key] = f"{len(shapes)} of {len(tasks)} tasks have it: {few([*shapes])}"
+        elif len({*shapes.values()}) > 1:
+            those = few([f"{[*shape]} in {task}" for task, shape in shapes.items()])
+            reasons[key] = f"it has other shapes in some tasks: {those}"
+    return reasons
+
+
+def _unusable(names: Sequence[str], chosen: Callable[[str], Demonstration]) -> dict[str, DemonstrationsError]:
     """Why demonstrations cannot be used beside the others, as far as is known without reading lazy values."""
     first: Demonstration | None = None
     left_out = dict[str, DemonstrationsError]()
     for name in names:
         try:
-            demo = _chosen(source, name, choice)
+            demo = chosen(name)
             check(demo, first)
             first = first or demo
         except DemonstrationsError as error:
@@ -164,8 +194,9 @@ def _labelled(source: Source, labels: Mapping[str, Mapping[str, np.ndarray]], na
     return Demonstration.stored(name, demo.observations, demo.actions, {**kept, **given}, demo.attributes)
 
 
-def _unread(demo: Demonstration, chosen: Mapping[str, Observed]) -> Iterator[str]:
-    """A line for each observation that networks cannot read, and for each video that is not chosen."""
+def _unread(demo: Demonstration, chosen: Mapping[str, Observed], alone: Mapping[str, str]) -> Iterator[str]:
+    """A line for each observation that networks cannot read, and for each that is left out without being asked for."""
+    yield from (f"obs/{key} is left out: {why}" for key, why in alone.items() if key not in chosen)
     for key, array in demo.observations.items():
         if why := network_input(array.shape[1:], array.dtype)[1]:
             yield f"networks do not read obs/{key}: it {why}"
@@ -173,8 +204,11 @@ def _unread(demo: Demonstration, chosen: Mapping[str, Observed]) -> Iterator[str
             yield f"obs/{key} is a video, left out without --videos"
 
 
-def _chosen(source: Source, name: str, choice: Choice) -> Demonstration:
-    """A demonstration with the chosen observations, scaled, at the chosen rate."""
+def _chosen(source: Source, name: str, choice: Choice, alone: Mapping[str, str]) -> Demonstration:
+    """A demonstration with the chosen observations, scaled, at the chosen rate.
+
+    :param alone: observations that are left out unless they are chosen.
+    """
     demo = source.read(name)
     known = demo.observations
     keys = {**dict.fromkeys(known), **{given: key for given, key in source.given.items() if key in known}}
@@ -184,10 +218,11 @@ def _chosen(source: Source, name: str, choice: Choice) -> Demonstration:
                 f"{name}: there is no observation {key!r}{nearest(key, keys)}; there is: {', '.join(known)}"
             )
     videos = {key for key, array in known.items() if isinstance(array, LazyArray) and array.video}
-    usual = [key for key in known if known[key].dtype.kind in NUMBERS and (choice.videos or key not in videos)]
+    without = {*alone, *(() if choice.videos else videos)}
+    usual = [key for key in known if known[key].dtype.kind in NUMBERS and key not in without]
     wanted = [keys[key] or key for key in choice.observations] or usual
     if not wanted:
-        why = "; ".join(_unread(demo, {})) or "there is none"
+        why = "; ".join(_unread(demo, {}, alone)) or "there is none"
         raise DemonstrationsError(f"{name}: has no observation that can be used: {why}")
     observations = {key: known[key] for key in wanted}
     actions: Observed = demo.actions

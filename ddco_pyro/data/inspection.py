@@ -26,13 +26,15 @@ from ddco_pyro.data.controls import (
     rounding,
     same,
 )
-from ddco_pyro.data.demonstration import Attribute, problem_of, unlike
+from ddco_pyro.data.demonstration import NOTHING, Attribute, problem_of, unlike
 from ddco_pyro.data.division import check_division, problems_of_masks
 from ddco_pyro.data.errors import DemonstrationsError
+from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.labels import UNKNOWN, label_names
 from ddco_pyro.data.likeness import EXCLUDE, Likeness, reasons_told
 from ddco_pyro.data.sources import Source, open_source
 from ddco_pyro.data.sources.metadata import clock_fault
+from ddco_pyro.data.tasks import Where, are_several, by_task, task_of
 from ddco_pyro.spec import ControlSpec
 
 GAP = 3.0
@@ -55,10 +57,11 @@ class Field:
     :param first: demonstration and step of the first unusable value; None if all values are usable.
     :param affected: names of the demonstrations with unusable values.
     :param still: whether the array is constant within every demonstration.
-    :param demonstrations: number of demonstrations that have the array.
+    :param having: names of the demonstrations that have the array.
     :param video: whether the array is in video files, which are not decoded.
     :param unknown: number of steps of labels without ground truth.
     :param values: the labels that occur, without the unknown one.
+    :param of_tasks: the same by task.
     :param names: of labels 0, 1, ..., where the file names them.
     """
 
@@ -73,11 +76,17 @@ class Field:
     first: tuple[str, int] | None = None
     affected: list[str] = field(default_factory=list)
     still: bool = True
-    demonstrations: int = 0
     video: bool = False
     unknown: int = 0
     values: set[int] = field(default_factory=set)
+    of_tasks: dict[str, set[int]] = field(default_factory=dict)
+    having: list[str] = field(default_factory=list)
     names: list[str] = field(default_factory=list)
+
+    @property
+    def demonstrations(self) -> int:
+        """Number of demonstrations that have the array."""
+        return len(self.having)
 
     @property
     def key(self) -> str:
@@ -121,8 +130,8 @@ class Field:
         huge = f" and {self.huge} beyond ±{LARGEST:g}" if self.huge else ""
         return f"{self.nan} NaN and {self.infinite} infinite values{huge}"
 
-    def add(self, values: np.ndarray, name: str, step: int, first: np.ndarray) -> None:
-        """Add a block of a demonstration.
+    def add(self, values: np.ndarray, name: str, task: str, step: int, first: np.ndarray) -> None:
+        """Add a block of a demonstration of a task.
 
         :param values: [steps, dimensions], at least one step.
         :param step: number of the first step.
@@ -143,7 +152,9 @@ class Field:
             self.affected += [name] if name not in self.affected[-1:] else []
         if self.place.startswith("labels/"):
             self.unknown += int((values == UNKNOWN).sum())
-            self.values |= {int(value) for value in np.unique(values[usable(values)]) if value != UNKNOWN}
+            there = {int(value) for value in np.unique(values[usable(values)]) if value != UNKNOWN}
+            self.values |= there
+            self.of_tasks.setdefault(task, set()).update(there)
         self.still = self.still and bool((values == first).all())
 
     def as_json(self) -> dict[str, Any]:
@@ -152,7 +163,11 @@ class Field:
             name: [float(value) if np.isfinite(value) else None for value in getattr(self, name)]
             for name in ("minimum", "maximum")
         }
-        shown = {"dtype": str(self.dtype), "shape": [*self.shape], "values": sorted(self.values)}
+        shown: dict[str, Any] = {"dtype": str(self.dtype), "shape": [*self.shape], "values": sorted(self.values)}
+        shown |= {
+            "demonstrations": self.demonstrations,
+            "of_tasks": {t: sorted(own) for t, own in self.of_tasks.items()},
+        }
         return asdict(self) | ends | shown | {"constant": self.constant, "rounding": self.rounding}
 
 
@@ -174,6 +189,7 @@ class Inspection:
     :param odd: names of demonstrations that are dead, unlike the others, or change the kind of a control dimension, and
         why.
     :param attributes: of each demonstration by its name.
+    :param where: what was asked of attributes.
     """
 
     path: Path
@@ -193,6 +209,7 @@ class Inspection:
     turns: dict[str, tuple[tuple[int, ...], tuple[int, ...]]] = field(default_factory=dict)
     clocks: dict[str, str] = field(default_factory=dict)
     attributes: dict[str, Mapping[str, Attribute]] = field(default_factory=dict)
+    where: Where = field(default_factory=dict)
 
     @property
     def exclusions(self) -> list[str]:
@@ -219,6 +236,17 @@ class Inspection:
         return [*asked, *self.clocks.values()]
 
     @property
+    def tasks(self) -> dict[str, list[str]]:
+        """The names of the demonstrations of each task, in alphabetical order; empty where none is named."""
+        found = by_task({name: self.attributes[name] for name in self.lengths})
+        return {task: found[task] for task in sorted(found, key=natural)} if {*found} - {""} else {}
+
+    @property
+    def several(self) -> bool:
+        """Whether there are several tasks, with two demonstrations and more in the mean."""
+        return are_several([task_of(self.attributes[name]) for name in self.lengths])
+
+    @property
     def observations(self) -> list[Field]:
         """The arrays under ``obs``."""
         return [array for place, array in self.fields.items() if place.startswith("obs/")]
@@ -243,6 +271,7 @@ class Inspection:
             "path": str(self.path),
             "format": self.format,
             "demonstrations": dict(self.lengths),
+            "tasks": self.tasks,
             "control_frequency": self.frequency,
             "masks": {name: list(names) for name, names in self.masks.items()},
             "fields": [array.as_json() for array in self.fields.values()],
@@ -254,15 +283,19 @@ class Inspection:
         }
 
 
-def inspect(path: str | Path, form: str | None = None, exclude: Sequence[str] = ()) -> Inspection:
+def inspect(
+    path: str | Path, form: str | None = None, exclude: Sequence[str] = (), where: Where = NOTHING
+) -> Inspection:
     """Read every array of a file or folder once, in blocks.
 
     :param exclude: names of demonstrations to skip.
+    :param where: attributes and values of the demonstrations to look at; all if empty.
     :raises DemonstrationsError: the source cannot be read, or holds no demonstrations.
     """
-    with open_source(path, form) as source:
+    with open_source(path, form, where=where) as source:
         masks = {mask: tuple(name for name in members if name not in exclude) for mask, members in source.masks.items()}
-        found = Inspection(Path(path), source.format, masks, source.frequency, excluded=tuple(exclude))
+        about = (Path(path), source.format, masks, source.frequency)
+        found = Inspection(*about, excluded=tuple(exclude), where=where)
         _Inspector(source, found).read([name for name in source.names if name not in exclude])
     return found
 
@@ -364,7 +397,7 @@ class _Inspector:
                 self._problem("shape", f"{name}: {place} {problem}", place)
                 continue
             self.found.fields[place] = field
-            field.demonstrations += 1
+            field.having.append(name)
             field.video = field.video or (isinstance(array, LazyArray) and array.video)
             if not field.video and field.numeric:
                 self._read_array(field, array, name)
@@ -380,14 +413,14 @@ class _Inspector:
             values = block.reshape(len(block), -1)
             first = first if step else values[:1].copy()
             digest.update(b"" if label else np.ascontiguousarray(values).tobytes())
-            field.add(values, name, step, first)
+            field.add(values, name, task_of(self.found.attributes[name]), step, first)
             step += len(values)
         if label or not step or not isinstance(array, np.ndarray):
             return
         values = array.reshape(len(array), -1)
         if field.place == "actions":
             self.controls[name] = array
-            self.likeness.add(name, field.place, values)
+            self.likeness.add(name, field.place, values, task_of(self.found.attributes[name]))
         elif not field.image and name in self.controls:
             self.likeness.add(name, field.place, values)
             self.leaks.add(field.place, values, self.controls[name].reshape(len(values), -1))

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping
+from copy import deepcopy
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -12,6 +14,7 @@ from ddco_pyro.data.arrays import is_picture
 from ddco_pyro.data.coincidences import NEARLY, TURNS
 from ddco_pyro.data.controls import MOST_DIMENSIONS, few, listed
 from ddco_pyro.data.demonstration import Demonstration
+from ddco_pyro.data.tasks import are_several, task_of
 
 LEAST = 4
 """Fewest demonstrations in a file of which one can be unlike the others."""
@@ -79,13 +82,14 @@ class Likeness:
 
     def __init__(self) -> None:
         self._lengths: dict[str, int] = {}
+        self._tasks: dict[str, str] = {}
         self._controls = np.zeros((0, 0))  # of the demonstration whose arrays are added
-        self._sampled: list[np.ndarray] = []
+        self._sampled: dict[str, np.ndarray] = {}
         self._statistics: dict[str, dict[str, np.ndarray]] = {}
         self._correlations: dict[str, dict[str, np.ndarray]] = {}
 
-    def add(self, name: str, place: str, rows: np.ndarray) -> None:
-        """Add an array [T, D] of a demonstration, unless it is too wide.
+    def add(self, name: str, place: str, rows: np.ndarray, task: str = "") -> None:
+        """Add an array [T, D] of a demonstration of a task, unless it is too wide.
 
         The statistics of a number are its size, its span, its mean and its largest change in a step, and the step of
         the latter, −1 where another change is nearly as large.
@@ -94,8 +98,8 @@ class Likeness:
             return
         rows = np.nan_to_num(rows.astype(np.float64), posinf=0, neginf=0)
         if place == "actions":
-            self._lengths[name], self._controls = len(rows), rows
-            self._sampled.append(rows[:: 1 + len(rows) // SAMPLED])
+            self._lengths[name], self._tasks[name], self._controls = len(rows), task, rows
+            self._sampled[name] = rows[:: 1 + len(rows) // SAMPLED]
         with np.errstate(over="ignore", invalid="ignore"):
             after = np.concatenate([rows[1:], rows[-1:]])
             changes = np.abs(after - rows)
@@ -113,8 +117,8 @@ class Likeness:
 
     def discard(self, name: str) -> None:
         """Forget a demonstration."""
-        self._lengths.pop(name, None)
-        for kept in (*self._statistics.values(), *self._correlations.values()):
+        known: list[dict[str, Any]] = [self._lengths, self._tasks, self._sampled]
+        for kept in (*known, *self._statistics.values(), *self._correlations.values()):
             kept.pop(name, None)
 
     def add_all(self, demo: Demonstration, keys: Collection[str]) -> None:
@@ -122,7 +126,7 @@ class Likeness:
         arrays = {"actions": demo.actions} | {f"obs/{key}": demo.observations[key] for key in keys}
         for place, array in arrays.items():
             if not is_picture(array):
-                self.add(demo.name, place, np.asarray(array).reshape(len(demo), -1))
+                self.add(demo.name, place, np.asarray(array).reshape(len(demo), -1), task_of(demo.attributes))
 
     def usual(self, frequency: float | None) -> Usual:
         """What the demonstrations have in common."""
@@ -132,11 +136,18 @@ class Likeness:
         return Usual(extremes, reference.tolist(), least, self._length, frequency, self.unlike())
 
     def unlike(self, usual: Usual | None = None, frequency: float | None = None) -> dict[str, str]:
-        """Why demonstrations are unlike the others, or unlike the usual ones of a fit, by their names.
+        """Why demonstrations are unlike the others of their task, or unlike the usual ones of a fit, by their names.
 
         :param frequency: control steps per second of these demonstrations, Hz.
         """
         reasons: dict[str, str] = {}
+        if usual is None and are_several([*self._tasks.values()]):
+            for task in dict.fromkeys(self._tasks.values()):
+                part = deepcopy(self)
+                for name in [name for name, own in self._tasks.items() if own != task]:
+                    part.discard(name)
+                reasons |= part.unlike()
+            return reasons
         if len(self._lengths) < (LEAST if usual is None else 1):
             return reasons
         for found in (self._units(usual), self._reversed(usual), self._rate(usual, frequency), self._joined(usual)):
@@ -187,7 +198,7 @@ class Likeness:
         """Names of demonstrations with a reversed control, by why."""
         _, agreement = self._agreement(usual)
         if usual is None:
-            steps = np.concatenate(self._sampled)
+            steps = np.concatenate([*self._sampled.values()])
             low, high = steps.min(0), steps.max(0)
             rests = np.minimum(steps - low, high - steps) < 0.1 * (high - low)
             known = (rests.mean(0) > RESTS) & (np.quantile(np.abs(agreement), 0.1, axis=0) > SURE)

@@ -36,7 +36,7 @@ OPTIONS = 4
 """Options where no labels say how many."""
 
 MOST_OPTIONS = 30
-"""Labels with more values than that do not decide the number of options."""
+"""Labels with more values than that, of each task, do not decide the number of options."""
 
 MOST_EPOCHS = 2000
 """Largest budget of epochs."""
@@ -121,7 +121,7 @@ def starting_spec(
     excluded = sorted({*inspection.unreadable, *_few_affected(inspection), *odd, *left_out}, key=natural)
     reasons = [printable(line) for line in inspection.exclusions if odd]
     if excluded:
-        inspection = inspect(inspection.path, exclude=excluded)
+        inspection = inspect(inspection.path, exclude=excluded, where=inspection.where)
     try:
         check_division(tuple(inspection.lengths), inspection.masks)
     except DemonstrationsError as error:
@@ -139,16 +139,36 @@ def starting_spec(
         why = next((f": {field.place} {_left_out(inspection, field)}" for field in observed), "")
         raise DemonstrationsError(f"{inspection.path}: no observation can be used{why}; see all with: {look}")
     labels = _fullest_first([field for field in inspection.labels if not _unusable(inspection, field)])
-    counted = labels[0] if labels and 1 < len(labels[0].values) <= MOST_OPTIONS else None
-    many = f"as many as the values of {counted.place}" if counted else ""
+    count, many = _options(inspection, labels[0]) if labels else (0, "")
+    counted = 1 < count <= MOST_OPTIONS * max(1, len(inspection.tasks) * inspection.several)
+    count, many = (count, many) if counted else (OPTIONS, "")
     apart = _held_out(inspection, hold_out_by) if hold_out_by else ""
-    filled = {"labels": labels, "count": len(counted.values) if counted else OPTIONS, "many": many}
+    filled = {"labels": labels, "count": count, "many": many}
     filled |= {"by": hold_out_by, "apart": apart, "small": decided or Decided()}
     text = _filled(inspection, str(path), observed, used, reasons, filled)
     parse_spec(read_yaml(text))  # the text is a valid spec
     said = [decided.why, "heavy tails: " + HEAVY if decided.heavy else ""] if decided else []
-    notes = [f"{filled['count']} options, {many}" if many else "", apart, *said]
+    tasks = f"{len(inspection.tasks)} tasks: terminations and the meta-policy see which, policies do not"
+    notes = [f"{count} options, {many}" if many else "", tasks if inspection.several else "", apart, *said]
     return Starting(text, [note for note in notes if note])
+
+
+def _options(inspection: Inspection, labels: Field) -> tuple[int, str]:
+    """How many options labels ask for, and why, in words. Without names, a number is another label in each task."""
+    if not inspection.several or labels.names:
+        return len(labels.values), f"as many as the values of {labels.place}"
+    return sum(map(len, labels.of_tasks.values())), f"as many as the values of {labels.place} in each task"
+
+
+HANDS = re.compile(r"(^|_)(hand|eef|ee|tcp|gripper|end_effector)(_|$)")
+"""In the name of a position, that of the hand."""
+
+
+def _relative(vectors: Sequence[Field]) -> list[tuple[str, str]]:
+    """Positions and that of the hand, to which they may be relative, by the ends ``_pos`` of their names."""
+    positions = {field.key: field.shape for field in vectors if field.key.endswith(("_pos", "_position"))}
+    hand = next((key for key in positions if HANDS.search(key)), "")
+    return [(key, hand) for key, shape in positions.items() if hand and key != hand and shape == positions[hand]]
 
 
 def _held_out(inspection: Inspection, attribute: str) -> str:
@@ -197,6 +217,9 @@ def _filled(
         steps=sum(lengths),
         unusable_labels=unusable_labels,
         vectors=vectors,
+        tasks=inspection.tasks if inspection.several and vectors and not images else {},
+        where={name: list(values) for name, values in inspection.where.items()},
+        relative=_relative(vectors),
         turns=inspection.turns,
         relative_to=inspection.relative_to,
         zip=zip,

@@ -11,14 +11,16 @@ option anew is no boundary.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ddco_pyro.data.labels import BOUNDARY, SOURCE, UNKNOWN, label_names
 from ddco_pyro.data.sources import open_source
+from ddco_pyro.data.tasks import are_several
 from ddco_pyro.drawing.page import Table
 from ddco_pyro.drawing.words import duration, number
 from ddco_pyro.errors import BadInput
@@ -36,8 +38,10 @@ UNMATCHED = ("nmi", "ari", *(f"boundary_f1_{steps}" for steps in TOLERANCES))
 MATCHED = tuple(Matched.model_fields)
 
 
-def agreement(segments: Sequence[np.ndarray], labels: Sequence[np.ndarray]) -> Scores | None:
+def agreement(segments: Sequence[np.ndarray], labels: Sequence[np.ndarray], tasks: Sequence[str] = ()) -> Scores | None:
     """All measures over demonstrations, each at most 1 (perfect); None where no step has a known label.
+
+    Of several tasks, measures are means over tasks: options are matched with the labels of one task at a time.
 
     - ``nmi``: normalised mutual information, arithmetic mean of the entropies.
     - ``ari``: adjusted Rand index, 0 by chance.
@@ -55,7 +59,11 @@ def agreement(segments: Sequence[np.ndarray], labels: Sequence[np.ndarray]) -> S
 
     :param segments: options [T] of each demonstration, any integers.
     :param labels: the true ones [T].
+    :param tasks: the task of each demonstration; empty for one task.
     """
+    if are_several(tasks):
+        by_task = (agreement(ours, truth) for ours, truth in _by_task(tasks, segments, labels))
+        return _mean([scores for scores in by_task if scores is not None])
     from sklearn.metrics import adjusted_rand_score, normalized_mutual_info_score
 
     pairs = _known(segments, labels)
@@ -76,14 +84,51 @@ def agreement(segments: Sequence[np.ndarray], labels: Sequence[np.ndarray]) -> S
     )
 
 
+def _by_task(tasks: Sequence[str], *sides: Sequence[np.ndarray]) -> Iterator[tuple[list[np.ndarray], ...]]:
+    """Of each task, those of the arrays [T] that are of its demonstrations."""
+    for task in dict.fromkeys(tasks):
+        rows = [row for row, own in enumerate(tasks) if own == task]
+        yield tuple([side[row] for row in rows] for side in sides)
+
+
+def _mean(scores: Sequence[Scores]) -> Scores | None:
+    """The mean of each measure; None of none."""
+    if not scores:
+        return None
+
+    def mean(values: Sequence[Any]) -> Any:
+        if isinstance(values[0], dict):
+            return {key: mean([value[key] for value in values]) for key in values[0]}
+        return float(np.mean(values))
+
+    return Scores.model_validate(mean([one.model_dump() for one in scores]))
+
+
 def equal_lengths(steps: int, count: int) -> np.ndarray:
     """The number of the part, from 0 on, of each step [T] of a demonstration that is cut into equal parts."""
     return np.arange(steps) * count // steps
 
 
-def of_equal_lengths(labels: Sequence[np.ndarray], count: int) -> Scores | None:
-    """The agreement with labels [T] of demonstrations that are cut into ``count`` equal parts."""
-    return agreement([equal_lengths(len(own), count) for own in labels], labels)
+USED = 0.05
+"""Share of the steps of a task from which on an option is one of the task."""
+
+
+def of_equal_lengths(
+    labels: Sequence[np.ndarray], count: int, segments: Sequence[np.ndarray] = (), tasks: Sequence[str] = ()
+) -> Scores | None:
+    """The agreement with labels [T] of demonstrations that are cut into ``count`` equal parts.
+
+    Of several tasks, into as many as options are used in the task (:data:`USED`).
+
+    :param segments: the options [T] of each demonstration, of several tasks; ``tasks`` as of :func:`agreement`.
+    """
+    if not are_several(tasks):
+        return agreement([equal_lengths(len(own), count) for own in labels], labels)
+    each = []
+    for known, ours in _by_task(tasks, labels, segments):
+        shares = np.unique(np.concatenate(ours), return_counts=True)[1] / sum(map(len, ours))
+        each.append(of_equal_lengths(known, int((shares >= USED).sum())))
+    return _mean([scores for scores in each if scores is not None])
 
 
 def confusion(segments: Sequence[np.ndarray], labels: Sequence[np.ndarray]) -> Confusion:
@@ -243,7 +288,8 @@ EXPLAINED = (
     "the same in all demonstrations (one for all) or separate in each (each its own). Accuracy: share of steps that "
     "agree. IoU: intersection over union, mean over labels. F1@P: a segment is right where it overlaps one of its "
     "label by P % or more. Edit: 1 − edit distance of the sequences of segments. Equal lengths: what cutting each "
-    "demonstration into equal parts, as many as options, reaches without looking at it."
+    "demonstration into equal parts, as many as options, reaches without looking at it. Of several tasks, each measure "
+    "is the mean over tasks."
 )
 
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from ddco_pyro.data.demonstration import check_fitted
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, not_demonstrations
 from ddco_pyro.data.memory import INFERENCE
+from ddco_pyro.data.tasks import with_task
 from ddco_pyro.inference.paths import Path, most_likely_path, sample_paths
 from ddco_pyro.inference.posteriors import Decomposition, Posterior, decompose, log_predictive, posterior
 from ddco_pyro.model.batch import Batch, encode
@@ -305,6 +306,7 @@ def _read(demonstrations: Iterable[Demonstration], hierarchy: Hierarchy) -> Iter
     for demo in demonstrations:
         if not isinstance(demo, Demonstration):
             raise not_demonstrations(demo)
+        demo = with_task(demo, hierarchy.encoder.tasks) if hierarchy.encoder.tasks else demo
         check_fitted(demo, hierarchy.encoder.shapes, hierarchy.scaling.size)
         yield demo
 

@@ -167,12 +167,13 @@ def export_policy(fit: Fit, folder: Path) -> Exported:
         about = json.loads((temporary / "controller.json").read_text(encoding="utf-8"))
         step = about["step"] and about["step"]["key"]
         inputs = {
-            "observation." + spec["key"].replace("/", "."): {
+            "observation." + key.replace("/", "."): {
                 "type": "VISUAL" if spec["image"] else "STATE",
                 "shape": [spec["shape"][place] for place in (2, 0, 1)] if spec["image"] else spec["shape"],
             }
             for spec in about["observations"]
-            if spec["key"] != step
+            for key in (spec["minus"], spec["key"])
+            if key not in (None, step)
         }
         config = {
             "type": "ddco",

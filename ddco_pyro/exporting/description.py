@@ -16,7 +16,7 @@ from ddco_pyro.model.emissions import KINDS
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.outputs import TERMINATION_BOUND, Outputs
-from ddco_pyro.spec import STEP, RolloutSpec
+from ddco_pyro.spec import STEP, ObservationSpec, RolloutSpec
 
 
 def named(outputs: Outputs) -> dict[str, Tensor]:
@@ -91,7 +91,7 @@ def describe(hierarchy: Hierarchy, control: RolloutSpec, program: StepProgram) -
     """
     networks, weights = _networks(hierarchy)
     encoder = hierarchy.encoder
-    vectors = {spec.key: spec for spec in encoder.specs}
+    vectors = {spec.name: spec for spec in encoder.specs}
     scaling = hierarchy.scaling
     scale, shift = scaling.scale.numpy(), scaling.shift.numpy()
     return networks | {
@@ -102,15 +102,16 @@ def describe(hierarchy: Hierarchy, control: RolloutSpec, program: StepProgram) -
         ],
         "observations": [
             {
-                "key": key,
-                "shape": list(shape),
-                "image": key in encoder.images,
-                "differences": key in vectors and vectors[key].differences,
-                "angles": list(vectors[key].angles) if key in vectors else [],
-                "quaternions": list(vectors[key].quaternions) if key in vectors else [],
-                **(encoder.transforms[key].as_data() if key in encoder.images else {}),
+                "key": spec.key,
+                "minus": spec.minus,
+                "shape": list(encoder.shapes.get(spec.key, (1,))),
+                "image": spec.key in encoder.images,
+                "differences": spec.differences,
+                "angles": list(spec.angles),
+                "quaternions": list(spec.quaternions),
+                **(encoder.transforms[spec.key].as_data() if spec.key in encoder.images else {}),
             }
-            for key, shape in ((key, encoder.shapes.get(key, (1,))) for key in [*vectors, *encoder.images])
+            for spec in [*encoder.specs, *(ObservationSpec(key=key) for key in encoder.images)]
         ],
         "step": {"key": STEP, "longest": float(encoder.longest)} if STEP in vectors else None,
         "features": dict(zip(encoder.keys, encoder.sizes, strict=True)),

@@ -122,6 +122,9 @@ def _episode(encoder: ObservationEncoder, steps: int, random: np.random.Generato
             behind = slice(len(rest), 2 * len(rest))
             differences = mean[behind] + std[behind] * random.normal(size=values.shape)
             values = _walk(values[0], differences, mean[: len(rest)], std[: len(rest)])
+        if spec.minus:
+            other = observations.setdefault(spec.minus, random.normal(size=(steps, *shape)))
+            values = values + other.reshape(steps, -1)
         observations[spec.key] = values.reshape(steps, *shape)
     return observations | {key: _pictures(steps, encoder.shapes[key], random) for key in encoder.images}
 

@@ -81,7 +81,8 @@ class Runner:
         if built_in:
             observation = {**observation, built_in["key"]: np.array([self.time / built_in["longest"]])}
         specs = self.about["observations"]
-        now = {spec["key"]: _checked(observation, spec) for spec in specs}
+        read = (spec | {"key": key} for spec in specs for key in (spec["minus"], spec["key"]) if key)
+        now = {spec["key"]: _checked(observation, spec) for spec in read}
         images = {spec["key"]: _picture(now[spec["key"]], spec) for spec in specs if spec["image"]}
         features = self._features(now, self._last or now)
         self.outputs, self._state = self._networks(features, self.time, images, self._state)
@@ -102,10 +103,10 @@ class Runner:
         parts = [np.zeros(0)]
         for spec in self.about["observations"]:
             if not spec["image"]:
-                value = _turned(now[spec["key"]], spec)
+                value = _turned(now, spec)
                 parts.append(value)
                 if spec["differences"]:
-                    parts.append(value - _turned(before[spec["key"]], spec))
+                    parts.append(value - _turned(before, spec))
         return np.concatenate(parts)
 
     def _choose(self, outputs: Outputs, generator: np.random.Generator) -> tuple[int, ...]:
@@ -178,9 +179,14 @@ def _std(part: Part, level: int, actor: int, numbers: np.ndarray) -> np.ndarray:
 # kinds of control
 
 
-def _turned(value: np.ndarray, spec: Mapping[str, Any]) -> np.ndarray:
-    """The numbers of an observation, with sines and cosines of angles, and products of quaternions, behind the rest."""
-    value, angles, quaternions = value.astype(np.float64).ravel(), spec["angles"], spec["quaternions"]
+def _turned(seen: Mapping[str, np.ndarray], spec: Mapping[str, Any]) -> np.ndarray:
+    """The numbers of an observation, less another one where the spec says so, as networks read them.
+
+    Sines and cosines of angles, and products of quaternions, are behind the rest.
+    """
+    value, angles, quaternions = seen[spec["key"]].astype(np.float64).ravel(), spec["angles"], spec["quaternions"]
+    if spec["minus"]:
+        value = value - seen[spec["minus"]].astype(np.float64).ravel()
     four = [value[first : first + 4] for first in quaternions]
     products = [np.outer(q, q)[np.triu_indices(4)] for q in four]
     rest = np.delete(value, [*angles, *(first + place for first in quaternions for place in range(4))])

@@ -307,13 +307,13 @@ def _agreement(fit: Fit, ours: Mapping[str, _Part], parts: Mapping[str, Demonstr
     names = fit.spec.demonstrations.labels_by_level(len(levels)) if levels else ()
     found: dict[str, Any] = {"labels": list(names), "recogniser": {}}
     for part, demos in parts.items():
-        truth = [[demo.labels[name] for demo in demos] for name in names]
+        truth, tasks = [[demo.labels[name] for demo in demos] for name in names], demos.tasks
         pairs = list(zip(ours[part].segments, truth, strict=False))
-        equal = zip(truth, (level.count for level in levels), strict=False)
-        found |= {part: [agreement(*pair) for pair in pairs], "confusion": [confusion(*pair) for pair in pairs]}
-        found[f"equal_{part}"] = [of_equal_lengths(labels, count) for labels, count in equal]
+        equal = zip(truth, (level.count for level in levels), ours[part].segments, strict=False)
+        found |= {part: [agreement(*pair, tasks) for pair in pairs], "confusion": [confusion(*pair) for pair in pairs]}
+        found[f"equal_{part}"] = [of_equal_lengths(*each, tasks) for each in equal]
         if names and recogniser is not None:
-            found["recogniser"][part] = agreement(ours[part].recognised, truth[recogniser.level - 1])
+            found["recogniser"][part] = agreement(ours[part].recognised, truth[recogniser.level - 1], tasks)
     return Agreement(**found) if names else None
 
 

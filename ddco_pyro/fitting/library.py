@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -12,13 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.demonstrations import Demonstrations, with_tasks
 from ddco_pyro.data.files import json_text, write_text
+from ddco_pyro.data.tasks import by_task, known_tasks
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.inferred import infer
 from ddco_pyro.fitting.fitted import Fit, load
 from ddco_pyro.jobs import Workers, run_all
-from ddco_pyro.spec import Spec, SpecError, load_spec, user_code, with_overrides
+from ddco_pyro.spec import TASK, Spec, SpecError, load_spec, user_code, with_overrides
 from ddco_pyro.spec.yaml import dump_yaml, read_mapping
 from ddco_pyro.training.data import dimensions, train_and_valid
 from ddco_pyro.training.networks import Dimensions
@@ -27,9 +27,6 @@ from ddco_pyro.training.restarts import train_model
 
 STRENGTHS = (3.0, 10.0, 30.0, 100.0, 300.0)
 """The ridges among which the tasks of a library choose."""
-
-TASK = "task"
-"""The attribute of a demonstration that says of which task it is."""
 
 MOST_TASKS = 5
 """Tasks that are left out in turn, at most."""
@@ -92,7 +89,13 @@ def for_new_task(path: Path, run: Path, overrides: Iterable[str] = (), allow_cod
     """
     alone = {
         "compare_with": [],
-        "demonstrations": {"valid_fraction": 0, "leave_one_out": False, "hold_out_by": None, "exclude": []},
+        "demonstrations": {
+            "valid_fraction": 0,
+            "leave_one_out": False,
+            "hold_out_by": None,
+            "exclude": [],
+            "where": {},
+        },
         "training": {"tune_fraction": 0, "library": {"run": str(run)}},
     }
     said = [f"{key}={dump_yaml(value)}" for part in (alone, read_mapping(path, "spec")) for key, value in _leaves(part)]
@@ -123,10 +126,8 @@ def _strength(library: Fit, spread: float, workers: Workers) -> float:
     if kept.exists():
         return float(json.loads(kept.read_text(encoding="utf-8"))["ridge"])
     demos = train_and_valid(library.spec, library.demonstrations)["train"]
-    by_task = defaultdict[str, list[str]](list)
-    for demo in demos:
-        by_task[str(demo.attributes.get(TASK, ""))].append(demo.name)
-    tasks = {task: names for task, names in by_task.items() if len(names) > 1}
+    each = by_task({demo.name: demo.attributes for demo in demos})
+    tasks = {task: names for task, names in each.items() if len(names) > 1}
     if len(tasks) < 2:
         text = f"{library.run_folder}: has demonstrations of {len(tasks)} task(s) with two or more, by the attribute"
         raise BadInput(f"{text} {TASK!r}; say how strong a prior it is: training.library.ridge=30")
@@ -143,6 +144,9 @@ def _strength(library: Fit, spread: float, workers: Workers) -> float:
 def _predicted(spec: Spec, demos: Demonstrations, names: Sequence[str], spread: float) -> list[float]:
     """log p(ξ) per step of a task's demonstrations but the first, by a library without the task, for each strength."""
     others = demos.select(name for name in demos.names if name not in names)
+    if spec.sees_task:
+        others = with_tasks(others)
+        demos = with_tasks(demos, known_tasks(others.attributes))  # its own task is none of them
     spec = with_overrides(spec, {"training.starts": spec.training.starts[:1]})
     model = train_model(spec, Dimensions.of(others, spec.control.relative_to), others).hierarchy
     first, rest = demos.select(names[:1]), demos.select(names[1:])

@@ -81,6 +81,7 @@ def write_model(folder: Path, hierarchy: Hierarchy) -> None:
         "shapes": json.dumps({key: list(shape) for key, shape in hierarchy.encoder.shapes.items()}),
         "control_size": str(hierarchy.scaling.size),
         "steps": str(hierarchy.steps),
+        "tasks": json.dumps(hierarchy.encoder.tasks),
         "control": json.dumps([part.as_data() for part in hierarchy.scaling.parts]),
     }
     write_tensors(folder / "model.safetensors", copy_of(hierarchy), metadata)
@@ -103,7 +104,8 @@ def read_model(folder: Path, spec: Spec) -> Hierarchy:
         others = sorted(set(range(size)) - set(tensors["scaling.varying"].tolist()))
         constant = dict(zip(others, tensors["scaling.constant"].tolist(), strict=True))
         parts = tuple(ControlPart.of(part) for part in json.loads(metadata["control"]))
-        hierarchy = build_hierarchy(spec, Dimensions(shapes, size, steps, constant, parts=parts))
+        tasks = tuple(json.loads(metadata["tasks"]))
+        hierarchy = build_hierarchy(spec, Dimensions(shapes, size, steps, constant, parts=parts, tasks=tasks))
         hierarchy.load_state_dict(tensors)
     except BadInput:
         raise

@@ -60,7 +60,8 @@ def refit(
         scaling, names = before.scaling, demos.names
         others = sorted({*range(scaling.size)} - {*scaling.varying.tolist()})
         constant = dict(zip(others, scaling.constant.tolist(), strict=True))
-        size = Dimensions(before.encoder.shapes, scaling.size, max(demos.lengths), constant, parts=scaling.parts)
+        shapes, steps, tasks = before.encoder.shapes, max(demos.lengths), before.encoder.tasks
+        size = Dimensions(shapes, scaling.size, steps, constant, parts=scaling.parts, tasks=tasks)
         batch = encode(demos, before.encoder, scaling, fitted=True)
         known = _padded([demo.labels[SAID] for demo in demos])
         known = torch.where(known > 0, known, -1)

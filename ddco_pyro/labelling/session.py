@@ -17,11 +17,13 @@ import sklearn.linear_model
 import sklearn.metrics  # noqa: F401  (the first edit does not wait for these)
 
 from ddco_pyro.data.arrays import is_picture
+from ddco_pyro.data.demonstration import NOTHING
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.labels import EXCLUDE, SOURCE
 from ddco_pyro.data.likeness import Likeness
 from ddco_pyro.data.sources import Source, format_of, open_source
 from ddco_pyro.data.sources.metadata import FREQUENCY
+from ddco_pyro.data.tasks import Where, with_task
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.drawing.timeline import text
 from ddco_pyro.errors import BadInput, reason
@@ -57,14 +59,15 @@ UNCERTAIN = 20
 """Boundaries that are named as the most uncertain ones."""
 
 
-def read(path: Path, needed: Iterable[str] = ()) -> Demonstrations:
+def read(path: Path, needed: Iterable[str] = (), where: Where = NOTHING) -> Demonstrations:
     """The demonstrations of a file or data set as they are; pictures and videos are read when they are shown.
 
     :param needed: the pictures that a model reads.
+    :param where: attributes and values of the demonstrations that are read; all if empty.
     """
     if format_of(path) == "robomimic":
-        return Demonstrations.read(path)
-    with open_source(path) as source:
+        return Demonstrations.read(path, where=where)
+    with open_source(path, where=where) as source:
         each = []
         for demo in map(source.read, source.names):
             seen = {key: own for key, own in demo.observations.items() if key in needed or not is_picture(own)}
@@ -85,6 +88,7 @@ class Session:
     :param skills: names of the options 1, 2, ... where nothing is labelled yet; further ones are new options.
     :param team: who labels, and who labels what.
     :param first: the session of another level, whose demonstrations and marks are those of this one.
+    :param where: attributes and values of the demonstrations to label; all if empty.
     :ivar beside: the sessions of the other levels.
     :raises BadInput: the run has no options or no such level, ``out`` is something else, or another process labels it.
     """
@@ -98,14 +102,18 @@ class Session:
         skills: Sequence[str] = (),
         team: Team | None = None,
         first: Session | None = None,
+        where: Where = NOTHING,
     ) -> None:
         fit.refuse_flat()
+        self.where = where
         self.run, self.fit, self.path, self.out = fit, fit, path, out
         self.level, self.team, self.first = level or next(iter(fit.names)), team or Team(), first or self
         if self.level not in fit.names:
             raise BadInput(f"--level: there is no level {self.level!r} (there is: {', '.join(fit.names)})")
         self.beside = list[Session]()
-        self.demos: Demonstrations = first.demos if first else read(path, fit.hierarchy.encoder.shapes)
+        self.demos: Demonstrations = first.demos if first else read(path, fit.hierarchy.encoder.shapes, where)
+        if (tasks := fit.hierarchy.encoder.tasks) and not first:
+            self.demos = replace(self.demos, demonstrations=tuple(with_task(demo, tasks) for demo in self.demos))
         self.form, self.in_place = format_of(path), out.exists() and out.samefile(path)
         self._check_out()
         self.version, self.frequency = self._version(), self.demos.frequency
@@ -117,7 +125,7 @@ class Session:
         self.others = Others(place, self.team.me, self.document.lengths, ours)
         self.shares = self.team.shares(self.demos.names)
         if not (self.document.done or self.document.undone):
-            there = read(out) if out.exists() and not self.in_place else self.demos
+            there = read(out, where=where) if out.exists() and not self.in_place else self.demos
             if said := said_in(there, self.level, self.document.names, self.form == "lerobot", first is None):
                 self.journal.edit(said)
                 self.journal.save()
@@ -153,7 +161,7 @@ class Session:
     def _version(self) -> list[tuple[int, int]]:
         if self.form == "robomimic":
             return version([self.path])
-        with open_source(self.path) as source:
+        with open_source(self.path, where=self.where) as source:
             return version(source.files)
 
     def begin(self) -> None:
@@ -666,7 +674,7 @@ class Session:
     @cached_property
     def _observed(self) -> Demonstrations:
         """The demonstrations with what the run's networks observe alone."""
-        keys = self.run.spec.observed
+        keys = self.run.hierarchy.encoder.shapes
         return Demonstrations(
             tuple(replace(demo, observations={key: demo.observations[key] for key in keys}) for demo in self.demos),
             attributes=self.demos.attributes,
@@ -694,7 +702,7 @@ class Session:
             if not self._unchanged():
                 raise BadInput(self.warnings()[0])
             documents = {own.level: own.document for own in every}
-            with open_source(self.path) as source:
+            with open_source(self.path, where=self.where) as source:
                 labels = said_segments(documents, source, self.frequency, self.first.document.marks)
                 if self.form == "robomimic":
                     write_labels(self.path, self.out, labels)
@@ -741,7 +749,7 @@ class Session:
             raise BadInput(f"there is no format {form!r}; there is: {', '.join(self.formats)}")
         about = FORMATS[f"--{form}"]
         place = folder / f"segments{'' if about.kind == 'folder' else about.suffix or f'.{form}'}"
-        with open_source(self.path) as source:
+        with open_source(self.path, where=self.where) as source:
             with self.lock:
                 segmented = shown_segments(self.fit, source, self.level, self.shown, self.document)
             marks, whole = self.first.document.marks, about.takes == "lerobot"

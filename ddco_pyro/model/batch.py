@@ -101,7 +101,7 @@ def refuse_unusable(
     :raises DemonstrationsError: a number in scaled units is larger than :data:`LARGEST_SCALED`, or a switch or a
         discrete action has a value of probability 0.
     """
-    places = np.repeat([f"obs/{spec.key}" for spec in encoder.specs], encoder.sizes)
+    places = np.repeat([f"obs/{name}" for name in encoder.keys], encoder.sizes)
     for demo in demonstrations:
         if problem := scaling.impossible(demo.name, demo.controls(scaling.relative_to)):
             declare, repair = "declare another kind in control.parts", f"repair it, or leave {demo.name} out"

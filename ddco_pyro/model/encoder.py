@@ -40,6 +40,7 @@ class ObservationEncoder(nn.Module):
     The built-in observation :data:`~ddco_pyro.spec.STEP` is made here: the number of the step divided by ``longest``,
     the steps of the longest demonstration given to :meth:`fit`.
 
+    :param tasks: of the numbers of the built-in observation :data:`~ddco_pyro.spec.TASK`, in their order.
     :raises ShapeError: an observation cannot be read, cropped, scaled, binned or shifted as the spec says.
     """
 
@@ -50,15 +51,20 @@ class ObservationEncoder(nn.Module):
     high: Tensor
     places: Tensor
 
-    def __init__(self, specs: Sequence[ObservationSpec], shapes: Shapes) -> None:
+    def __init__(self, specs: Sequence[ObservationSpec], shapes: Shapes, tasks: Sequence[str] = ()) -> None:
         super().__init__()
+        self.tasks = tuple(tasks)
         shapes = {**shapes, STEP: (1,)}
-        self.shapes = {spec.key: tuple(shapes[spec.key]) for spec in specs if spec.key != STEP}
+        read = dict.fromkeys(key for spec in specs for key in (spec.key, spec.minus) if key not in (None, STEP))
+        self.shapes = {key: tuple(shapes[key]) for key in read}
         kinds = {}
         for spec in specs:
             kinds[spec.key], why = network_input(tuple(shapes[spec.key]))
             if why:
                 raise ShapeError(f"observations: {spec.key!r} {why}")
+            if spec.minus and (kinds[spec.key] == "picture" or shapes[spec.key] != shapes[spec.minus]):
+                both = " and ".join(f"{key!r} has shape {[*shapes[key]]}" for key in (spec.key, spec.minus))
+                raise ShapeError(f"observations: {both}; a difference is of vectors of as many numbers")
         self.specs = tuple(spec for spec in specs if kinds[spec.key] == "vector")
         pictures = [spec for spec in specs if kinds[spec.key] == "picture"]
         self.transforms = {spec.key: Transform(spec.crop, spec.resize) for spec in pictures}
@@ -79,7 +85,8 @@ class ObservationEncoder(nn.Module):
 
     @property
     def keys(self) -> list[str]:
-        return [spec.key for spec in self.specs]
+        """What networks call each vector observation."""
+        return [spec.name for spec in self.specs]
 
     def shape(self, steps: int) -> InputShape:
         """The shapes that networks are built for."""
@@ -140,7 +147,8 @@ class ObservationEncoder(nn.Module):
         low, high = (np.stack([end(part, axis=0) for part in rows]) for end in (np.min, np.max))
         moves, first = [np.zeros(0, dtype=bool)], 0
         for spec, size in zip(self.specs, self.given, strict=True):
-            arrays = [] if spec.key == STEP else [demo.observations[spec.key] for demo in demonstrations]
+            keys = [key for key in (spec.key, spec.minus) if key not in (None, STEP)]
+            arrays = [demo.observations[key] for key in keys for demo in demonstrations]
             dtype = np.result_type(*arrays) if arrays else np.dtype(np.float64)
             own = slice(first, first + size // spec.given)
             lowest, highest = low[:, own].min(0), high[:, own].max(0)
@@ -160,8 +168,11 @@ class ObservationEncoder(nn.Module):
         times = np.arange(steps) if times is None else times
         columns: list[np.ndarray] = [np.zeros((steps, 0))]
         for spec in self.specs:
-            values = times / float(self.longest) if spec.key == STEP else observations[spec.key]
-            column = _turned(np.asarray(values, dtype=np.float64).reshape(steps, -1), spec)
+            seen = times / float(self.longest) if spec.key == STEP else observations[spec.key]
+            values = np.asarray(seen, dtype=np.float64).reshape(steps, -1)
+            if spec.minus:
+                values = values - np.asarray(observations[spec.minus], dtype=np.float64).reshape(steps, -1)
+            column = _turned(values, spec)
             columns.append(column)
             if spec.differences:
                 columns.append(np.diff(column, axis=0, prepend=column[:1]))

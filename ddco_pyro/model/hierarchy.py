@@ -125,6 +125,7 @@ class Hierarchy(nn.Module):
     :param steps: the longest demonstration, for per-timestep networks.
     :param constant: the control dimensions outside the model, and the values that are emitted for them.
     :param parts: the kinds of the other control dimensions; by default all are Gaussian.
+    :param tasks: of the numbers of the built-in observation ``task``.
     :raises ShapeError: a network cannot read these observations.
     """
 
@@ -139,10 +140,11 @@ class Hierarchy(nn.Module):
         steps: int,
         constant: Mapping[int, float] = MappingProxyType({}),
         parts: tuple[ControlPart, ...] | None = None,
+        tasks: tuple[str, ...] = (),
     ) -> None:
         super().__init__()
         self.steps, self.device = steps, HOST
-        self.encoder = ObservationEncoder(spec.observations, shapes)
+        self.encoder = ObservationEncoder(spec.observations, shapes, tasks)
         power = spec.control.power if spec.hierarchy is not None else 1.0  # nothing is latent in a flat policy
         self.register_buffer("power", torch.tensor(power, dtype=torch.float64))
         varying = [dimension for dimension in range(control_size) if dimension not in constant]

@@ -74,8 +74,14 @@ def segments_of(fit: Fit, demos: Demonstrations) -> Segmented:
     found = {demo.name: demo for piece in fit.infer(demos) for demo in of_piece(fit, piece, labels, intervals=True)}
     rows = fit.metrics.demonstrations_by_likelihood
     held_out = {row.name for row in rows if row.part == "valid"}
+    tasks = dict(zip(demos.names, demos.tasks, strict=True))
     ordered = [
-        replace(found[row.name], log_likelihood=row.log_likelihood_per_step[fit.name], held_out=row.part == "valid")
+        replace(
+            found[row.name],
+            log_likelihood=row.log_likelihood_per_step[fit.name],
+            held_out=row.part == "valid",
+            task=tasks[row.name],
+        )
         for row in rows
         if row.name in found and (row.part == "valid" or row.name not in held_out)  # some are in both parts
     ]

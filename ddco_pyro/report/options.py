@@ -23,7 +23,7 @@ from ddco_pyro.metrics import Confusion, Scores
 from ddco_pyro.names import label_name, numbered_name, option_name
 from ddco_pyro.report.skills import Shown, agreeing
 from ddco_pyro.segmenting.baselines import BASELINES, EQUAL, RECOGNISED
-from ddco_pyro.segmenting.page import HOW
+from ddco_pyro.segmenting.page import HOW, use_by_task
 from ddco_pyro.segmenting.segments import Segmented
 
 ROWS = 6
@@ -52,6 +52,8 @@ def section(fit: Fit, segmented: Segmented, shown: Shown) -> Section:
         blocks.append(Drawing(drawing, caption))
     blocks += [Text("Use of the options", "heading"), use_table(fit)]
     blocks.append(note("On the most likely path of all demonstrations. The same option chosen anew stays one segment."))
+    for level in reversed(fit.names):
+        blocks += use_by_task(segmented, level)
     link = Markup('<a href="#segments">segments of every demonstration</a>')
     blocks.append(Text(Markup("Step by step: {}.").format(link)))
     return Section("options", "How the options are used", blocks, folded=True)

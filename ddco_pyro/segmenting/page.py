@@ -57,11 +57,29 @@ def _level(name: str, segmented: Segmented) -> Section:
             share = percent(float(lengths.sum()) / total, 1)
             rows.append([named, share, str(len(lengths)), median, f"{having} of {len(segmented)}"])
     head = ["Option", "Share of steps", "Segments", "Median length", "Demonstrations with it"]
-    blocks: list[Block] = [Table(head, rows)]
+    blocks: list[Block] = [Table(head, rows), *use_by_task(segmented, name)]
     if scores := segmented.agreements.get(name):
         blocks.append(Text(f"Agreement with the label “{segmented.truth[name]}”", "heading"))
         blocks += [agreement_table(scores), footnote(f"{EXPLAINED} {tolerances(segmented.frequency)}")]
     return Section(f"level-{quote(name, safe='')}", f"Level “{name}”", blocks)
+
+
+def use_by_task(segmented: Segmented, level: str) -> list[Block]:
+    """A table of the share of each task's steps that is in each option of a level; none of a single task."""
+    steps: dict[str, list[np.ndarray]] = {}
+    for demo in segmented.segments:
+        steps.setdefault(demo.task, []).append(demo.levels[level].options)
+    if len(steps) < 2:
+        return []
+    tasks, names = sorted(steps), segmented.names.get(level, ())
+    used = {task: np.concatenate(steps[task]) for task in tasks}
+    rows = []
+    for option in range(segmented.counts[level] + 1):
+        shares = [float((used[task] == option).mean()) for task in tasks]
+        if option or any(shares):
+            named = Cell(numbered_name(option, names), colour=option_colour(option))
+            rows.append([named, *(percent(share) if share else "" for share in shares)])
+    return [Text("Options in tasks", "heading"), Table(["Option", *(task or "no task" for task in tasks)], rows)]
 
 
 def anchor(name: str) -> str:
@@ -95,7 +113,7 @@ def timelines(
         Track(
             demo.name,
             anchor(demo.name),
-            f"{duration(segmented.frequency, len(demo))}, {number(demo.log_likelihood)} nats/step",
+            ", ".join(filter(None, (demo.task, duration(segmented.frequency, len(demo)), _nats(demo)))),
             demo.held_out,
             len(demo),
             [_runs(demo, name) for name in lanes],
@@ -104,6 +122,10 @@ def timelines(
         for demo, follow in zip(shown, follows, strict=True)
     ]
     return Timelines(list(lanes.values()), tracks, segmented.frequency)
+
+
+def _nats(demo: Segments) -> str:
+    return f"{number(demo.log_likelihood)} nats/step"
 
 
 def _values(segmented: Segmented) -> dict[str, dict[int, str]]:

@@ -14,10 +14,11 @@ import numpy as np
 from ddco_pyro.data.demonstration import check_fitted, needed
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.errors import DemonstrationsError
-from ddco_pyro.data.labels import label_names
+from ddco_pyro.data.labels import BOUNDARY, SOURCE, label_names
 from ddco_pyro.data.likeness import Likeness
 from ddco_pyro.data.memory import INFERENCE, refuse_too_much
 from ddco_pyro.data.sources import Source, open_source
+from ddco_pyro.data.tasks import are_several, of_tasks, task_of, with_task
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.evaluation.agreement import agreement as scores_of
 from ddco_pyro.evaluation.agreement import of_equal_lengths
@@ -68,6 +69,7 @@ class Segments:
     :param labels: ground-truth labels in the file, name to [T].
     :param baselines: labels of baselines, ``<level>_<baseline>`` to kinds from 1 on [T]; where a person labelled, also
         ``<level>_source``, the place in :data:`SOURCES` [T].
+    :param task: the demonstration's own; empty where none is known.
     """
 
     name: str
@@ -76,6 +78,7 @@ class Segments:
     held_out: bool
     labels: dict[str, np.ndarray] = field(default_factory=dict)
     baselines: dict[str, np.ndarray] = field(default_factory=dict)
+    task: str = ""
 
     def __len__(self) -> int:
         return len(next(iter(self.levels.values())).options)
@@ -129,14 +132,16 @@ class Segmented:
             for part, group in groups.items():
                 options, labels = [demo.levels[level].options for demo in group], [demo.labels[truth] for demo in group]
                 scores = agreements.setdefault(level, {})
-                scores[f"options, {part}"] = scores_of(options, labels)
+                tasks = [demo.task for demo in group]
+                scores[f"options, {part}"] = scores_of(options, labels, tasks)
                 equal = f"{baselines.BASELINES[baselines.EQUAL]}, {part}"
-                scores[equal] = of_equal_lengths(labels, self.counts[level])
+                scores[equal] = of_equal_lengths(labels, self.counts[level], options, tasks)
             for part, group in [*groups.items()][:1]:
                 for name, words in (baselines.BASELINES | {baselines.RECOGNISER: baselines.RECOGNISED}).items():
                     if f"{level}_{name}" in group[0].baselines and name != baselines.EQUAL:
                         kinds = [demo.baselines[f"{level}_{name}"] for demo in group]
-                        agreements[level][f"{words}, {part}"] = scores_of(kinds, [demo.labels[truth] for demo in group])
+                        labels, tasks = [demo.labels[truth] for demo in group], [demo.task for demo in group]
+                        agreements[level][f"{words}, {part}"] = scores_of(kinds, labels, tasks)
         return agreements
 
     def label_colours(self, name: str) -> dict[int, str]:
@@ -169,14 +174,33 @@ def segments(fit: Fit, source: Source, on_event: OnEvent = ignore, intervals: bo
     fit.refuse_flat()
     chosen, known = chosen_names(source, fit), label_names(source.attributes)
     labels: dict[str, dict[str, np.ndarray]] = {}
+    tasks: dict[str, str] = {}
     segmented: list[Segments] = []
     likeness = Likeness()
-    for piece in fit.infer(_demonstrations(source, chosen, fit, labels, likeness)):
-        segmented += of_piece(fit, piece, labels, intervals)
+    for piece in fit.infer(_demonstrations(source, chosen, fit, labels, tasks, likeness)):
+        segmented += (replace(one, task=tasks[one.name]) for one in of_piece(fit, piece, labels, intervals))
         on_event(DemonstrationsDone(len(segmented), len(chosen)))
+    segmented, named = _labels_of_tasks(segmented, known)
     nats = {demo.name: demo.log_likelihood for demo in segmented}
     unlike = fit.unlike(likeness, nats, source.frequency)
-    return replace(of_run(fit, segmented, source.frequency, known), unlike=unlike)
+    return replace(of_run(fit, segmented, source.frequency, named), unlike=unlike)
+
+
+def _labels_of_tasks(
+    segmented: list[Segments], known: Mapping[str, Sequence[str]]
+) -> tuple[list[Segments], Mapping[str, Sequence[str]]]:
+    """Segments whose labels differ between several tasks, unless the file names them, and the names of all labels."""
+    if not are_several([demo.task for demo in segmented]):
+        return segmented, known
+    names = dict(known)
+    unnamed = {key for demo in segmented for key in demo.labels if not key.endswith((BOUNDARY, SOURCE))} - {*known}
+    for key in sorted(unnamed):
+        having = [row for row, demo in enumerate(segmented) if key in demo.labels]
+        tasks, labels = zip(*((segmented[row].task, segmented[row].labels[key]) for row in having), strict=True)
+        values, names[key] = of_tasks(tasks, labels)
+        for row, own in zip(having, values, strict=True):
+            segmented[row] = replace(segmented[row], labels={**segmented[row].labels, key: own})
+    return segmented, names
 
 
 def of_run(
@@ -251,12 +275,21 @@ FOUND = 40
 
 
 def _demonstrations(
-    source: Source, names: Sequence[str], fit: Fit, labels: dict[str, dict[str, np.ndarray]], likeness: Likeness
+    source: Source,
+    names: Sequence[str],
+    fit: Fit,
+    labels: dict[str, dict[str, np.ndarray]],
+    tasks: dict[str, str],
+    likeness: Likeness,
 ) -> Iterator[Demonstration]:
-    """Each demonstration as the run's networks observe it. Ground-truth labels go into ``labels``."""
+    """Each demonstration as the run's networks observe it.
+
+    Ground-truth labels go into ``labels``, tasks into ``tasks``, and what else is known of it into ``likeness``.
+    """
     before = 0  # steps whose labels are in memory
     for name in names:
         found = source.read(name)
+        tasks[name] = task_of(found.attributes)
         seen = {key: array for key, array in found.observations.items() if key in fit.hierarchy.encoder.shapes}
         inferred = INFERENCE * len(found) + FOUND * fit.hierarchy.depth * (before + len(found))
         whole = needed([Demonstration.stored(name, seen, found.actions)]) + inferred
@@ -272,9 +305,11 @@ def _demonstrations(
 
 def _demonstration(found: Demonstration, fit: Fit) -> Demonstration:
     """A demonstration of a source with the observations of the run's networks."""
-    shapes = fit.hierarchy.encoder.shapes
+    shapes, tasks = fit.hierarchy.encoder.shapes, fit.hierarchy.encoder.tasks
+    found = with_task(found, tasks) if tasks else found
     check_fitted(found, shapes, fit.hierarchy.scaling.size)
-    return Demonstration(found.name, {key: found.observations[key] for key in shapes}, found.actions)
+    observations = {key: found.observations[key] for key in shapes}
+    return Demonstration(found.name, observations, found.actions, attributes=found.attributes)
 
 
 def of_piece(

@@ -68,11 +68,11 @@ def _value(value: Any) -> str:
 def wide(spec: Spec) -> Spec:
     """The spec with the observations of all candidates, for reading the demonstrations once."""
     alone = with_overrides(spec, {"selection.grid": {}})
-    seen = {obs.key: obs for obs in spec.observations}
+    seen = {obs.name: obs for obs in spec.observations}
     for path, values in spec.selection.grid.items():
         if path.partition(".")[0] == "observations":
             for value in values:
-                seen |= {obs.key: obs for obs in with_overrides(alone, {path: value}).observations}
+                seen |= {obs.name: obs for obs in with_overrides(alone, {path: value}).observations}
     return alone.model_copy(update={"observations": tuple(seen.values())})
 
 

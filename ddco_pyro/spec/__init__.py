@@ -9,6 +9,7 @@ from ddco_pyro.spec.networks import Activation, ConvolutionLayer, NetworkSpec, P
 from ddco_pyro.spec.settings import (
     DISCRETE,
     STEP,
+    TASK,
     ControlSpec,
     DemonstrationsSpec,
     Kind,
@@ -25,6 +26,7 @@ from ddco_pyro.spec.yaml import dump_spec, load_spec, spec_schema, user_code
 __all__ = [
     "DISCRETE",
     "STEP",
+    "TASK",
     "Activation",
     "BaselineSpec",
     "ControlSpec",

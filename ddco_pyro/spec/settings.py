@@ -38,6 +38,8 @@ class DemonstrationsSpec(Model):
     which leaves it out. For few demonstrations; ``valid_fraction`` does not apply."""
     exclude: Items[Text] = ()
     """Names of demonstrations that are not read."""
+    where: dict[str, Annotated[Items[Text], Field(min_length=1)]] = Field(default={})
+    """Attributes of demonstrations and their values, such as ``{task: [reach]}``: those with others are not read."""
     labels: Labels | None = None
     """Ground-truth labels in the file, with which discovered options are compared: one name for all levels, or a list
     with a name for each level, lowest first. Steps labelled −1 are ignored."""
@@ -72,6 +74,9 @@ class DemonstrationsSpec(Model):
 STEP = "step"
 """The built-in observation: the number of the step divided by the steps of the longest training demonstration."""
 
+TASK = "task"
+"""The built-in observation: a number for each task of the demonstrations, 1 for its own and 0 for the others."""
+
 
 Size = Annotated[Items[Count], Field(min_length=2, max_length=2)]
 Part = Annotated[Items[Annotated[int, Field(ge=0)]], Field(min_length=4, max_length=4)]
@@ -85,7 +90,10 @@ class ObservationSpec(Model):
     """
 
     key: Text
-    """Name of the observation in the demonstrations; ``step`` is built in."""
+    """Name of the observation in the demonstrations; ``step`` and ``task`` are built in."""
+    minus: Text | None = None
+    """For vectors: an observation of as many numbers that is subtracted, so that a position is relative to another.
+    Networks know the difference as ``KEY-MINUS``."""
     differences: bool = False
     """Append x_t − x_{t−1}."""
     angles: Items[Annotated[int, Field(ge=0)]] = ()
@@ -109,13 +117,18 @@ class ObservationSpec(Model):
     def problems(self) -> Problems:
         if self.crop is not None and 0 in self.crop[2:]:
             yield "crop", "is top, left, height, width; height and width must be at least 1"
-        for key in ("differences", "angles", "quaternions", "shift"):
-            if self.key == STEP and getattr(self, key):
-                yield key, f"does not apply to {STEP}; leave it out"
+        for key in ("minus", "differences", "angles", "quaternions", "shift"):
+            if self.key in (STEP, TASK) and getattr(self, key):
+                yield key, f"does not apply to {self.key}; leave it out"
         turned = [*self.angles, *(first + place for first in self.quaternions for place in range(4))]
         if len(set(turned)) < len(turned):
             where = "angles" if self.angles else "quaternions"
             yield where, "name a number twice; each is part of one angle or quaternion"
+
+    @property
+    def name(self) -> str:
+        """What networks call it."""
+        return f"{self.key}-{self.minus}" if self.minus else self.key
 
     def turned(self, size: int) -> int:
         """For vectors: numbers of a step of ``size`` numbers, with angles and quaternions in their place."""

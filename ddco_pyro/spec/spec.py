@@ -13,6 +13,7 @@ from ddco_pyro.spec.model import Baseline, HierarchySpec, LevelSpec
 from ddco_pyro.spec.networks import foreign_keys
 from ddco_pyro.spec.settings import (
     STEP,
+    TASK,
     ControlSpec,
     DemonstrationsSpec,
     InferenceSpec,
@@ -41,7 +42,8 @@ class Spec(Model):
     """Where the demonstrations come from."""
     observations: Items[Observation] = Field(min_length=1)
     """The observations that the networks read; a bare name stands for ``{key: name}``. ``step`` is built in: the number
-    of the step divided by the steps of the longest training demonstration."""
+    of the step divided by the steps of the longest training demonstration. So is ``task``: a number for each task of
+    the demonstrations, 1 for the demonstration's own and 0 for the others."""
     control: ControlSpec = ControlSpec()
     """The distribution of the control."""
     hierarchy: HierarchySpec | None = None
@@ -70,8 +72,14 @@ class Spec(Model):
 
     @property
     def observed(self) -> list[str]:
-        """Names of the observations that demonstrations must hold: all except the built-in ``step``."""
-        return [observation.key for observation in self.observations if observation.key != STEP]
+        """Names of the observations that demonstrations must hold: all except the built-in ``step`` and ``task``."""
+        named = (name for each in self.observations for name in (each.key, each.minus))
+        return [*dict.fromkeys(name for name in named if name not in (None, STEP, TASK))]
+
+    @property
+    def sees_task(self) -> bool:
+        """Whether a network may read the built-in observation ``task``."""
+        return any(observation.key == TASK for observation in self.observations)
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -133,12 +141,15 @@ class Spec(Model):
             yield "compare_with", "needs held-out demonstrations to compare on; raise demonstrations.valid_fraction"
 
     def _observed(self) -> Problems:
-        keys = [observation.key for observation in self.observations]
+        keys = [observation.name for observation in self.observations]
         for index, key in enumerate(keys):
             if key in keys[:index]:
                 yield f"observations.{index}.key", f"{key!r} is given twice; keep one"
         if not self.observed:
-            yield "observations", f"{STEP} alone says nothing about the state; name an observation beside it"
+            yield (
+                "observations",
+                f"{' and '.join(keys)} alone says nothing about the state; name an observation beside it",
+            )
         named = [("report.trajectory", path.key) for path in self.report.trajectory or ()]
         named += [("control.relative_to", self.control.relative_to)] if self.control.relative_to else []
         for place, key in dict.fromkeys(named):

@@ -11,10 +11,12 @@ import numpy as np
 
 from ddco_pyro.data.arrays import is_picture, network_input
 from ddco_pyro.data.demonstration import Demonstration, check, needed
-from ddco_pyro.data.demonstrations import Demonstrations, stored
+from ddco_pyro.data.demonstrations import Demonstrations, stored, with_labels_of_tasks, with_tasks
 from ddco_pyro.data.division import check_trained, with_values
 from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.memory import refuse_too_much
+from ddco_pyro.data.tasks import chosen, known_tasks
+from ddco_pyro.data.tensors import read_tensors
 from ddco_pyro.errors import nearest
 from ddco_pyro.events import OnEvent, ignore
 from ddco_pyro.simulation.collect import cache_path, collect
@@ -48,7 +50,8 @@ def dimensions(spec: Spec, demos: Demonstrations | None = None) -> Dimensions:
     file = sought.file or cache_path(task, spec.demonstrated_task, sought, spec.observed)
     if not file.exists():
         return size
-    collected = Dimensions.of(Demonstrations.read(file, _measured(spec), (), sought.exclude), spec.control.relative_to)
+    known = Demonstrations.read(file, _measured(spec), (), sought.exclude, sought.where)
+    collected = Dimensions.of(known, spec.control.relative_to)
     return replace(size, constant=collected.constant, control=collected.control)
 
 
@@ -150,7 +153,8 @@ def _read(spec: Spec, path: Path, ready: Callable[[Demonstration], Demonstration
             f"demonstrations.path=FILE; it has to be HDF5 in robomimic's layout, with {', '.join(read)} in each "
             "data/<demonstration>"
         )
-    with stored(path, spec.observed, _labels(spec), spec.demonstrations.exclude) as (found, masks, attributes):
+    sought = spec.demonstrations
+    with stored(path, spec.observed, _labels(spec), sought.exclude, sought.where) as (found, masks, attributes):
         remedy = "leave observations out, or make its demonstrations fewer, shorter or equally long"
         refuse_too_much(needed(found), f"a fit to {', '.join(spec.observed)}", remedy)
         return _set_apart(spec, Demonstrations(tuple(ready(demo) for demo in found), masks, attributes))
@@ -179,6 +183,9 @@ def seen(spec: Spec, demos: Demonstrations) -> Demonstrations:
     """
     keys, labels, exclude = spec.observed, _labels(spec), set(spec.demonstrations.exclude)
     first = demos[0]
+    if spec.demonstrations.where:
+        attributes = {demo.name: demo.attributes for demo in demos}
+        exclude |= {*demos.names} - {*chosen(attributes, spec.demonstrations.where)}
     if (first.observations.keys(), first.labels.keys(), exclude) == ({*keys}, {*labels}, set()):
         return _set_apart(spec, demos)
     for kind, names, there in (("obs", keys, first.observations), ("labels", labels, first.labels)):
@@ -204,8 +211,13 @@ def seen(spec: Spec, demos: Demonstrations) -> Demonstrations:
 def _set_apart(spec: Spec, demos: Demonstrations) -> Demonstrations:
     """The demonstrations with the mask ``valid`` that ``hold_out_by`` asks for, in place of masks of the file.
 
-    :raises DemonstrationsError: the demonstrations cannot be divided by this attribute.
+    They have the observation ``task`` where the spec names it, and labels of two tasks differ.
+
+    :raises DemonstrationsError: the demonstrations cannot be divided by this attribute, or have no tasks.
     """
+    demos = with_labels_of_tasks(demos)
+    if spec.sees_task:
+        demos = with_tasks(demos, _tasks_of_library(spec))
     given, own = spec.demonstrations, {demo.name: demo.attributes for demo in demos}
     if given.hold_out_by is None:
         return demos
@@ -213,6 +225,13 @@ def _set_apart(spec: Spec, demos: Demonstrations) -> Demonstrations:
     held_out = {name for members in found.values() for name in members}
     others = {mask: names for mask, names in demos.masks.items() if mask != "train"}
     return replace(demos, masks={**others, "valid": tuple(name for name in demos.names if name in held_out)})
+
+
+def _tasks_of_library(spec: Spec) -> tuple[str, ...]:
+    """The tasks of the run that is the spec's library; none without one."""
+    library = spec.training.library
+    model = library and Path(library.run) / "model.safetensors"
+    return known_tasks(read_tensors(model)[1]) if model and model.is_file() else ()
 
 
 def _labels(spec: Spec) -> tuple[str, ...]:

@@ -22,12 +22,13 @@ from ddco_pyro.data.controls import (
     same,
 )
 from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
+from ddco_pyro.data.tasks import known_tasks
 from ddco_pyro.model.encoder import Shapes
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import ShapeError
 from ddco_pyro.model.seeding import seeded
 from ddco_pyro.names import HIERARCHY, MIXTURE
-from ddco_pyro.spec import BaselineSpec, Spec, SpecError, user_code, with_overrides
+from ddco_pyro.spec import TASK, BaselineSpec, Spec, SpecError, user_code, with_overrides
 from ddco_pyro.training.processes import device_of
 
 
@@ -39,6 +40,7 @@ class Dimensions:
         them out.
     :param control: statistics of each control dimension in the demonstrations; empty where they are unknown.
     :param parts: the parts of the control in a fitted model; None before they are decided.
+    :param tasks: of the numbers of the built-in observation ``task``.
     """
 
     shapes: Shapes
@@ -47,6 +49,7 @@ class Dimensions:
     constant: Mapping[int, float] = field(default_factory=dict)
     control: tuple[ControlDimension, ...] = field(default=(), compare=False)
     parts: tuple[ControlPart, ...] | None = None
+    tasks: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, demonstrations: Demonstrations, relative_to: str | None = None) -> Dimensions:
@@ -60,7 +63,8 @@ class Dimensions:
         if len(constant) == len(control):
             raise DemonstrationsError(all_constant(control))
         shapes, size = demonstrations.observation_shapes, demonstrations.control_size
-        return cls(shapes, size, max(demonstrations.lengths), constant, control)
+        tasks = known_tasks(demonstrations.attributes)
+        return cls(shapes, size, max(demonstrations.lengths), constant, control, tasks=tasks)
 
     def like(self, model: Hierarchy, name: str) -> Dimensions:
         """With the kinds of control of a fitted model, which is to be the prior of another one.
@@ -89,7 +93,8 @@ def build_hierarchy(spec: Spec, dimensions: Dimensions, seed: int | None = None)
     :param seed: of the initial weights; None for the spec's.
     :raises SpecError: something in the spec does not fit the observations or the control.
     """
-    missing = [key for key in spec.observed if key not in dimensions.shapes]
+    read = [*spec.observed, *([TASK] if spec.sees_task else [])]
+    missing = [key for key in read if key not in dimensions.shapes]
     if missing:
         known = ", ".join(sorted(dimensions.shapes))
         raise SpecError(f"observations: there is no {', '.join(missing)} (there are: {known})")
@@ -101,7 +106,8 @@ def build_hierarchy(spec: Spec, dimensions: Dimensions, seed: int | None = None)
         parts = control_parts(spec.control, dimensions.control)
     try:
         with seeded(spec.seed if seed is None else seed):
-            return Hierarchy(spec, dimensions.shapes, size, dimensions.steps, dimensions.constant, parts)
+            given = (dimensions.steps, dimensions.constant, parts, dimensions.tasks)
+            return Hierarchy(spec, dimensions.shapes, size, *given)
     except ShapeError as error:
         raise SpecError(str(error)) from error
 

@@ -61,10 +61,9 @@ class DDCOPolicy(PreTrainedPolicy):
 
         :raises ValueError: an observation is missing, or has another shape than in training.
         """
-        specs = self.about["observations"]
-        names = {
-            spec["key"]: "observation." + spec["key"].replace("/", ".") for spec in specs if not self._built_in(spec)
-        }
+        own = [spec for spec in self.about["observations"] if not self._built_in(spec)]
+        specs = [spec | {"key": key} for spec in own for key in (spec["minus"], spec["key"]) if key]
+        names = {spec["key"]: "observation." + spec["key"].replace("/", ".") for spec in specs}
         if missing := [name for name in names.values() if name not in batch]:
             raise ValueError(f"the batch has no {missing[0]!r} (it has: {', '.join(sorted(batch))})")
         rows = {key: batch[name].cpu().numpy() for key, name in names.items()}
@@ -76,7 +75,7 @@ class DDCOPolicy(PreTrainedPolicy):
             self.episodes += count
         controls = []
         for row, controller in enumerate(self._controllers):
-            seen = {spec["key"]: _own(rows[spec["key"]][row], spec) for spec in specs if spec["key"] in rows}
+            seen = {spec["key"]: _own(rows[spec["key"]][row], spec) for spec in specs}
             controls.append(controller.act(seen))
         return torch.as_tensor(np.stack(controls), dtype=torch.float32)
 

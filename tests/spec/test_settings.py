@@ -8,12 +8,13 @@ from collections.abc import Iterator
 from dataclasses import replace
 from inspect import get_annotations
 from pathlib import Path
-from typing import Any, get_args, get_origin
+from typing import Any, Literal, get_args, get_origin
 
 import h5py
 import numpy as np
 import pytest
 import yaml
+from four_tasks import four_tasks
 from random_demonstrations import numbered
 from targets import targets, velocities
 
@@ -51,6 +52,11 @@ def setting(model: type[Model], key: str) -> str:
     return f"{declaring[-1].__name__}.{key}"
 
 
+def chosen(annotation: Any) -> bool:
+    """Whether there is a choice: a key with one possible value marks a mapping, such as ``learn: true`` of σ."""
+    return get_origin(annotation) is not Literal or len(get_args(annotation)) > 1
+
+
 def reachable(model: type[Model], found: dict[type[Model], None]) -> dict[type[Model], None]:
     if model not in found:
         found[model] = None
@@ -61,7 +67,9 @@ def reachable(model: type[Model], found: dict[type[Model], None]) -> dict[type[M
 
 
 MODELS = list(reachable(Spec, {}))
-ALL = sorted({setting(model, key) for model in MODELS for key in fields(model)})
+ALL = sorted(
+    {setting(model, key) for model in MODELS for key, field in fields(model).items() if chosen(field.annotation)}
+)
 
 
 def meant(models: list[type[Model]], data: dict[str, Any]) -> list[type[Model]]:
@@ -170,6 +178,7 @@ def of_init(folder: Path) -> Iterator[tuple[str, str]]:
         "few demonstrations": pick_and_place(4),
         "labels": Demonstrations(tuple(operators)),
         "targets": targets(velocities(4)),
+        "tasks": four_tasks(4),
     }
     for name, demos in files.items():
         path = folder / f"{name}.hdf5"

@@ -11,12 +11,13 @@ from shlex import quote
 
 import h5py
 
-from ddco_pyro.data.demonstration import Attribute, Demonstration
+from ddco_pyro.data.demonstration import NOTHING, Attribute, Demonstration
 from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.formats import FORMATS, LAYOUTS
+from ddco_pyro.data.tasks import Where, chosen
 from ddco_pyro.errors import command, nearest, path_of
 
-__all__ = ["Source", "open_source", "refuse_foreign"]
+__all__ = ["Source", "narrowed", "open_source", "refuse_foreign"]
 
 
 @dataclass(frozen=True)
@@ -44,11 +45,14 @@ class Source:
 
 
 @contextmanager
-def open_source(path: str | Path, form: str | None = None, actions: Sequence[str] = ()) -> Iterator[Source]:
+def open_source(
+    path: str | Path, form: str | None = None, actions: Sequence[str] = (), where: Where = NOTHING
+) -> Iterator[Source]:
     """Open a file or folder.
 
     :param form: its format, of :data:`~ddco_pyro.data.formats.FORMATS`; recognised if None.
     :param actions: names of the arrays that are the control together, where a LeRobot or Minari dataset has several.
+    :param where: attributes and values of the demonstrations that the source has then; all if empty.
     :raises DemonstrationsError: the source cannot be read, or has another format.
     """
     path = path_of(path, "demonstrations")
@@ -63,7 +67,19 @@ def open_source(path: str | Path, form: str | None = None, actions: Sequence[str
     with reader(path, actions) if FORMATS[form].parts else reader(path) as source:
         if not source.names:
             raise DemonstrationsError(f"{path}: holds no demonstrations; at least one is needed", located=True)
-        yield replace(source, format=form)
+        yield narrowed(replace(source, format=form), where)
+
+
+def narrowed(source: Source, where: Where) -> Source:
+    """A source of the demonstrations with some values of attributes (:func:`~ddco_pyro.data.tasks.chosen`).
+
+    :raises DemonstrationsError: there is none.
+    """
+    if not where:
+        return source
+    names = chosen({name: source.read(name).attributes for name in source.names}, where)
+    kept = {mask: tuple(name for name in members if name in names) for mask, members in source.masks.items()}
+    return replace(source, names=tuple(names), masks=kept)
 
 
 # --- recognition ------------------------------------------------------------------------------------------------------

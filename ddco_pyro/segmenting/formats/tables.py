@@ -25,8 +25,11 @@ def table(segmented: Segmented) -> pandas.DataFrame:
     Then come the kinds of baselines, and who says so where a person labelled.
     """
     parts = []
+    named = any(demo.task for demo in segmented.segments)
     for demo in segmented.segments:
-        columns: dict[str, Any] = {"demonstration": demo.name, "step": np.arange(len(demo))}
+        columns: dict[str, Any] = {"demonstration": demo.name}
+        columns |= {"task": demo.task} if named else {}
+        columns["step"] = np.arange(len(demo))
         if segmented.frequency:
             columns["seconds"] = columns["step"] / segmented.frequency
         for name, level in demo.levels.items():
@@ -34,8 +37,8 @@ def table(segmented: Segmented) -> pandas.DataFrame:
             columns[name] = level.options
             columns[name + BOUNDARY] = level.boundaries.astype(int)
             columns[f"{name}_probability"] = level.probability.astype(float)
-            named = {option: option_name(option, names) for option in level.options.tolist()} | {UNKNOWN: ""}
-            columns[f"{name}_name"] = [named[option] for option in level.options.tolist()]
+            words = {option: option_name(option, names) for option in level.options.tolist()} | {UNKNOWN: ""}
+            columns[f"{name}_name"] = [words[option] for option in level.options.tolist()]
         for name, kinds in demo.baselines.items():
             columns[name] = [SOURCES[kind] for kind in kinds] if name.endswith(SOURCE) else kinds
         parts.append(pandas.DataFrame(columns))
@@ -45,7 +48,7 @@ def table(segmented: Segmented) -> pandas.DataFrame:
 def write_csv(asked: Asked, segmented: Segmented) -> str:
     """The table as CSV; an apostrophe goes before a text that a spreadsheet would execute."""
     rows = table(segmented)
-    for name in ("demonstration", *(f"{level}_name" for level in segmented.counts)):
+    for name in ("demonstration", *({"task"} & {*rows}), *(f"{level}_name" for level in segmented.counts)):
         rows[name] = [f"'{text}" if text.startswith(FORMULA) else text for text in rows[name]]
     with whole_file(asked.out) as temporary:
         rows.to_csv(temporary, index=False)
