@@ -54,7 +54,7 @@ TOLERANCE = 1e-5
 """EM has converged where a step gains less, in nats per step of the demonstrations."""
 ROUGHLY = 1e-3
 """The same in a stage whose end is a start alone."""
-MOST = 100_000
+MOST = 50_000
 """The most steps that such a stage learns from, of demonstrations spread evenly over their lengths."""
 BLOCK = 512
 """Steps whose features are multiplied at once: the products stay in the cache."""
@@ -73,26 +73,26 @@ def is_linear(model: Hierarchy) -> bool:
 
 
 class Features:
-    """The features of a piece of the demonstrations, in float64.
+    """The features of a piece of the demonstrations. What networks say of a step is float32, as they compute it; sums
+    over steps that are solved for weights are float64.
 
     :param reads: the vectors that networks read; none for constants.
     :ivar x: the vectors with a 1 at the end, [N, T, F].
     """
 
     def __init__(self, inputs: Inputs, reads: Sequence[str]) -> None:
-        vectors = (inputs.vectors[name].double() for name in reads)
-        self.x = torch.cat([*vectors, torch.ones(*inputs.batch, 1, dtype=torch.float64)], dim=-1)
+        self.x = torch.cat([*(inputs.vectors[name] for name in reads), torch.ones(*inputs.batch, 1)], dim=-1)
 
     def outputs(self, weights: Sequence[Tensor]) -> list[Tensor]:
         """W^T x of networks with weights [K, F, n] each: [N, T, K, n] each."""
-        said = self.x.flatten(0, 1) @ torch.cat([own.transpose(0, 1).flatten(1) for own in weights], 1)
+        said = self.x.flatten(0, 1) @ torch.cat([own.transpose(0, 1).flatten(1) for own in weights], 1).to(self.x)
         parts = said.split([own.shape[0] * own.shape[2] for own in weights], 1)
         shapes = ((*self.x.shape[:2], own.shape[0], own.shape[2]) for own in weights)
         return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
 
     def gradients(self, of: Sequence[Tensor]) -> list[Tensor]:
         """Σ_t x_t g_t^T of the gradients of the outputs of networks, [N, T, K, n] each: [K, F, n] each."""
-        sums = self.x.flatten(0, 1).T @ torch.cat([own.flatten(0, 1).flatten(1) for own in of], 1)
+        sums = (self.x.flatten(0, 1).T @ torch.cat([own.flatten(0, 1).flatten(1) for own in of], 1)).double()
         parts = sums.split([own.shape[2:].numel() for own in of], 1)
         return [part.unflatten(1, own.shape[2:]).transpose(0, 1) for part, own in zip(parts, of, strict=True)]
 
@@ -103,8 +103,9 @@ class Features:
         features = self.x.shape[-1]
         pairs = np.empty((BLOCK, features * (features + 1) // 2))
         found = torch.zeros(sum(own.shape[1] for own in weights), pairs.shape[1], dtype=torch.float64)
-        for rows, own in zip(self.x.flatten(0, 1).split(BLOCK), torch.cat([*weights], 1).split(BLOCK), strict=True):
-            products(rows.numpy(), pairs)
+        columns = torch.cat([*weights], 1).double()
+        for rows, own in zip(self.x.flatten(0, 1).split(BLOCK), columns.split(BLOCK), strict=True):
+            products(rows.double().numpy(), pairs)
             found.addmm_(own.T, torch.from_numpy(pairs[: len(rows)]))
         lower = torch.tril_indices(features, features)
         whole = found.new_empty(len(found), features, features)
@@ -417,7 +418,7 @@ class Expectation:
         logits = [said[f"{name}.termination"].squeeze(-1) if f"{name}.termination" in said else None for name in named]
         top = callers["meta_policy"]
         if self._discovering:
-            uniform = torch.zeros(*piece.inputs.batch, 1, levels[-1].count, dtype=torch.float64)
+            uniform = torch.zeros(*piece.inputs.batch, 1, levels[-1].count)
             top = CallerOutputs(levels[-1].count, uniform, None)
         outputs = Outputs((*(callers[f"{name}.policy"] for name in named), top), tuple(logits), power)
         before = outputs.logits(piece.actions)
@@ -430,14 +431,15 @@ class Expectation:
         acting = {name: own for name, own in zip(every, acted, strict=False) if name in stds and own is not None}
         densities = [table for name, table in zip(every, tables.control, strict=False) if name in acting]
         wanted = [leaf[name] for leaf in (said, stds) for name in acting]
-        slopes = torch.autograd.grad(densities, wanted, [*acting.values()], allow_unused=True) if acting else ()
+        weighed = [(own * table).sum() for own, table in zip(acting.values(), densities, strict=True)]
+        slopes = torch.autograd.grad(weighed, wanted, allow_unused=True) if acting else ()  # weights would import sympy
         of, of_std = (dict(zip(acting, part, strict=True)) for part in (slopes[: len(acting)], slopes[len(acting) :]))
         learned: dict[str, list[Information]] = {}
         with torch.no_grad():
             selecting = (name for name in every if callers[name].options)
             for name, posterior, table in zip(selecting, chosen, tables.selection, strict=False):
                 if name in sums and posterior is not None and self._callers[name].sizes[0]:
-                    asked, p = posterior @ torch.ones(posterior.shape[-1], dtype=torch.float64), table.exp()
+                    asked, p = posterior @ posterior.new_ones(posterior.shape[-1]), table.exp()
                     columns = slice(0, self._callers[name].sizes[0])
                     of.setdefault(name, torch.zeros_like(said[name]))
                     of[name][..., columns] = (posterior - asked.unsqueeze(-1) * p)[..., -columns.stop :]
