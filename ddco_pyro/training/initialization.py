@@ -29,6 +29,9 @@ if TYPE_CHECKING:
     from sklearn.cluster import KMeans
     from sklearn.linear_model import LogisticRegression
 
+ENOUGH = 20_000
+"""The most steps that k-means without labels finds clusters of."""
+
 ITERATIONS = 300
 """The most iterations of k-means or logistic regression."""
 
@@ -61,6 +64,7 @@ class Clusters:
     ) -> None:
         self._controls, self._read, self._window = controls, read, window
         most = most_rows(next(self._trajectories(batch)).shape[1])
+        most = min(most, ENOUGH) if labels is None else most  # labels may be few
         chosen = np.ones(batch.steps, dtype=bool)
         chosen[np.random.default_rng(seed).permutation(batch.steps)[most:]] = False
         left, found = chosen, []
