@@ -170,7 +170,7 @@ class Inferred:
     def draws(self, row: int, number: int, seed: Sequence[int]) -> np.ndarray:
         """Choices and terminations of draws from p(ζ | ξ) for one demonstration, [2, D, number, T]."""
         length = self.lengths[row]
-        path = sample_paths(self.tables.trajectory(row, length), torch.tensor([length]), number, seed)
+        path = sample_paths(self.tables.part(torch.tensor([row]), length), torch.tensor([length]), number, seed)
         return torch.stack([torch.stack(kind)[:, :, 0] for kind in path]).numpy()
 
     def drawn(self, row: int, lasts: Sequence[bool]) -> list[dict[int, np.ndarray]]:

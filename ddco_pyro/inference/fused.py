@@ -56,7 +56,7 @@ class Eliminate(torch.autograd.Function):
         with torch.no_grad():
             tables = Tables.of(ctx.depth, leaves)
             widest = reduce(torch.promote_types, (leaf.dtype for leaf in leaves if leaf is not None))
-            rows = (ctx.rows * upstream.reshape(-1, 1, 1)).to(widest)
+            rows = ctx.rows.to(widest) * upstream.reshape(-1, 1, 1).to(widest)
             parts, marginals = _split(tables, rows, any(needed[3 * ctx.depth + 1 :]))
             each = *parts.leaves(), *(marginals or tables.evidence)
             gradients = [
@@ -109,20 +109,22 @@ def _eliminated(tables: Tables, lengths: Tensor, marginals: bool, gradient: bool
             sums = logspace.log_likelihood(complete(tables, lengths))
             acting = alive.double().unsqueeze(-1)
             return Elimination(sums, Tables((), (), (acting,)), (), acting)
-        structure, rows = Structure.of(tables.sizes), side_by_side(tables)
+        structure = Structure.of(tables.sizes)
         gains = structure.columns + (sum(tables.sizes) if marginals else 0)
         found = torch.empty(number, steps, gains, dtype=torch.float64)
         value, exact = np.empty(number), np.empty(number, np.bool_)
+
         order = lengths.argsort(stable=True)
-        blocks = np.array([int(lengths[block].sum()) for block in order.split(kernel.LANES)])
-        given = order.numpy(), lengths.numpy(), rows.numpy(), found.numpy(), value, exact
+        blocks = torch.stack([lengths[block].sum() for block in order.split(kernel.LANES)])
 
         def some(first: int, last: int) -> None:
-            longest = int(lengths[order[: last * kernel.LANES][-1]])
+            chosen = order[first * kernel.LANES : last * kernel.LANES]
+            longest = int(lengths[chosen[-1]])
+            rows = side_by_side(tables.part(chosen, longest)).numpy()
             room = kernel.room_for(longest, rows.shape[2], gains, structure.entries)
             kernel.eliminate(
-                first, last, *given, room, tables.power, tables.logits, gradient, structure.columns, *structure.tables,
-                structure.groups, structure.inert,
+                chosen.numpy(), lengths.numpy(), rows, found.numpy(), value, exact, room, tables.power, tables.logits,
+                gradient, structure.columns, *structure.tables, structure.groups, structure.inert,
             )  # fmt: skip
 
         kernel.on_threads(some, blocks)
@@ -141,14 +143,17 @@ def predicted(tables: Tables, lengths: Tensor) -> Tensor:
     if not tables.depth:
         return found
     structure = Structure.of(tables.sizes)
-    given = lengths.numpy(), logarithms(tables).numpy(), found.flatten(2).numpy()
 
     def some(first: int, last: int) -> None:
         longest, size = int(lengths[first:last].max()), structure.entries
+        rows, into = (
+            logarithms(tables.part(torch.arange(first, last), longest)).numpy(),
+            found[first:last].flatten(2).numpy(),
+        )
         room = np.empty((longest + 1, size)), np.empty((longest, size))
-        kernel.predict(first, last, *given, *room, structure.columns, *structure.tables)
+        kernel.predict(lengths[first:last].numpy(), rows, into, *room, structure.columns, *structure.tables)
 
-    kernel.on_threads(some, given[0])
+    kernel.on_threads(some, lengths)
     return found
 
 
@@ -191,7 +196,8 @@ def _split(tables: Tables, rows: Tensor, marginals: bool) -> tuple[Tables, tuple
 
 def _repeat_in_log_space(tables: Tables, n: int, length: int, elimination: Elimination, gradient: bool) -> None:
     """Eliminate a trajectory in log space and write the results into ``elimination``."""
-    alone = tables.trajectory(n, length) if gradient else tables.trajectory(n, length).normalised()
+    alone = tables.part(torch.tensor([n]), length)
+    alone = alone if gradient else alone.normalised()
     leaves = [None if leaf is None else leaf.detach().double().requires_grad_() for leaf in alone.leaves()]
     with torch.enable_grad():
         chain = complete(Tables.of(tables.depth, leaves, tables.power, alone.logits), torch.tensor([length]))

@@ -28,6 +28,7 @@ import numpy as np
 import torch
 from llvmlite import ir
 from numba.extending import intrinsic
+from torch import Tensor
 
 Array = np.ndarray
 
@@ -123,19 +124,25 @@ def _offsets(sizes: Sequence[int]) -> Array:
     return np.cumsum([0, *sizes])
 
 
-def on_threads(run: Callable[[int, int], object], lengths: Array) -> None:
+def on_threads(run: Callable[[int, int], object], lengths: Tensor) -> None:
     """Call ``run(first, last)`` for parts of the trajectories, on at most ``torch.get_num_threads()`` threads.
+
+    torch itself works on one thread meanwhile: its own threads wait busily, and these would wait for them.
 
     :param lengths: steps of each, [N].
     """
-    number = len(lengths)
-    threads = min(torch.get_num_threads(), number, 1 + int(lengths.sum()) // STEPS_A_THREAD)
+    number, most = len(lengths), torch.get_num_threads()
+    threads = min(most, number, 1 + int(lengths.sum()) // STEPS_A_THREAD)
     if threads == 1:
         run(0, number)
         return
     bounds = [number * part // threads for part in range(threads + 1)]
-    with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(run, bounds[:-1], bounds[1:]))
+    torch.set_num_threads(1)
+    try:
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(run, bounds[:-1], bounds[1:]))
+    finally:
+        torch.set_num_threads(most)
 
 
 inner = numba.njit(error_model="numpy", fastmath={"contract"}, inline="always")
@@ -232,10 +239,9 @@ def _load(
     controls, number = groups[-1, 0], rows.shape[2]
     for lane in range(LANES):
         at = block * LANES + lane
-        n = order[min(at, len(order) - 1)]
-        if at < len(order) and t < lengths[n]:
+        if at < len(order) and t < lengths[order[at]]:
             for c in range(number):
-                room[LANES * (p + c) + lane] = rows[n, t, c]
+                room[LANES * (p + c) + lane] = rows[at, t, c]
         else:
             for c in range(number):
                 room[LANES * (p + c) + lane] = inert[c] if c < columns else 0.0
@@ -343,17 +349,17 @@ def _backward(
 
 @entry
 def eliminate(
-    first: int, last: int, order: Array, lengths: Array, rows: Array, posterior: Array, value: Array, exact: Array,
-    room: Array, power: float, logits: bool, gradient: bool, columns: int, callers: Array, actors: Array,
+    order: Array, lengths: Array, rows: Array, posterior: Array, value: Array, exact: Array, room: Array, power: float,
+    logits: bool, gradient: bool, columns: int, callers: Array, actors: Array,
     choices: Array, above: Array, groups: Array, inert: Array,
 ) -> None:  # fmt: skip
-    """Of blocks ``first`` to ``last`` of :data:`LANES` trajectories, fill ``value``, ``exact`` and the posteriors.
+    """Fill ``value``, ``exact`` and the posteriors, with :data:`LANES` trajectories in a block.
 
     Each step is scaled to a mass of 1. Underflow there matters only where the past makes next to impossible what the
     future demands. Then Σ_s α_t(s) β_t(s) is not 1, and the trajectory is not ``exact``.
 
-    :param order: of the trajectories, [N]; those of a block should be about as long.
-    :param rows: log-probabilities; of selections and terminations logits where ``logits`` says so.
+    :param order: the trajectories [M] of N; those of a block should be about as long.
+    :param rows: their log-probabilities in this order; of selections and terminations logits where ``logits`` says so.
     :param posterior: or the derivative of log p(ξ) with respect to ``rows``, where ``gradient`` says so.
     :param value: log p(ξ), [N]; ``exact`` likewise.
     :param room: of :func:`room_for`.
@@ -362,7 +368,7 @@ def eliminate(
     gain, begin, stride, controls = FIXED + size, FIXED + size + gains, number + 2 * size + 1, groups[-1, 0]
     for i in range(LANES):
         room[LANES * ONE + i], room[LANES * ZERO + i], room[LANES * POWER + i] = 1.0, 0.0, power
-    for block in range(first, last):
+    for block in range((len(order) + LANES - 1) // LANES):
         longest, many = 0, min(LANES, len(order) - block * LANES)
         for lane in range(many):
             longest = max(longest, lengths[order[block * LANES + lane]])
@@ -487,15 +493,14 @@ def _act(
 
 @entry
 def predict(
-    first: int, last: int, lengths: Array, rows: Array, predicted: Array, messages: Array, spread: Array,
+    lengths: Array, rows: Array, predicted: Array, messages: Array, spread: Array,
     columns: int, callers: Array, actors: Array, choices: Array, above: Array,
 ) -> None:  # fmt: skip
-    """Of trajectories ``first`` to ``last``, fill the ``predicted`` log-probabilities [N, T, S] of joint choices before
-    the control of each step.
+    """Fill the ``predicted`` log-probabilities [N, T, S] of joint choices before the control of each step.
 
     :param rows: log-probabilities.
     """
-    for n in range(first, last):
+    for n in range(len(lengths)):
         _begin(messages)
         before = 0.0
         for t in range(lengths[n]):
@@ -522,7 +527,7 @@ def _back(
 
     A number uniform in [0, 1) takes the first part of the mass up to which the shares sum to more.
     """
-    entry, left = 0, uniforms[m, n, length, 0]
+    entry, left = 0, uniforms[n, m, length, 0]
     for s in range(len(actors)):
         left -= _share(semiring, messages[length, s], total)
         if left < 0:
@@ -530,19 +535,19 @@ def _back(
             break
     for t in range(length - 1, -1, -1):
         level = 0
-        joint[m, n, t] = entry
+        joint[n, m, t] = entry
         while entry < len(above):
             i = above[entry] - len(actors)
             j = entry - callers[i, 0]
             if t > 0 and j > 0:
                 kept = messages[t, entry] + rows[n, t, callers[i, 3] + 2 * j - 2]
-                if uniforms[m, n, t, level] < _share(semiring, kept, spread[t, entry]):
+                if uniforms[n, m, t, level] < _share(semiring, kept, spread[t, entry]):
                     break
             entry = above[entry]
             level += 1
-        ended[m, n, t] = level
+        ended[n, m, t] = level
         for d in range(level - 1 if t > 0 else -1, -1, -1):
-            i, mass, left = entry - len(actors), messages[t, entry], uniforms[m, n, t, uniforms.shape[3] // 2 + d]
+            i, mass, left = entry - len(actors), messages[t, entry], uniforms[n, m, t, uniforms.shape[3] // 2 + d]
             entry = callers[i, 0]
             for j in range(callers[i, 1]):
                 part = messages[t, callers[i, 0] + j]
@@ -556,19 +561,19 @@ def _back(
 
 @entry
 def trace(
-    first: int, last: int, semiring: int, lengths: Array, rows: Array, uniforms: Array, joint: Array,
-    ended: Array, possible: Array, messages: Array, spread: Array, columns: int, callers: Array, actors: Array,
+    semiring: int, lengths: Array, rows: Array, uniforms: Array, joint: Array, ended: Array, possible: Array,
+    messages: Array, spread: Array, columns: int, callers: Array, actors: Array,
     choices: Array, above: Array,
 ) -> None:  # fmt: skip
-    """Of trajectories ``first`` to ``last``, fill the ``joint`` choices [M, N, T] of M paths, and how many levels
-    ``ended`` before each. Paths are the most likely one (:data:`LARGEST`), or draws from p(ζ | ξ) (:data:`LOG_SUM`).
+    """Fill the ``joint`` choices [N, M, T] of M paths, and how many levels ``ended`` before each. Paths are the most
+    likely one (:data:`LARGEST`), or draws from p(ζ | ξ) (:data:`LOG_SUM`).
 
     ``possible`` [N] says which trajectories have a probability above 0; nothing is filled for others.
 
     :param rows: log-probabilities.
-    :param uniforms: numbers uniform in [0, 1), [M, N, 1 + T, 2·D]; zeros for the most likely path.
+    :param uniforms: numbers uniform in [0, 1), [N, M, 1 + T, 2·D]; zeros for the most likely path.
     """
-    for n in range(first, last):
+    for n in range(len(lengths)):
         _begin(messages)
         total = -np.inf
         for t in range(lengths[n]):
@@ -576,7 +581,7 @@ def trace(
             total = _act(semiring, t, n, rows, columns, messages, spread, actors)
         possible[n] = total > -np.inf
         if possible[n]:
-            for m in range(len(joint)):
+            for m in range(joint.shape[1]):
                 _back(
                     semiring, total, m, n, lengths[n], rows, messages, spread, uniforms, joint, ended, callers,
                     actors, above,

@@ -87,18 +87,22 @@ def segment(tables: Tables, lengths: Tensor) -> tuple[Tensor, ...]:
 def _trace(tables: Tables, lengths: Tensor, semiring: int, uniforms: np.ndarray) -> Path:
     if not tables.depth:
         return Path((), ())
-    structure, (samples, number, *_) = Structure.of(tables.sizes), uniforms.shape
-    joint, ended = np.full((2, samples, number, tables.steps), -1, dtype=np.int64)
-    possible = np.empty(number, dtype=np.bool_)
-    given = lengths.numpy(), logarithms(tables).numpy(), uniforms, joint, ended, possible
+    structure, uniforms = Structure.of(tables.sizes), np.ascontiguousarray(uniforms.swapaxes(0, 1))
+    joint, ended = np.full((2, *uniforms.shape[:2], tables.steps), -1, dtype=np.int64)
+    possible = np.empty(len(uniforms), dtype=np.bool_)
 
     def some(first: int, last: int) -> None:
-        longest, size = int(lengths[first:last].max()), structure.entries
+        longest, size, own = int(lengths[first:last].max()), structure.entries, slice(first, last)
+        rows = logarithms(tables.part(torch.arange(first, last), longest)).numpy()
         room = np.empty((longest + 1, size)), np.empty((longest, size))
-        kernel.trace(first, last, semiring, *given, *room, structure.columns, *structure.tables)
+        kernel.trace(
+            semiring, lengths[own].numpy(), rows, uniforms[own], joint[own], ended[own], possible[own], *room,
+            structure.columns, *structure.tables,
+        )  # fmt: skip
 
-    kernel.on_threads(some, given[0])
+    kernel.on_threads(some, lengths)
     refuse_impossible(torch.from_numpy(possible))
+    joint, ended = joint.swapaxes(0, 1), ended.swapaxes(0, 1)
     digits = structure.choices.T - structure.choices[0][:, None]
     ends = (np.arange(tables.depth + 1) > level for level in range(tables.depth))
     return Path(

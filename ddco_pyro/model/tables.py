@@ -124,11 +124,12 @@ class Tables:
         levels = replace(self, selection=(*lower, uniform))
         return levels, replace(fixed, selection=(*fixed.selection[:-1], top))
 
-    def trajectory(self, n: int, length: int) -> Tables:
-        """The first ``length`` steps of trajectory ``n`` alone, as tables with N = 1."""
+    def part(self, rows: Tensor, steps: int) -> Tables:
+        """The first steps of the trajectories ``rows`` [M] alone; without a copy where these stand side by side."""
+        chosen = slice(int(rows[0]), int(rows[-1]) + 1) if bool((rows.diff() == 1).all()) else rows
 
         def cut(tables: Sequence[Tensor | None]) -> Any:
-            return tuple(None if table is None else table[n : n + 1, :length] for table in tables)
+            return tuple(None if table is None else table[chosen, :steps] for table in tables)
 
         selection, termination, control, evidence = map(
             cut, (self.selection, self.termination, self.control, self.evidence)
