@@ -54,7 +54,7 @@ TOLERANCE = 1e-5
 """EM has converged where a step gains less, in nats per step of the demonstrations."""
 ROUGHLY = 1e-3
 """The same in a stage whose end is a start alone."""
-MOST = 50_000
+MOST = 100_000
 """The most steps that such a stage learns from, of demonstrations spread evenly over their lengths."""
 BLOCK = 512
 """Steps whose features are multiplied at once: the products stay in the cache."""

@@ -40,7 +40,7 @@ class Clusters:
     """k-means clusters of the observations of every step of a batch, named as the options 1 to k.
 
     Fewer than ``options`` clusters are found where there are fewer distinct observations. The clusters are fitted to at
-    most :func:`most_rows` steps, drawn at random.
+    most :data:`ENOUGH` steps, with labels to :func:`most_rows`, drawn at random.
 
     :param controls: cluster observations and controls together, with equal weight on either. Steps with similar
         observations and different controls are then in different clusters.
