@@ -113,7 +113,7 @@ print("share of the steps by option:", fitted[..., 1:].mean((0, 1)).numpy().roun
 
 # %%
 program = (complete(tables, batch.lengths), outputs.emissions, batch.actions)
-first = tables.trajectory(0, 4)
+first = tables.part(torch.tensor([0]), 4)
 short = (complete(first, torch.tensor([4])), *known_controls(first))
 if which("dot") and find_spec("graphviz"):
     display(pyro.render_model(ahmm, model_args=short))
