@@ -37,13 +37,17 @@ def check(
     loaded = load_spec(spec, overrides, allow_code)
     from ddco_pyro.cli import console
     from ddco_pyro.data.labels import label_names
-    from ddco_pyro.fitting.library import dimensions_for
-    from ddco_pyro.training.data import in_file, outline, refuse_unfit
+    from ddco_pyro.training.data import dimensions, in_file, outline, refuse_unfit
     from ddco_pyro.training.labels import used
     from ddco_pyro.training.networks import check_models
 
     demos = outline(loaded) if in_file(loaded) else None
-    size = dimensions_for(loaded, demos)
+    if loaded.training.library is None:
+        size = dimensions(loaded, demos)
+    else:
+        from ddco_pyro.fitting.library import dimensions_for  # and all that infers
+
+        size = dimensions_for(loaded, demos)
     (_, hierarchy), *baselines = check_models(loaded, size).values()
     if demos is not None:
         refuse_unfit(loaded, demos)
