@@ -62,11 +62,6 @@ def style() -> Iterator[None]:
         yield
 
 
-def blank(height: float) -> Figure:
-    """An empty figure as wide as the page; height in inches."""
-    return Figure(figsize=(WIDTH, height), layout="constrained")
-
-
 def save(figure: Figure, path: Path, alt: str, caption: str = "") -> Picture:
     """Write a figure as PNG; the same figure for a page."""
     buffer = io.BytesIO()
@@ -80,13 +75,6 @@ def save(figure: Figure, path: Path, alt: str, caption: str = "") -> Picture:
 def data_uri(content: bytes, kind: str) -> str:
     """Bytes as ``data:<kind>;base64,...``."""
     return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
-
-
-def hide_frame(axes: Axes) -> None:
-    """Remove ticks and frame."""
-    axes.set_xticks([])
-    axes.set_yticks([])
-    axes.spines[:].set_visible(False)
 
 
 @dataclass(frozen=True)
@@ -135,7 +123,7 @@ class Panel:
 
 def interval_plot(names: Sequence[str], panels: Sequence[Panel], notes: Sequence[str] = ()) -> Figure:
     """A forest plot: a row for each name, panels side by side, and ``notes`` below, a line each."""
-    figure = blank(1.1 + 0.34 * len(names) + 0.17 * len(notes))
+    figure = Figure(figsize=(WIDTH, 1.1 + 0.34 * len(names) + 0.17 * len(notes)), layout="constrained")
     all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
     for axes, panel in zip(all_axes, panels, strict=True):
         if panel.line is not None:

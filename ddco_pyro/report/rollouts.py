@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from ddco_pyro.data.sources.video import frames
-from ddco_pyro.drawing.figures import WIDTH, Interval, Panel, blank, data_uri, hide_frame, interval_plot, save
-from ddco_pyro.drawing.page import Block, Film, Films, Section, Table, Text, note
+from ddco_pyro.drawing.figures import Interval, Panel, data_uri, interval_plot, save
+from ddco_pyro.drawing.page import Block, Film, Films, Picture, Section, Table, Text, note
+from ddco_pyro.drawing.shown import jpeg
 from ddco_pyro.drawing.words import P_VALUE, interval, measure, number, p_value, rate
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Mean, Measure, Method, read_successes
@@ -21,6 +21,8 @@ MOST_BYTES = 4_000_000
 
 MOST_FRAMES = 16
 COLUMNS = 4
+MOST_PIXELS = 1920
+"""Frames in a strip, in a row of it, and pixels of a row."""
 
 
 def success(fit: Fit) -> Section | None:
@@ -92,7 +94,7 @@ def films(fit: Fit) -> Section | None:
             f"Frames of {shown[0].caption}. The border has the colour of the lowest level’s option; h1 is its number."
         )
         alt = f"Film strip of one rollout, seed {_named(paths[0])[1]}"
-        blocks.append(save(draw_strip(paths[0]), folder / "figures" / "film.png", alt, caption))
+        blocks.append(Picture(data_uri(strip(paths[0]), "image/jpeg"), alt, caption))
     return Section("films", "Films", [*blocks, Films(shown)])
 
 
@@ -115,17 +117,11 @@ def _named(path: Path) -> tuple[str, int]:
     return name, int(seed)
 
 
-def draw_strip(path: Path) -> Figure:
-    """Frames of a film, evenly over time, in rows."""
+def strip(path: Path) -> bytes:
+    """Frames of a film, evenly over time, in rows, as JPEG."""
     film = np.stack(list(frames(path)))
     chosen = film[np.unique(np.linspace(0, len(film) - 1, min(len(film), MOST_FRAMES)).round().astype(int))]
-    rows = -(-len(chosen) // COLUMNS)
-    height, width = film.shape[1:3]
-    figure = blank(rows * WIDTH / COLUMNS * height / width)
-    figure.get_layout_engine().set(w_pad=0.02, h_pad=0.02, wspace=0, hspace=0)  # type: ignore[union-attr, call-arg]
-    panels = figure.subplots(rows, COLUMNS, squeeze=False)
-    for axes in panels.flat:
-        hide_frame(axes)
-    for axes, frame in zip(panels.flat, chosen, strict=False):
-        axes.imshow(frame)
-    return figure
+    every = -(-COLUMNS * chosen.shape[2] // MOST_PIXELS)  # larger frames are thinned out
+    cells = np.pad(chosen[:, ::every, ::every], ((0, -len(chosen) % COLUMNS), *((0, 0),) * 3), constant_values=255)
+    rows = cells.reshape(-1, COLUMNS, *cells.shape[1:])
+    return jpeg(np.vstack([np.hstack(list(row)) for row in rows]))
