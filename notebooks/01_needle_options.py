@@ -21,7 +21,7 @@ import os
 import warnings
 from pathlib import Path
 
-from IPython.display import SVG, Image, Markdown
+from IPython.display import SVG, Markdown
 
 warnings.filterwarnings("ignore", message="IProgress")  # progress needs no widgets here
 
@@ -69,4 +69,4 @@ Markdown(use_table(needle).markdown())
 Markdown(verdicts.verdict(needle.metrics))
 
 # %%
-Image(figures / "likelihood.png")
+SVG(figures / "likelihood.svg")

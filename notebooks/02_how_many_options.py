@@ -22,7 +22,7 @@ import os
 import warnings
 from pathlib import Path
 
-from IPython.display import Image, Markdown
+from IPython.display import SVG, Markdown
 
 warnings.filterwarnings("ignore", message="IProgress")  # progress needs no widgets here
 
@@ -47,7 +47,7 @@ with Progress() as progress:
     found = select(spec, RUNS / "how-many", progress, Workers(1))
 
 # %%
-Image(found.folder / "figures" / "selection.png")
+SVG(found.folder / "figures" / "selection.svg")
 
 # %% [markdown]
 # Where the best is the largest that was tried, the grid is too small to say how many are enough: try more. On the

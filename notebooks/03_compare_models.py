@@ -21,7 +21,7 @@ import os
 import warnings
 from pathlib import Path
 
-from IPython.display import Image, Markdown
+from IPython.display import SVG, Markdown
 
 warnings.filterwarnings("ignore", message="IProgress")  # progress needs no widgets here
 
@@ -53,7 +53,7 @@ write(found, RUNS / "comparison")
 Markdown((RUNS / "comparison" / "compare.md").read_text())
 
 # %%
-Image(RUNS / "comparison" / "compare.png")
+SVG(RUNS / "comparison" / "compare.svg")
 
 # %% [markdown]
 # ## Against the number of demonstrations

@@ -5,7 +5,6 @@ No test depends on how busy the machine is, and every run draws the same example
 
 from __future__ import annotations
 
-import io
 import os
 import sys
 from pathlib import Path
@@ -17,8 +16,6 @@ import toy_task
 import yaml
 from dots import followed
 from hypothesis import settings
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from ddco_pyro.errors import Failed
 from ddco_pyro.fitting.fit import fit
@@ -44,25 +41,6 @@ def cache(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cache")
     os.environ["DDCO_PYRO_CACHE"] = str(folder)
     return folder
-
-
-PRINT = FigureCanvasAgg.print_png
-
-
-@pytest.fixture(scope="session", autouse=True)
-def undrawn():
-    """Every figure is saved as the same small picture: rendering takes most of the time of a report."""
-    content = io.BytesIO()
-    PRINT(FigureCanvasAgg(Figure(figsize=(0.1, 0.1))), content)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(FigureCanvasAgg, "print_png", lambda canvas, file, **more: file.write(content.getvalue()))
-        yield
-
-
-@pytest.fixture
-def drawn_here(undrawn, monkeypatch):
-    """Figures are rendered, in the tests that ask for it."""
-    monkeypatch.setattr(FigureCanvasAgg, "print_png", PRINT)
 
 
 class Watched:

@@ -160,7 +160,7 @@ def fit_and_report(
             log.add(_held_out(fitted))
         if seeds is not None:
             fitted = repeat(fitted, seeds, progress, jobs)
-    from ddco_pyro.report import write_report  # imports matplotlib, after the fit
+    from ddco_pyro.report import write_report
 
     console.library(fitted)
     console.skills(fitted)

@@ -8,13 +8,13 @@ from pathlib import Path
 from urllib.parse import quote
 
 import numpy as np
-from matplotlib.figure import Figure
+from markupsafe import Markup
 
 from ddco_pyro.comparison import Comparison, Row
 from ddco_pyro.data.files import json_text, write_text
 from ddco_pyro.drawing import words
-from ddco_pyro.drawing.figures import Interval, Panel, interval_plot, save, style
-from ddco_pyro.drawing.page import Block, Cell, Page, Picture, Section, Table, Text, note
+from ddco_pyro.drawing.figures import Interval, Panel, interval_plot, save
+from ddco_pyro.drawing.page import Block, Cell, Drawing, Page, Section, Table, Text, note
 from ddco_pyro.evaluation import verdicts
 from ddco_pyro.evaluation.agreement import EXPLAINED, UNMATCHED
 from ddco_pyro.metrics import METRICS, Rate
@@ -23,16 +23,16 @@ from ddco_pyro.report.likelihood import SHOWN
 from ddco_pyro.segmenting.page import anchor
 from ddco_pyro.statistics import worth
 
-FILES = ("compare.png", "compare.json", "compare.md", "compare.html")
+FILES = ("compare.svg", "compare.json", "compare.md", "compare.html")
 """The files of a comparison."""
 
 
 def write(compared: Comparison, folder: Path) -> Path:
-    """Write ``compare.json``, ``.md``, ``.html`` and ``.png`` into a folder.
+    """Write ``compare.json``, ``.md``, ``.html`` and ``.svg`` into a folder.
 
     :returns: the path of the page.
     """
-    picture = write_figure(compared, folder / "compare.png")
+    picture = write_figure(compared, folder / "compare.svg")
     whole = page(compared, picture, folder)
     write_text(folder / "compare.json", json_text(compared.as_data()))
     write_text(folder / "compare.md", whole.markdown())
@@ -40,7 +40,7 @@ def write(compared: Comparison, folder: Path) -> Path:
     return folder / "compare.html"
 
 
-def page(compared: Comparison, picture: Picture, folder: Path) -> Page:
+def page(compared: Comparison, picture: Drawing, folder: Path) -> Page:
     """A page for ``folder``. Its only links are to segments in a run's report."""
     likelihood: list[Block] = [run_table(compared), note(_explanation(compared)), picture]
     sections = [Section("likelihood", "Held-out log-likelihood", likelihood)]
@@ -148,18 +148,17 @@ def _explanation(compared: Comparison) -> str:
     )
 
 
-def write_figure(compared: Comparison, path: Path) -> Picture:
-    """Draw the comparison as PNG."""
+def write_figure(compared: Comparison, path: Path) -> Drawing:
+    """Draw the comparison as SVG."""
     alt = "; ".join(f"{row.name}: {row.total:.1f} nats held out" for row in compared.rows)
     caption = (
         f"Left: held-out log-likelihood of {len(compared.trajectories)} trajectories, ± one standard error. Right: "
         "each run's minus the best's, ± one standard error of the paired difference."
     )
-    with style():
-        return save(draw(compared.rows), path, alt, caption)
+    return save(draw(compared.rows, alt), path, caption)
 
 
-def draw(rows: Sequence[Row]) -> Figure:
+def draw(rows: Sequence[Row], alt: str) -> Markup:
     """Totals and paired differences to the best, with their errors."""
     totals = [Interval.around(row.total, row.se) for row in rows]
     differences = [Interval.around(-row.difference, row.dse) if row.rank else None for row in rows]
@@ -167,4 +166,4 @@ def draw(rows: Sequence[Row]) -> Figure:
         Panel("Each run", "held-out log-likelihood (nats)", totals, line=rows[0].total),
         Panel("Minus the best", "nats above the best, same trajectories", differences, line=0),
     ]
-    return interval_plot([row.name for row in rows], panels)
+    return interval_plot([row.name for row in rows], panels, alt)

@@ -32,7 +32,8 @@ def svg(width: float, height: float, label: str, parts: Sequence[str]) -> Markup
     )
 
 
-def _text(x: float, y: float, text: str, anchor: str = "middle", kind: str = "") -> Markup:
+def words_at(x: float, y: float, text: str, anchor: str = "middle", kind: str = "") -> Markup:
+    """A text beside a place: ``start``, ``middle`` or ``end`` of the text is there."""
     shape = Markup('<text x="{:.1f}" y="{:.1f}" text-anchor="{}" class="{}">{}</text>')
     return shape.format(x, y, anchor, kind, text)
 
@@ -77,12 +78,12 @@ def transition_graph(counts: np.ndarray, shares: Sequence[float], names: Sequenc
                 '<g><title>{}</title><circle cx="{:.1f}" cy="{:.1f}" r="{:.1f}" fill="{}" stroke="var(--line)"/></g>'
             ).format(title, x, up, radius, option_colour(choice))
         )
-        parts.append(_text(x, up + radius + 14, shortened(names[choice])))
+        parts.append(words_at(x, up + radius + 14, shortened(names[choice])))
     for x, word in ((starts[outside], "start"), (ends[outside], "end")):
         parts.append(
             Markup('<circle cx="{:.1f}" cy="{:.1f}" r="5" fill="var(--paper)" stroke="var(--ink)"/>').format(x, up)
         )
-        parts.append(_text(x, up + 20, word, kind="soft"))
+        parts.append(words_at(x, up + 20, word, kind="soft"))
     return svg(WIDTH, up + down, "Transitions between options", parts)
 
 
@@ -105,7 +106,7 @@ def _edge(start: float, end: float, y: float, gap: float, share: float, title: s
     return Markup(
         '<g opacity="{:.2f}"><title>{}</title><path class="edge" d="{}" stroke-width="{:.1f}"/>'
         '<path d="{}" fill="var(--soft)"/>{}</g>'
-    ).format(0.45 + 0.55 * share, title, path, width, head, _text(middle, top - 7, count))
+    ).format(0.45 + 0.55 * share, title, path, width, head, words_at(middle, top - 7, count))
 
 
 # --- instances of an option -------------------------------------------------------------------------------------------
@@ -198,8 +199,8 @@ def curves(
         longest = max(max(map(len, each)) - 1, 1)
         parts.append(f'<g transform="translate({width * (place % columns):.0f},{height * (place // columns):.0f})">')
         parts.append(f'<rect x="2" y="16" width="{width - 8:.0f}" height="{height - 22:.0f}" class="faint"/>')
-        parts += [_text(2, 11, name, "start"), _text(width - 9, 26, f"{high:.3g}", "end", "soft")]
-        parts.append(_text(width - 9, height - 9, f"{low:.3g}", "end", "soft"))
+        parts += [words_at(2, 11, name, "start"), words_at(width - 9, 26, f"{high:.3g}", "end", "soft")]
+        parts.append(words_at(width - 9, height - 9, f"{low:.3g}", "end", "soft"))
         for array, look in zip(each, cycle(looks), strict=False):
             across = 6 + (width - 50) * np.arange(len(array)) / longest
             down = height - 11 - (height - 33) * (array - low) / ((high - low) or 1)

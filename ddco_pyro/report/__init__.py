@@ -11,7 +11,6 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
 from ddco_pyro.data.labels import label_names
 from ddco_pyro.data.sources import open_source
-from ddco_pyro.drawing.figures import style
 from ddco_pyro.drawing.page import Block, Folded, Page, Section, Text, Warned, note
 from ddco_pyro.drawing.shown import pictures, stored_pictures
 from ddco_pyro.evaluation import verdicts
@@ -34,36 +33,35 @@ def write_report(fit: Fit, demos: Demonstrations) -> Path:
     tiles: list[Block] = []
     by_options: dict[str, Section] = {}
     anchors: set[str] = set()
-    with style():
-        learning = training.learning(fit)  # or a history is damaged, and no figure is written
-        if fit.spec.hierarchy:
-            segmented = segments_of(fit, demos)
-            ordered = demos.select([demo.name for demo in segmented.segments])
-            paths = fit.spec.report.trajectory or ()
-            shown = skills.Shown(ordered, pictures(ordered) or _stored(fit, ordered), paths)
-            drawn = timelines(segmented, ordered, shown.pictures, paths, options.MOST_STEPS)
-            every = skills.skills(fit, segmented)
-            tiles, anchors = skills.overview(fit, every, shown), {track.anchor for track in drawn.tracks}
-            by_options = {
-                "skills": skills.section(fit, every, shown, segmented),
-                "segments": options.segments(drawn, len(metrics.demonstrations_by_likelihood)),
-                "options": options.section(fit, segmented, shown),
-            }
-        sections = [
-            likelihood.test(metrics),
-            by_options.get("skills"),
-            by_options.get("segments"),
-            options.agreement(fit, demos),
-            rollouts.success(fit),
-            rollouts.films(fit),
-            likelihood.section(fit),
-            likelihood.demonstrations(metrics, anchors),
-            likelihood.dimensions(fit),
-            by_options.get("options"),
-            inputs.branches(fit),
-            learning,
-            training.particulars(fit),
-        ]
+    learning = training.learning(fit)  # or a history is damaged, and no figure is written
+    if fit.spec.hierarchy:
+        segmented = segments_of(fit, demos)
+        ordered = demos.select([demo.name for demo in segmented.segments])
+        paths = fit.spec.report.trajectory or ()
+        shown = skills.Shown(ordered, pictures(ordered) or _stored(fit, ordered), paths)
+        drawn = timelines(segmented, ordered, shown.pictures, paths, options.MOST_STEPS)
+        every = skills.skills(fit, segmented)
+        tiles, anchors = skills.overview(fit, every, shown), {track.anchor for track in drawn.tracks}
+        by_options = {
+            "skills": skills.section(fit, every, shown, segmented),
+            "segments": options.segments(drawn, len(metrics.demonstrations_by_likelihood)),
+            "options": options.section(fit, segmented, shown),
+        }
+    sections = [
+        likelihood.test(metrics),
+        by_options.get("skills"),
+        by_options.get("segments"),
+        options.agreement(fit, demos),
+        rollouts.success(fit),
+        rollouts.films(fit),
+        likelihood.section(fit),
+        likelihood.demonstrations(metrics, anchors),
+        likelihood.dimensions(fit),
+        by_options.get("options"),
+        inputs.branches(fit),
+        learning,
+        training.particulars(fit),
+    ]
     write_text(path, Page(title(fit), [*tiles, *header(fit)], sections, subtitle=subtitle(fit)).html())
     return path
 

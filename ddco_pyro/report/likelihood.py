@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 
 import numpy as np
-from matplotlib.figure import Figure
+from markupsafe import Markup
 
 from ddco_pyro.data.controls import ControlDimension
 from ddco_pyro.drawing.figures import Interval, Panel, interval_plot, save
@@ -48,12 +48,12 @@ def section(fit: Fit) -> Section:
         "log-probabilities. Another unit adds the same constant to every method. So differences in nats can be "
         "compared; percentages cannot."
     )
-    figure = draw(metrics, {name: one.held_out for name, one in fit.baselines.items()})
+    figure = draw(metrics, {name: one.held_out for name, one in fit.baselines.items()}, alt)
     blocks: list[Block] = [
         Text(verdict(metrics)),
         Text(f"Nats per step; higher is better. {about(metrics.methods)} {stds(fit)}"),
         table(metrics),
-        save(figure, fit.run_folder / "figures" / "likelihood.png", alt, caption),
+        save(figure, fit.run_folder / "figures" / "likelihood.svg", caption),
         note(units),
     ]
     return Section("likelihood", "Held-out log-likelihood", blocks, folded=True)
@@ -86,7 +86,7 @@ def table(metrics: Metrics, digits: int = 2, title: str | None = None) -> Table:
     return Table(["Method", "Held out", "Training", ours, "Parameters", "Gradient steps"], rows, title=title)
 
 
-def draw(metrics: Metrics, baselines: Mapping[str, Mapping[str, float]]) -> Figure:
+def draw(metrics: Metrics, baselines: Mapping[str, Mapping[str, float]], alt: str) -> Markup:
     """Log-likelihood of each method and, where there are several, the paired differences.
 
     :param baselines: log p(ξ) of the held-out demonstrations by name, for each baseline.
@@ -101,7 +101,7 @@ def draw(metrics: Metrics, baselines: Mapping[str, Mapping[str, float]]) -> Figu
             differences.append(Interval.of(other.difference, each, marker="D"))
         title, axis = f"{method(metrics.model)} minus each baseline", "nats per step above that method, held out"
         panels.append(Panel(title, axis, differences, line=0))
-    return interval_plot(list(map(method, metrics.methods)), panels)
+    return interval_plot(list(map(method, metrics.methods)), panels, alt)
 
 
 def demonstrations(metrics: Metrics, anchors: Collection[str]) -> Section:

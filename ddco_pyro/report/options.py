@@ -8,11 +8,11 @@ from dataclasses import replace
 from markupsafe import Markup
 
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.data.files import write_text
 from ddco_pyro.data.labels import label_names
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.drawing.diagrams import MOST_PATHS, paths_of_options
-from ddco_pyro.drawing.page import Block, Cell, Drawing, Section, Table, Text, footnote, note
+from ddco_pyro.drawing.figures import save
+from ddco_pyro.drawing.page import Block, Cell, Section, Table, Text, footnote, note
 from ddco_pyro.drawing.shown import in_words
 from ddco_pyro.drawing.timeline import Timelines
 from ddco_pyro.drawing.words import capital, duration, number, percent
@@ -43,13 +43,11 @@ def section(fit: Fit, segmented: Segmented, shown: Shown) -> Section:
         options = [demo.levels[level].options for demo in segmented.segments]
         drawing = paths_of_options(shown.paths, options)
         name = "trajectories" if len(fit.names) == 1 else f"trajectories-{level}"
-        standing_alone = str(drawing).replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1)
-        write_text(fit.run_folder / "figures" / f"{name}.svg", standing_alone)
         caption = (
             f"Level “{level}”: {min(len(options), MOST_PATHS)} demonstrations, coloured by the most likely option: "
             f"{in_words(shown.drawn, shown.demos)}. Circles: first steps."
         )
-        blocks.append(Drawing(drawing, caption))
+        blocks.append(save(drawing, fit.run_folder / "figures" / f"{name}.svg", caption))
     blocks += [Text("Use of the options", "heading"), use_table(fit)]
     blocks.append(note("On the most likely path of all demonstrations. The same option chosen anew stays one segment."))
     for level in reversed(fit.names):

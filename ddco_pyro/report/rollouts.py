@@ -42,11 +42,10 @@ def success(fit: Fit) -> Section | None:
         rows = [
             Interval(*(100 * value for value in (one.rate or 0.0, *(one.interval or ())))) for one in rates.values()
         ]
-        panel = Panel("", "success rate (%), 95 % interval", rows)
-        figure = interval_plot(list(map(method, rates)), [panel])
-        figure.axes[0].set_xlim(-1, 101)
+        panel = Panel("", "success rate (%), 95 % interval", rows, ends=(0, 100))
+        figure = interval_plot(list(map(method, rates)), [panel], alt)
         caption = "Success rate of each method with its Wilson 95 % interval."
-        blocks.append(save(figure, fit.run_folder / "figures" / "success.png", alt, caption))
+        blocks.append(save(figure, fit.run_folder / "figures" / "success.svg", caption))
     if paired := paired_table(methods, fit.metrics.model):
         blocks += [Text("Paired comparison of success", "heading"), paired, note(P_VALUE)]
     return Section("rollouts", "Success in the task", blocks)

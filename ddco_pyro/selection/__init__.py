@@ -180,5 +180,5 @@ def _write(folder: Path, spec: Spec, choice: Choice, folds: Sequence[Demonstrati
         **choosing.as_data(choice),
     }
     write_text(folder / "selection.md", choosing.markdown(choice, found))
-    choosing.write_figure(choice, folder / "figures" / "selection.png")
+    choosing.write_figure(choice, folder / "figures" / "selection.svg")
     write_text(folder / "selection.json", json_text(found))

@@ -226,13 +226,13 @@ def markdown(choice: Choice, data: Mapping[str, Any]) -> str:
 
 
 def write_figure(choice: Choice, path: Path) -> None:
-    """Draw log-likelihoods and paired differences of candidates as PNG; nothing where no candidate was scored.
+    """Draw log-likelihoods and paired differences of candidates as SVG; nothing where no candidate was scored.
 
     A band ends one standard error below the best.
     """
     if all(row.mean is None for row in choice.rows):
         return
-    from ddco_pyro.drawing.figures import ACCENT, FAINT, INK, Interval, Panel, interval_plot, save, style
+    from ddco_pyro.drawing.figures import ACCENT, FAINT, INK, Interval, Panel, interval_plot, save
 
     best, band = choice.best, None
     if best and best.mean is not None and best.error is not None:
@@ -261,6 +261,5 @@ def write_figure(choice: Choice, path: Path) -> None:
         f"{row.candidate.name} ({row.candidate.parameters} parameters){' (failed)' if row.failed else ''}"
         for row in choice.rows
     ]
-    with style():
-        figure = interval_plot(names, panels, [marks, *notes])
-        save(figure, path, "Held-out log-likelihood of each candidate, and paired differences to the best")
+    alt = "Held-out log-likelihood of each candidate, and paired differences to the best"
+    save(interval_plot(names, panels, alt, [marks, *notes]), path)

@@ -306,7 +306,7 @@ def test_help_and_refusals_load_nothing_heavy():
 def test_check_finds_tasks_beside_it_and_loads_no_package_that_it_does_not_use(spec):
     """The toy task is found in the working folder.
 
-    Sorting and indexing on torch's "meta" device import sympy; figures import matplotlib; intervals scipy.stats.
+    Sorting and indexing on torch's "meta" device import sympy; intervals import scipy.stats.
     """
     line = ["check", str(spec), "--allow-code", "--set", "task=toy_task:task"]
     program = LIGHT.format(lines=[line], heavy=HEAVY)

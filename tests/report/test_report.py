@@ -227,10 +227,8 @@ def test_a_label_has_the_colour_of_the_option_that_it_is_matched_with(labelled):
     assert lanes["phase"]
 
 
-def test_a_long_list_is_folded_and_long_timelines_are_cut(labelled, monkeypatch, drawn_here):
-    """With every figure drawn."""
+def test_a_long_list_is_folded_and_long_timelines_are_cut(labelled, monkeypatch):
     found, _, demos = labelled
-    monkeypatch.setattr("ddco_pyro.drawing.figures.DOTS_PER_INCH", 40)
     monkeypatch.setattr("ddco_pyro.report.likelihood.SHOWN", 3)
     monkeypatch.setattr("ddco_pyro.report.options.MOST_STEPS", 1)
     page = write_report(found, demos).read_text()

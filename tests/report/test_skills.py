@@ -9,7 +9,6 @@ import av
 import cv2
 import numpy as np
 import pytest
-from matplotlib.colors import to_rgb
 
 from ddco_pyro.data.demonstrations import Demonstration
 from ddco_pyro.drawing.colours import CONTROL, OPTIONS, option_rgb
@@ -177,7 +176,7 @@ WHITE = np.array([0.95047, 1.0, 1.08883])
 
 
 def lab(colour, sight):
-    rgb = np.array(to_rgb(colour))
+    rgb = np.array([*bytes.fromhex(colour.removeprefix("#"))]) / 255
     linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
     x, y, z = XYZ @ np.clip(SIGHTS[sight] @ linear, 0, 1) / WHITE
     x, y, z = (np.cbrt(v) if v > 0.008856 else 7.787 * v + 16 / 116 for v in (x, y, z))
