@@ -21,7 +21,7 @@ import os
 import warnings
 from pathlib import Path
 
-from IPython.display import SVG, Markdown
+from IPython.display import SVG, Image, Markdown
 
 warnings.filterwarnings("ignore", message="IProgress")  # progress needs no widgets here
 

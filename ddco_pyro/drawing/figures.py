@@ -97,7 +97,7 @@ class Panel:
 
 def interval_plot(names: Sequence[str], panels: Sequence[Panel], alt: str, notes: Sequence[str] = ()) -> Markup:
     """A forest plot: a row for each name, panels side by side, and ``notes`` below, a line each."""
-    left = 12 + 6.2 * max(map(len, names))
+    left = min(12 + 6.2 * max(map(len, names)), WIDTH / 2)  # of longer names the ends are seen
     height = TITLE + ROW * len(names) + AXIS
     parts: list[str] = [
         words_at(left - 8, TITLE + ROW * (place + 0.65), name, "end") for place, name in enumerate(names)
