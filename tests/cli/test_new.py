@@ -60,7 +60,7 @@ def test_another_setting_of_the_report_draws_again_and_fits_nothing(file: Path, 
     spec, run = out / "spec.yaml", out / "run"
     assert call("new", file, "--out", out).status == 0
     before, text = (run / "model.safetensors").stat().st_mtime_ns, spec.read_text()
-    spec.write_text(text + "report: {trajectory: goal}\n")
+    spec.write_text(text.partition("report:")[0] + "report: {trajectory: goal}\n")
     assert call("new", file, "--out", out).status == 0
     assert "Drawings: observation “goal”." in (run / "report.html").read_text()
     assert call("report", run, "--set", "report.trajectory=[object, 0:2]").status == 0
