@@ -1,6 +1,6 @@
-"""A library of Meta-World's tasks and new tasks that begin with it (``world: library:WORLD``; ``library.yaml``).
+"""Libraries of Meta-World's tasks, and new tasks that begin with them (``world: library:WORLD``).
 
-python -m studies.library    # records its demonstrations and fits it: runs/metaworld/library
+python -m studies.library    # records their demonstrations and fits them, into runs/metaworld
 """
 
 from __future__ import annotations
@@ -37,7 +37,10 @@ TASKS = (
 EACH, SEEDS = 10, range(70_000_000, 70_000_500)
 """Demonstrations of each task, and the seeds of the expert's episodes."""
 
-SPEC, LIBRARY = ROOT / "specs" / "metaworld_library.yaml", RUNS / "library"
+SPEC = ROOT / "specs" / "metaworld_library.yaml"
+
+LIBRARIES = {"library": (), "library_clusters": ("training.starts=[vq_controls]",)}
+"""The run of each study, library.yaml and library_again.yaml, and what it changes in the spec."""
 
 CHOOSING = ("levels.0.termination.", "meta_policy.")
 """What is trained where options are frozen."""
@@ -66,15 +69,16 @@ class NewTasks(MetaWorld):
 WORLD = NewTasks()
 
 
-def make() -> Fit:
-    """Record the demonstrations of the library, and fit options and baselines to all of its tasks together."""
+def make() -> None:
+    """Record the demonstrations, and fit options and baselines of each library to all of its tasks together."""
     files = {task: RUNS / "library_demonstrations" / f"{task}.hdf5" for task in TASKS}
     for task, path in files.items():
         path.parent.mkdir(parents=True, exist_ok=True)
         if not path.exists():
             WORLD.collect(task, SEEDS, EACH, path)
     demos = [_named(demo, task) for task, path in files.items() for demo in Demonstrations.read(path)]
-    return fit(load_spec(SPEC), Demonstrations(tuple(demos)), LIBRARY)
+    for name, changes in LIBRARIES.items():
+        fit(load_spec(SPEC, changes), Demonstrations(tuple(demos)), RUNS / name)
 
 
 def _named(demo: Demonstration, task: str) -> Demonstration:
