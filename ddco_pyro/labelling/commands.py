@@ -18,8 +18,8 @@ from ddco_pyro.segmenting.segments import SOURCES
 LONGEST = 80
 """Characters of a name."""
 
-REACH = 50
-"""A boundary goes to a change point that is this part of the demonstration away, or nearer."""
+REACH = 2
+"""Steps that a boundary goes to a change point."""
 
 
 @dataclass(frozen=True)
@@ -137,8 +137,7 @@ class View:
 
     def _snapped(self, name: str, step: int, here: Segment) -> int:
         """The change point that is nearest to a step of a segment, within reach; else the step."""
-        reach = max(1, self.document.lengths[name] // REACH)
-        near = [point for point in self.changes_of(name) if abs(point - step) <= reach]
+        near = [point for point in self.changes_of(name) if abs(point - step) <= REACH]
         inside = [point for point in near if here.start < point < here.stop]
         return min(inside, key=lambda point: (abs(point - step), point), default=step)
 

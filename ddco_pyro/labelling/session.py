@@ -31,7 +31,7 @@ from ddco_pyro.evaluation.inferred import Inferred, runs, within
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.labelling.background import Background
 from ddco_pyro.labelling.commands import Segment, View, whole
-from ddco_pyro.labelling.document import FREE, SUFFIX, Change, Document, Journal, digest, version
+from ddco_pyro.labelling.document import FREE, OPEN, SUFFIX, Change, Document, Journal, digest, version
 from ddco_pyro.labelling.following import Following
 from ddco_pyro.labelling.proposals import (
     Proposals,
@@ -54,6 +54,9 @@ from ddco_pyro.segmenting.segments import Segmented
 
 NEAREST = 5
 """Segments elsewhere that are shown for one."""
+
+TENTH = 10
+"""The part of a demonstration that has to be named before naming from scratch is offered, as a divisor."""
 
 UNCERTAIN = 20
 """Boundaries that are named as the most uncertain ones."""
@@ -384,12 +387,16 @@ class Session:
     def _scratch(self) -> bool:
         """Whether a first demonstration is likely cheaper to name from scratch than to correct.
 
-        That is so where the segments that are proposed are likely wrong in more than half of the steps.
+        That is so where most of the steps that a person named were proposed wrong. The posterior says nothing of it:
+        the model may be sure of segments that are none of the person's.
         """
-        if any(labels.max() > 0 for labels in self.document.labels.values()):
+        labels = self.document.labels
+        if self.document.accepted or any((own == OPEN).any() for own in labels.values()):
             return False
-        steps = sum(self.document.lengths.values())
-        return sum(float((1 - shown.probability).sum()) for shown in self.shown.values()) > steps / 2
+        named = {name: own > 0 for name, own in labels.items() if name in self.untouched}
+        wrong = sum(int((self.untouched[name].options != labels[name])[said].sum()) for name, said in named.items())
+        total = sum(int(said.sum()) for said in named.values())
+        return total * TENTH >= min(self.document.lengths.values()) and wrong > total / 2
 
     def progress(self) -> dict[str, Any]:
         """What changes by itself.

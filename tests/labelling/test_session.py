@@ -287,7 +287,13 @@ def test_a_dropped_option_is_another_one_or_none_everywhere_and_an_undo_brings_i
 @pytest.mark.usefixtures("quiet")
 def test_from_scratch_each_segment_is_one_edit_that_goes_to_a_change_point(begin, demos):
     session, truth = begin(), demos[0].labels["phase"]
+    shown_first = session.demo(0)["segments"][0]
+    assert not session.state()["scratch"]
+    session.edit({"do": "name", "demo": 0, "step": 0, "option": shown_first["option"] % COUNT + 1})
+    assert session.state()["scratch"]  # what was named was proposed wrong
+    session.edit({"do": "undo"})
     session.edit({"do": "scratch", "demo": 0})
+    assert not session.state()["scratch"]
     for start, _, option in stretches(truth):
         session.edit({"do": "name", "demo": 0, "step": start, "option": option, "from_here": True})
     assert len(session.document.done) == 1 + COUNT
