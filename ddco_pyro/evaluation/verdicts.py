@@ -29,8 +29,7 @@ from ddco_pyro.names import FLAT, HIERARCHY, MIXTURE, method
 from ddco_pyro.statistics import paired, t_quantile, wider_interval
 
 SMALLEST = 0.01
-"""The smallest difference that counts, in nats per step and control dimension: a control is exp(0.01) times as
-probable, 1 % more."""
+"""The smallest useful difference in nats per step: each step's control is exp(0.01) times as probable, 1 % more."""
 
 LOST = 1.0
 """Nats per step and control dimension, from training to held-out demonstrations, from which on a model may have fallen
@@ -145,7 +144,7 @@ class Models:
         return known is not None and known.valid is not None and self.counts(known.valid - self.per_step(name))
 
     def counts(self, nats: float) -> bool:
-        """Whether a difference in nats per step is more than the smallest that counts."""
+        """Whether a difference in nats per step is a doubt: more than :data:`SMALLEST` for each control dimension."""
         return nats > SMALLEST * self.controls
 
     def apart(self, name: str) -> bool:
@@ -166,7 +165,7 @@ class Models:
         if held_out < FEWEST or lead.standard_error is None:
             return "few"
         half = lead.standard_error * t_quantile(held_out - 1)
-        return _direction(lead.nats_per_step - half, lead.nats_per_step + half, SMALLEST * self.controls)
+        return _direction(lead.nats_per_step - half, lead.nats_per_step + half, SMALLEST)
 
     @property
     def _best(self) -> str:
@@ -311,7 +310,7 @@ def tested(metrics: Metrics) -> str:
         held_out = len(metrics.valid)
         errors = [error for error in seeds.standard_error["memory"] if error is not None]
         error = float(np.mean(errors)) if errors else 0.0
-        way, lead = _over_seeds("log_likelihood", over, error, held_out, SMALLEST * models.controls)
+        way, lead = _over_seeds("log_likelihood", over, error, held_out, SMALLEST)
         text = _lasting(way, lead, held_out, short, len(seeds.training_seeds))
     else:
         assert found
