@@ -9,14 +9,7 @@ from pydantic import ConfigDict, Field
 from ddco_pyro.spec.base import Count, Fraction, Items, Model, Positive, Problems, Seed, Share, Text, nested
 
 
-class CrossValidated(Model):
-    """Settings that leaving out demonstrations can choose."""
-
-    cross_validated: bool = False
-    """Whether they are chosen so; each class says which."""
-
-
-class RidgeSpec(CrossValidated):
+class RidgeSpec(Model):
     """Ridges of EM: precisions of a normal prior on the weights of linear maps, biases left out."""
 
     policy: float = Field(default=1.0, ge=0)
@@ -49,7 +42,7 @@ class OptimizerSpec(Model):
     Models that ``em`` trains have ridges instead."""
 
 
-class RecogniserSpec(CrossValidated):
+class RecogniserSpec(Model):
     """A recogniser of the options of labelled steps, whose evidence places the options of steps without labels."""
 
     weight: float = Field(default=0.3, ge=0)

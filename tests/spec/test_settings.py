@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from inspect import get_annotations
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin
+from typing import Any, get_args, get_origin
 
 import h5py
 import numpy as np
@@ -28,7 +28,8 @@ from ddco_pyro.spec.networks import SETTINGS, Network, UserNetworkSpec
 from ddco_pyro.spec.spec import MODEL
 
 ROOT = Path(__file__).parents[2]
-MOST = 114
+MOST = 116
+"""110, and those of tasks and libraries: ``where``, ``minus``, ``library`` with ``run``, ``ridge`` and ``spread``."""
 PATH = re.compile(r"([a-z_]+(?:\.[a-z_0-9{}]+)*)(?:=(.*))?", re.DOTALL)
 """A key path, or ``path=value`` of ``--set``."""
 
@@ -52,11 +53,6 @@ def setting(model: type[Model], key: str) -> str:
     return f"{declaring[-1].__name__}.{key}"
 
 
-def chosen(annotation: Any) -> bool:
-    """Whether there is a choice: a key with one possible value marks a mapping, such as ``learn: true`` of σ."""
-    return get_origin(annotation) is not Literal or len(get_args(annotation)) > 1
-
-
 def reachable(model: type[Model], found: dict[type[Model], None]) -> dict[type[Model], None]:
     if model not in found:
         found[model] = None
@@ -67,9 +63,7 @@ def reachable(model: type[Model], found: dict[type[Model], None]) -> dict[type[M
 
 
 MODELS = list(reachable(Spec, {}))
-ALL = sorted(
-    {setting(model, key) for model in MODELS for key, field in fields(model).items() if chosen(field.annotation)}
-)
+ALL = sorted({setting(model, key) for model in MODELS for key in fields(model)})
 
 
 def meant(models: list[type[Model]], data: dict[str, Any]) -> list[type[Model]]:
