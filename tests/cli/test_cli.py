@@ -207,12 +207,12 @@ def test_bad_input_is_refused_in_one_line(arguments, message, spec, run):
     assert re.fullmatch(f"ddco-pyro: .*{message}.*\n", ended.err)
 
 
-WRONG = "{network: 'user_networks:Wrong', options: {how: joined}}"
+WRONG = "{network: 'user_networks:Wrong', options: {how: swapped}}"
 
 
 def test_an_own_network_of_another_shape_is_refused_before_any_work(spec, tmp_path, cache):
     line = (
-        "ddco-pyro: compare_with.0.policy: network 'user_networks:Wrong' gives shape [2, 3, 2]; "
+        "ddco-pyro: compare_with.0.policy: network 'user_networks:Wrong' gives shape [2, 3, 2, 1]; "
         "it has to be a tensor [N, T, copies, outputs], here [2, 3, 1, 2]\n"
     )
     kept = sorted(cache.rglob("*"))

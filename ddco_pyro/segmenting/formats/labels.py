@@ -106,11 +106,13 @@ def write_labels(path: Path, out: Path, segmented: Segmented) -> None:
                     del group[name]
                 for name, values in labels.items():
                     group.create_dataset(name, data=values).attrs[OURS] = SIGNATURE
+            for name, marks in segmented.marks.items():
                 for mark in ("flag", "note"):
-                    file["data"][demo.name].attrs.pop(mark, None)
-                    if mark in (marks := segmented.marks.get(demo.name, {})):
-                        file["data"][demo.name].attrs[mark] = marks[mark]
-            _write_mask(file, [name for name, marks in segmented.marks.items() if EXCLUDE in marks])
+                    file["data"][name].attrs.pop(mark, None)
+                    if mark in marks:
+                        file["data"][name].attrs[mark] = marks[mark]
+            if segmented.marks:
+                _write_mask(file, [name for name, marks in segmented.marks.items() if EXCLUDE in marks])
             if (names := _names(segmented)) != label_names(attributes_of(file["data"]) | attributes_of(file)):
                 holder = file if LABEL_NAMES in file.attrs else file["data"]
                 holder.attrs[LABEL_NAMES] = json.dumps(names)
