@@ -373,8 +373,9 @@ def said_in(
     known = label_names(demos.attributes).get(level, ())
     words = label_names(demos.attributes).get(level + SOURCE, SOURCES)
     ours, changes = not lerobot and any(level + SOURCE in demo.labels for demo in demos), list[Change]()
+    marks = _marks(demos) if marked else []
     if not ours and any(level + BOUNDARY in demo.labels for demo in demos):
-        return []
+        return marks
     found, options = [*names], dict[int, int]()
     values = {value for demo in demos for value in np.unique(demo.labels.get(level, UNKNOWN)).tolist()}
     for value in sorted(values - {UNKNOWN} | {*range(ours, len(known))}):
@@ -393,15 +394,18 @@ def said_in(
             if source != "proposed":
                 kind = CONFIRM if source == "accepted" else PAINT
                 changes.append((kind, demo.name, start, stop, OPEN if source == "open" else options[value]))
-    if marked:
-        changes += [("mark", name, EXCLUDE, True) for name in demos.masks.get(EXCLUDE, ())]
-        changes += [
-            ("mark", demo.name, mark, demo.attributes[mark])
-            for demo in demos
-            for mark in ("flag", "note")
-            if mark in demo.attributes
-        ]
-    return [("names", found), *changes] if changes else []
+    return [("names", found), *changes, *marks] if changes else marks
+
+
+def _marks(demos: Demonstrations) -> list[Change]:
+    """What a file says of demonstrations as a whole."""
+    left_out: list[Change] = [("mark", name, EXCLUDE, True) for name in demos.masks.get(EXCLUDE, ())]
+    return left_out + [
+        ("mark", demo.name, mark, demo.attributes[mark])
+        for demo in demos
+        for mark in ("flag", "note")
+        if mark in demo.attributes
+    ]
 
 
 def shown_segments(
