@@ -16,6 +16,9 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.model.emissions import KINDS, Emission, Product
 from ddco_pyro.spec import ControlSpec, LearnedStd
 
+ABOVE_FLOOR = 1e-4
+"""A learned σ stays so far above its floor."""
+
 INITIAL_STD = 0.5
 """Initial value of a learned standard deviation, in scaled units."""
 
@@ -166,6 +169,11 @@ class ControlScaling(nn.Module):
             at += emission.parameters
         in_order = [dimension for dims, _ in groups for dimension in dims] == list(range(len(self.varying)))
         return groups[0][1] if len(groups) == 1 and in_order else Product(tuple(groups))
+
+
+def raw_of(std: Tensor, floor: Tensor) -> Tensor:
+    """The parameters of a learned σ = floor + softplus(raw)."""
+    return (std - floor).clamp(min=ABOVE_FLOOR).expm1().log()
 
 
 class ControlStd(nn.Module):

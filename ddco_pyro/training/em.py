@@ -29,6 +29,7 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from ddco_pyro.model.batch import Batch
+from ddco_pyro.model.controls import ABOVE_FLOOR, raw_of
 from ddco_pyro.model.emissions import Emission, Information
 from ddco_pyro.model.hierarchy import Caller, Hierarchy
 from ddco_pyro.model.networks.inputs import Inputs
@@ -48,8 +49,6 @@ FARTHEST = 8.0
 """The most that a step is stretched."""
 HALVINGS = 10
 """How often a step that lowers the penalised log-likelihood is halved before it is given up."""
-ABOVE_FLOOR = 1e-4
-"""A learned σ stays so far above its floor."""
 TOLERANCE = 1e-5
 """EM has converged where a step gains less, in nats per step of the demonstrations."""
 ROUGHLY = 1e-3
@@ -73,8 +72,8 @@ def is_linear(model: Hierarchy) -> bool:
 
 
 class Features:
-    """The features of a piece of the demonstrations. What networks say of a step is float32, as they compute it; sums
-    over steps that are solved for weights are float64.
+    """The features of a piece of the demonstrations. What networks say of a step is float32, as they compute it, and so
+    are gradients of a piece. Sums over pieces, and the matrices that are solved, are float64.
 
     :param reads: the vectors that networks read; none for constants.
     :ivar x: the vectors with a 1 at the end, [N, T, F].
@@ -224,7 +223,7 @@ class Std:
         """Give the module these values."""
         module = self.module
         with torch.no_grad():
-            raw = (self.value - module.floor).clamp(min=ABOVE_FLOOR).expm1().log()
+            raw = raw_of(self.value, module.floor)
             if module.shared:
                 module.raw.copy_(raw[0, module.shared])
             if module.own:

@@ -22,9 +22,9 @@ from pyro.distributions import Gamma, Normal, TorchDistribution, TransformedDist
 from torch import Tensor
 from torch.distributions.transforms import AffineTransform, ExpTransform
 
+from ddco_pyro.model.controls import raw_of
 from ddco_pyro.model.emissions import KINDS
 from ddco_pyro.model.hierarchy import Caller, Hierarchy
-from ddco_pyro.training.em import ABOVE_FLOOR
 
 Site = Callable[[str, TorchDistribution, Tensor, float], Tensor]
 """What is done at a site: its name, distribution, present value, and how many times its log-density counts."""
@@ -105,7 +105,7 @@ class Prior:
             drawn = site(f"{place}.log_{key}".replace(".", "_"), of_log, value.log(), power).exp()
             for column, own in zip(places, drawn.unbind(-1), strict=True):
                 columns[column] = own.expand(caller.copies)
-            raw = (drawn - std.floor[places]).clamp(min=ABOVE_FLOOR).expm1().log()
+            raw = raw_of(drawn, std.floor[places])
             found[f"{place}.std.{key}"] = raw[0] if key == "raw" else raw
         return torch.stack(columns, -1)
 
