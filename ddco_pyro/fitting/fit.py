@@ -23,7 +23,7 @@ from ddco_pyro.events import OnEvent, ignore
 from ddco_pyro.fitting.digest import record, recorded
 from ddco_pyro.fitting.evaluation import evaluate, marginal
 from ddco_pyro.fitting.fitted import Fit, left_out, load
-from ddco_pyro.fitting.library import dimensions_for, library_of, prior_of
+from ddco_pyro.fitting.library import check_library, dimensions_for, prior_of
 from ddco_pyro.fitting.names import accepted, matched, read_names, write_names
 from ddco_pyro.fitting.run import Clock, claim, claimed, is_finished, write_model
 from ddco_pyro.inference import compile_all
@@ -105,7 +105,7 @@ def fit(
             demos = known_demonstrations(spec)
         models = check_models(spec, dimensions_for(spec, demos))
         for its, _ in models.values():
-            library_of(its)  # or it is refused
+            check_library(its)
         if demos is not None:
             refuse_unfit(spec, demos)
             used(spec, demos)

@@ -70,6 +70,16 @@ def dimensions_for(spec: Spec, demos: Demonstrations | None = None) -> Dimension
     return size if library is None else size.like(library.hierarchy, library.place)
 
 
+def check_library(spec: Spec) -> None:
+    """Check, before anything is written, that a spec's library is there and that it can choose its strength.
+
+    :raises BadInput: it is not, or it cannot.
+    """
+    given, library = spec.training.library, library_of(spec)
+    if given is not None and library is not None and given.ridge is None and not (library.run_folder / STORED).exists():
+        _several_tasks(library)
+
+
 def prior_of(spec: Spec, workers: Workers = Workers(1)) -> Prior | None:  # noqa: B008
     """The prior that a spec's library is; None without one.
 
@@ -125,12 +135,7 @@ def _strength(library: Fit, spread: float, workers: Workers) -> float:
     kept = library.run_folder / STORED
     if kept.exists():
         return float(json.loads(kept.read_text(encoding="utf-8"))["ridge"])
-    demos = train_and_valid(library.spec, library.demonstrations)["train"]
-    each = by_task({demo.name: demo.attributes for demo in demos})
-    tasks = {task: names for task, names in each.items() if len(names) > 1}
-    if len(tasks) < 2:
-        text = f"{library.run_folder}: has demonstrations of {len(tasks)} task(s) with two or more, by the attribute"
-        raise BadInput(f"{text} {TASK!r}; say how strong a prior it is: training.library.ridge=30")
+    demos, tasks = _several_tasks(library)
     chosen = list(tasks)[:: math.ceil(len(tasks) / MOST_TASKS)]
     calls = {task: partial(_predicted, library.spec, demos, tasks[task], spread) for task in chosen}
     with run_all(calls, workers, "trained without a task") as found:
@@ -139,6 +144,20 @@ def _strength(library: Fit, spread: float, workers: Workers) -> float:
     about = {"ridge": ridge, "tasks": chosen, "nats_per_step": dict(zip(map(str, STRENGTHS), nats, strict=True))}
     write_text(kept, json_text(about))
     return ridge
+
+
+def _several_tasks(library: Fit) -> tuple[Demonstrations, dict[str, list[str]]]:
+    """The training demonstrations of a library, and their names by task, of the tasks with two or more.
+
+    :raises BadInput: there is at most one such task.
+    """
+    demos = train_and_valid(library.spec, library.demonstrations)["train"]
+    each = by_task({demo.name: demo.attributes for demo in demos})
+    tasks = {task: names for task, names in each.items() if len(names) > 1}
+    if len(tasks) < 2:
+        text = f"{library.run_folder}: has demonstrations of {len(tasks)} task(s) with two or more, by the attribute"
+        raise BadInput(f"{text} {TASK!r}; say how strong a prior it is: training.library.ridge=30")
+    return demos, tasks
 
 
 def _predicted(spec: Spec, demos: Demonstrations, names: Sequence[str], spread: float) -> list[float]:

@@ -126,3 +126,4 @@ def test_a_library_of_one_task_says_that_a_strength_is_needed(tmp_path):
     ended = call("fit", new, "--library", tmp_path / "run", "--out", tmp_path / "new", "--jobs", 1)
     assert ended.status == 2
     assert "training.library.ridge=30" in ended.err
+    assert not (tmp_path / "new").exists()
