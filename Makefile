@@ -42,7 +42,7 @@ test-all: lint
 # this very code is not measured again; one part alone: .venv/bin/python benchmarks/performance.py inference
 # DEMONSTRATIONS=FILE: the file that `init` writes a spec for, instead of made-up demonstrations.
 bench: $(DEMO)
-	$(PIP) -e '.[bench,segments]'
+	$(PIP) -e '.[bench]'
 	$(BIN)/python benchmarks/performance.py
 	$(BIN)/python -m studies render README.md docs/results/*.md
 

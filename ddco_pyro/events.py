@@ -31,14 +31,6 @@ class DemonstrationsDone(Event):
 
 
 @dataclass(frozen=True)
-class BaselineSegmented(Event):
-    """One of ``total`` baselines has segmented the demonstrations."""
-
-    baseline: str
-    total: int
-
-
-@dataclass(frozen=True)
 class TrainingBegan(Event):
     """Training of a model begins, with a budget of epochs; None for no limit."""
 

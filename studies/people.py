@@ -39,7 +39,6 @@ from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.model.batch import encode
 from ddco_pyro.model.recogniser import observed, window_means
-from ddco_pyro.segmenting.baselines import segment
 from ddco_pyro.selection.small import decide
 from ddco_pyro.spec import parse_spec, with_overrides
 from ddco_pyro.spec.yaml import read_yaml
@@ -90,7 +89,6 @@ class PeopleCell(Cell):
         if self.labelled == "0":
             found, typical = fit(spec, demos), typical_length(demo.labels[LABELS] for demo in train)
             kinds = {"options": list(found.segment(valid)[0]), "windowed k-means": clusters(found, train, valid, count)}
-            kinds |= {name: segment(key, train, valid, count, 0, spec.observations) for name, key in BASELINES.items()}
             kinds |= dict(zip(("AR-HMM", "AR-HMM, sticky"), autoregressive(train, valid, count, typical), strict=True))
             for name, changes in self.further.items():
                 kinds[name] = list(fit(with_overrides(spec, changes), demos).segment(valid)[-1])
@@ -134,7 +132,6 @@ class PeopleCell(Cell):
 ALONE: dict[str, Any] = {"compare_with": []}
 NOTHING, ALONE_WEIGHT = 1e-6, 0.3
 """The power with which controls count nothing, and the recogniser's weight beside transitions."""
-BASELINES = {"Gaussian HMM": "hmm", "change points": "change_points"}
 USUAL: dict[str, Any] = {
     "control.power": 1.0,
     "control.parts": [],

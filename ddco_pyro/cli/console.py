@@ -20,7 +20,6 @@ from ddco_pyro.drawing import words
 from ddco_pyro.drawing.page import Table
 from ddco_pyro.evaluation import verdicts
 from ddco_pyro.events import (
-    BaselineSegmented,
     CellDone,
     CellsBegan,
     DemonstrationsDone,
@@ -93,8 +92,6 @@ class Progress:
         match event:
             case DemonstrationsDone(done, total):
                 self._advance(f"{self._what}", total, done)
-            case BaselineSegmented(baseline, total):
-                self._advance("segmenting by baselines", total, note=baseline)
             case TrainingBegan(model, epochs):
                 name, _, further = model.partition(" ")
                 self._begin(f"training {method(name)} {further}".rstrip(), epochs)

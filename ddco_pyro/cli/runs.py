@@ -17,9 +17,7 @@ from ddco_pyro.errors import BadInput
 from ddco_pyro.segmenting.formats import FORMATS, check_format, write_format
 
 if TYPE_CHECKING:
-    from ddco_pyro.data.sources import Source
     from ddco_pyro.exporting import Exported
-    from ddco_pyro.fitting.fitted import Fit
 
 FILMED = 3
 """Episodes of each method that ``rollout --video`` films."""
@@ -149,18 +147,6 @@ def segment(
         float | None,
         typer.Option(min=0.001, help="Steps per second; by default the control frequency that DEMOS says."),
     ] = None,
-    baselines: Annotated[
-        bool,
-        typer.Option(
-            "--baselines",
-            help="Write the labels of k-means, mixtures, hidden Markov models, change points, equal lengths and "
-            "gripper changes beside the options; measure the agreement of all with the file's labels "
-            f"(pip install 'ddco-pyro{BRACKET}segments]').",
-        ),
-    ] = False,
-    gripper: Annotated[
-        int, typer.Option(help="The control dimension of the gripper for --baselines, from 0; by default the last.")
-    ] = -1,
     allow_code: AllowCode = False,
 ) -> None:
     """Label every step of demonstrations with a run's options, and write them in the formats that you name.
@@ -170,10 +156,10 @@ def segment(
     given = locals()
     named = {option: given[option[2:].replace("-", "_")] for option in FORMATS} | {"--in-place": in_place and demos}
     places = {option: path for option, path in named.items() if path}
-    if not (places or baselines):
+    if not places:
         raise BadInput(
             "name what to write, such as --html PAGE or --csv FILE; labels for each step go to --out FILE (a copy) or "
-            "with --in-place into DEMOS; --baselines measures agreement with labels"
+            "with --in-place into DEMOS"
         )
     if out and in_place:
         raise BadInput("--out and --in-place exclude each other; keep one")
@@ -181,57 +167,25 @@ def segment(
         check_outputs([Output("--in-place", demos, "file")])
     from ddco_pyro.cli import console
     from ddco_pyro.data.sources import open_source
-    from ddco_pyro.evaluation.agreement import agreement_table, tolerances
     from ddco_pyro.fitting.fitted import load
-    from ddco_pyro.segmenting.baselines import BASELINES, check_installed
     from ddco_pyro.segmenting.formats.asked import Asked
-    from ddco_pyro.segmenting.segments import baseline_labels, beside_baselines, segments
+    from ddco_pyro.segmenting.segments import segments
 
     fit = load(run, allow_code)
     if level is not None and fit.names and level not in fit.names:
         raise BadInput(f"--level: there is no level {level!r} (there is: {', '.join(fit.names)})")
     with open_source(demos, where=where_of(wheres)) as source, console.Progress("segmenting") as progress:
-        beside = baseline_labels(fit) if baselines else ()
         subtasks = level or next(iter(fit.names), "")
-        asked = [
-            Asked(option, path, fit, run, demos, source, subtasks, beside, same_order)
-            for option, path in places.items()
-        ]
+        asked = [Asked(option, path, fit, run, demos, source, subtasks, same_order) for option, path in places.items()]
         if fit.names:  # without options, segments() refuses the run
             for each in asked:
                 check_format(each)
-        missing = _missing_labels(fit, source) if baselines else ""
-        if baselines:
-            check_installed(BASELINES)
-            if missing and not asked:
-                raise BadInput(f"--baselines: {missing}; name what to write, such as --html PAGE")
         segmented = segments(fit, source, progress, intervals=html is not None)
         segmented = replace(segmented, frequency=fps or segmented.frequency)
-        if baselines:
-            segmented = beside_baselines(segmented, fit, source, gripper, progress)
-            for name, scores in segmented.agreements.items():
-                title = f"level {name}: agreement with the label {segmented.truth[name]}"
-                console.show(agreement_table(scores, title))
-                if said := tolerances(segmented.frequency):
-                    console.say(said)
-            if missing:
-                print(f"--baselines: {missing}; no agreement is measured")
         for line in segmented.unlike:
             print(f"note: unlike the demonstrations of the fit: {line}", file=sys.stderr)
         for each in asked:
             print(write_format(each, segmented))
-
-
-def _missing_labels(fit: Fit, source: Source) -> str:
-    """What is missing to measure agreement, in words; empty where a demonstration has labels of the run's spec."""
-    from ddco_pyro.segmenting.segments import chosen_names
-
-    names = fit.spec.demonstrations.label_names
-    if not names:
-        return "the run's spec has no demonstrations.labels"
-    if any(name in source.read(demo).labels for demo in chosen_names(source, fit) for name in names):
-        return ""
-    return f"the demonstrations have no {', '.join(f'labels/{name}' for name in names)}"
 
 
 def export(

@@ -104,6 +104,10 @@ def _mean(scores: Sequence[Scores]) -> Scores | None:
     return Scores.model_validate(mean([one.model_dump() for one in scores]))
 
 
+EQUAL = "equal lengths"
+"""The row of parts of equal length in tables."""
+
+
 def equal_lengths(steps: int, count: int) -> np.ndarray:
     """The number of the part, from 0 on, of each step [T] of a demonstration that is cut into equal parts."""
     return np.arange(steps) * count // steps
@@ -299,7 +303,7 @@ def tolerances(frequency: float | None) -> str:
     return f"Tolerances of boundary F1: {each}." if frequency else ""
 
 
-def agreement_table(scores: Mapping[str, Scores | None], title: str | None = None) -> Table:
+def agreement_table(scores: Mapping[str, Scores | None]) -> Table:
     """Two rows for each name of segments, one for each way to match options with labels."""
     unmatched, matched = ([METRICS[key].name for key in keys] for keys in (UNMATCHED, MATCHED))
     head = ["Segments", *unmatched, "matching", *matched]
@@ -312,7 +316,7 @@ def agreement_table(scores: Mapping[str, Scores | None], title: str | None = Non
         for key, matching in MATCHINGS.items():
             rows.append([*first, matching, *(number(value) for _, value in getattr(known, key))])
             first = [""] * len(first)
-    return Table(head, rows, {0, 1 + len(UNMATCHED)}, title)
+    return Table(head, rows, {0, 1 + len(UNMATCHED)})
 
 
 # --- two annotators ---------------------------------------------------------------------------------------------------

@@ -350,7 +350,7 @@ def said_segments(
             labels = document.in_file(name)
             levels[level] = LevelLabels(labels, _starts(document, name, labels), np.ones(len(labels)))
             said[level + SOURCE] = sources_shown(document, name)
-        each.append(Segments(name, levels, 0.0, False, baselines=said))
+        each.append(Segments(name, levels, 0.0, False, sources=said))
     counts = {level: len(document.names) for level, document in documents.items()}
     names = {level: choice_names(counts[level], document.names) for level, document in documents.items()}
     known = {**label_names(source.attributes), **{level + SOURCE: list(SOURCES) for level in documents}}
@@ -423,7 +423,7 @@ def shown_segments(
     for demo in model.segments:
         levels = {**demo.levels, level: labels_shown(document, demo.name, proposed[demo.name])}
         sources = {level + SOURCE: sources_shown(document, demo.name)}
-        each.append(replace(demo, levels=levels, baselines=sources))
+        each.append(replace(demo, levels=levels, sources=sources))
     return replace(
         model,
         segments=tuple(each),

@@ -16,13 +16,12 @@ from ddco_pyro.drawing.page import Block, Cell, Section, Table, Text, footnote, 
 from ddco_pyro.drawing.shown import in_words
 from ddco_pyro.drawing.timeline import Timelines
 from ddco_pyro.drawing.words import capital, duration, number, percent
-from ddco_pyro.evaluation.agreement import EXPLAINED, agreement_table, tolerances
+from ddco_pyro.evaluation.agreement import EQUAL, EXPLAINED, agreement_table, tolerances
 from ddco_pyro.evaluation.verdicts import contributions, recogniser
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Confusion, Scores
 from ddco_pyro.names import label_name, numbered_name, option_name
 from ddco_pyro.report.skills import Shown, agreeing
-from ddco_pyro.segmenting.baselines import BASELINES, EQUAL, RECOGNISED
 from ddco_pyro.segmenting.page import HOW, use_by_task
 from ddco_pyro.segmenting.segments import Segmented
 
@@ -105,9 +104,9 @@ def agreement(fit: Fit, demos: Demonstrations) -> Section | None:
             if found is not None:
                 scores[f"{before}options, {words}"] = found[place]
                 if given is not None and level == given.level and part in record.recogniser:
-                    scores[f"{before}{RECOGNISED}, {words}"] = record.recogniser[part]
+                    scores[f"{before}recogniser alone, {words}"] = record.recogniser[part]
                 if equal:
-                    scores[f"{before}{BASELINES[EQUAL]}, {words}"] = equal[place]
+                    scores[f"{before}{EQUAL}, {words}"] = equal[place]
     known = label_names(demos.attributes)
     compared = " and ".join(f"“{name}”" for name in fit.spec.demonstrations.label_names)
     blocks: list[Block] = [Text(f"Options and the ground-truth label {compared}."), agreement_table(scores)]

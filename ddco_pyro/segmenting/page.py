@@ -129,14 +129,14 @@ def _nats(demo: Segments) -> str:
 
 
 def _values(segmented: Segmented) -> dict[str, dict[int, str]]:
-    """The labels and the baselines of demonstrations, and the name of each of their values."""
+    """The labels of demonstrations and who says so, and the name of each of their values."""
     found: dict[str, dict[int, str]] = {}
     for demo in segmented.segments:
-        for name, values in (*demo.labels.items(), *demo.baselines.items()):
+        for name, values in (demo.labels | demo.sources).items():
             if name not in segmented.counts and not name.endswith(BOUNDARY):
-                known, label = segmented.label_names.get(name, ()), "kind" if name in demo.baselines else name
+                known = segmented.label_names.get(name, ())
                 found.setdefault(name, {}).update(
-                    (value, label_name(label, value, known)) for value in np.unique(values).tolist()
+                    (value, label_name(name, value, known)) for value in np.unique(values).tolist()
                 )
     return found
 
@@ -146,7 +146,7 @@ def _runs(demo: Segments, name: str) -> Runs | None:
     if level := demo.levels.get(name):
         options, starts, _ = zip(*level.runs(), strict=True)
         return Runs(starts, options, level.intervals, level.probability)
-    values = demo.labels.get(name, demo.baselines.get(name))
+    values = demo.labels.get(name, demo.sources.get(name))
     if values is None:
         return None
     found = np.flatnonzero(np.diff(values, prepend=values[0] - 1))

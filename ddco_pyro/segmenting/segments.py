@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ddco_pyro.data.demonstration import check_fitted, needed
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.demonstrations import Demonstration
 from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.labels import BOUNDARY, SOURCE, label_names
 from ddco_pyro.data.likeness import Likeness
@@ -20,14 +20,12 @@ from ddco_pyro.data.memory import INFERENCE, refuse_too_much
 from ddco_pyro.data.sources import Source, open_source
 from ddco_pyro.data.tasks import are_several, of_tasks, task_of, with_task
 from ddco_pyro.drawing.colours import option_colour
+from ddco_pyro.evaluation.agreement import EQUAL, of_equal_lengths
 from ddco_pyro.evaluation.agreement import agreement as scores_of
-from ddco_pyro.evaluation.agreement import of_equal_lengths
 from ddco_pyro.evaluation.inferred import Inferred, runs
-from ddco_pyro.events import BaselineSegmented, DemonstrationsDone, OnEvent, ignore
+from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Scores
-from ddco_pyro.segmenting import baselines
-from ddco_pyro.training.data import train_and_valid
 
 SOURCES = ("open", "proposed", "accepted", "given")
 """Who says what a step is: none, as a person left it open; the model; a person who accepts that; a person."""
@@ -67,8 +65,7 @@ class Segments:
     :param log_likelihood: log p(ξ) per step, nats.
     :param held_out: whether the run's fit held the demonstration out.
     :param labels: ground-truth labels in the file, name to [T].
-    :param baselines: labels of baselines, ``<level>_<baseline>`` to kinds from 1 on [T]; where a person labelled, also
-        ``<level>_source``, the place in :data:`SOURCES` [T].
+    :param sources: where a person labelled, ``<level>_source`` to the place in :data:`SOURCES` [T].
     :param task: the demonstration's own; empty where none is known.
     """
 
@@ -77,7 +74,7 @@ class Segments:
     log_likelihood: float
     held_out: bool
     labels: dict[str, np.ndarray] = field(default_factory=dict)
-    baselines: dict[str, np.ndarray] = field(default_factory=dict)
+    sources: dict[str, np.ndarray] = field(default_factory=dict)
     task: str = ""
 
     def __len__(self) -> int:
@@ -123,25 +120,16 @@ class Segmented:
     def agreements(self) -> dict[str, dict[str, Scores | None]]:
         """Agreement of each level that has labels: the measures of each kind of segments, by its name.
 
-        Parts of equal length stand beside the options. Other baselines are compared on the held-out demonstrations, or
-        on all where none is held out.
+        Parts of equal length stand beside the options.
         """
         agreements: dict[str, dict[str, Scores | None]] = {}
         for level, truth in self.truth.items():
-            groups = self.labelled(truth)
-            for part, group in groups.items():
+            for part, group in self.labelled(truth).items():
                 options, labels = [demo.levels[level].options for demo in group], [demo.labels[truth] for demo in group]
                 scores = agreements.setdefault(level, {})
                 tasks = [demo.task for demo in group]
                 scores[f"options, {part}"] = scores_of(options, labels, tasks)
-                equal = f"{baselines.BASELINES[baselines.EQUAL]}, {part}"
-                scores[equal] = of_equal_lengths(labels, self.counts[level], options, tasks)
-            for part, group in [*groups.items()][:1]:
-                for name, words in (baselines.BASELINES | {baselines.RECOGNISER: baselines.RECOGNISED}).items():
-                    if f"{level}_{name}" in group[0].baselines and name != baselines.EQUAL:
-                        kinds = [demo.baselines[f"{level}_{name}"] for demo in group]
-                        labels, tasks = [demo.labels[truth] for demo in group], [demo.task for demo in group]
-                        agreements[level][f"{words}, {part}"] = scores_of(kinds, labels, tasks)
+                scores[f"{EQUAL}, {part}"] = of_equal_lengths(labels, self.counts[level], options, tasks)
         return agreements
 
     def label_colours(self, name: str) -> dict[int, str]:
@@ -218,44 +206,6 @@ def of_run(
         pairs = zip(table.matched, table.options, strict=True)
         matched.setdefault(label, {value: option for value, option in pairs if value is not None})
     return Segmented(tuple(segmented), counts, frequency, truth, fit.names, known, matched)
-
-
-def baseline_labels(fit: Fit) -> tuple[str, ...]:
-    """The names of the labels of baselines: ``<level>_<baseline>``."""
-    names = [f"{level}_{name}" for level in fit.names for name in baselines.BASELINES]
-    own = fit.hierarchy.recogniser
-    return (*names, *([] if own is None else [f"{[*fit.names][own.level - 1]}_{baselines.RECOGNISER}"]))
-
-
-def beside_baselines(
-    segmented: Segmented, fit: Fit, source: Source, gripper: int = -1, on_event: OnEvent = ignore
-) -> Segmented:
-    """The same segments with the labels of every baseline, fitted to the run's training demonstrations.
-
-    The options that a run's recogniser alone finds stand beside them.
-
-    :param gripper: the control dimension whose changes divide demonstrations in the baseline ``gripper``.
-    :raises BadInput: there is no such control dimension, or a package is not installed.
-    """
-    train = train_and_valid(fit.spec, fit.demonstrations)["train"]
-    demos = Demonstrations(tuple(recorded(segmented, fit, source)))
-    found, total = {}, len(segmented.counts) * len(baselines.BASELINES)
-    for level, count in segmented.counts.items():
-        for name in baselines.BASELINES:
-            seed, observations, key = fit.spec.seed, fit.spec.observations, fit.spec.control.relative_to
-            found[f"{level}_{name}"] = baselines.segment(name, train, demos, count, seed, observations, gripper, key)
-            on_event(BaselineSegmented(name, total))
-    if fit.hierarchy.recogniser is not None:
-        found[baseline_labels(fit)[-1]] = [
-            row[:steps].numpy() - 1
-            for piece in fit.infer(demos)
-            for row, steps in zip(() if piece.recognised is None else piece.recognised, piece.lengths, strict=True)
-        ]
-    each = (
-        replace(demo, baselines={name: kinds[row] + 1 for name, kinds in found.items()})
-        for row, demo in enumerate(segmented.segments)
-    )
-    return replace(segmented, segments=tuple(each))
 
 
 def recorded(segmented: Segmented, fit: Fit, source: Source) -> Iterator[Demonstration]:

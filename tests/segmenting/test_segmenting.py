@@ -5,8 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import re
-import sys
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,7 +14,6 @@ import pyarrow.parquet as parquet
 import pytest
 import yaml
 from command_line import call
-from random_demonstrations import numbered
 from sklearn.metrics import normalized_mutual_info_score
 from time_lines import embedded, tracks, unpacked
 
@@ -24,14 +21,11 @@ import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.importing import import_demonstrations
 from ddco_pyro.data.sources import open_source
-from ddco_pyro.errors import BadInput
-from ddco_pyro.evaluation.agreement import agreement
 from ddco_pyro.fitting.fit import fit
-from ddco_pyro.segmenting.baselines import BASELINES, segment
 from ddco_pyro.segmenting.formats.asked import Asked
 from ddco_pyro.segmenting.formats.lerobot import write_subtasks
 from ddco_pyro.segmenting.segments import LevelLabels, Segmented, Segments, recorded, segments
-from ddco_pyro.spec import ObservationSpec, parse_spec
+from ddco_pyro.spec import parse_spec
 from ddco_pyro.training.data import demonstrations
 from ddco_pyro.training.data import train_and_valid as split_in_parts
 
@@ -227,35 +221,6 @@ def test_the_page_marks_what_was_held_out_and_says_how_labels_agree(toy_run, toy
     assert "3 of 12 demonstrations were held out when the run was fitted" in text
 
 
-def test_baselines_stand_beside_the_options_and_are_written_as_they_are(toy_run, file, tmp_path):
-    """Their agreement is that on what was held out."""
-    parts, seen = split_in_parts(toy_run.spec, demonstrations(toy_run.spec)), demonstrations(toy_run.spec)
-    truth = [demo.labels["phase"] for demo in parts["valid"]]
-    out, table, page = (tmp_path / name for name in ("out.hdf5", "table.csv", "page.html"))
-    written = "--out", out, "--csv", table, "--html", page
-    ended = call("segment", toy_run.folder, file, "--baselines", "--gripper", 0, *written)
-    assert ended.status == 0, ended.err
-    names = [f"option_{name}" for name in BASELINES]
-    marks = [f"{name}_boundary" for name in names]
-    again = Demonstrations.read(out, labels=[*names, *marks])
-    with table.open(newline="") as opened:
-        rows = list(csv.DictReader(opened))
-    for name in BASELINES:
-        expected = segment(name, parts["train"], seen, 2, 0, toy_run.spec.observations, 0)
-        held_out = segment(name, parts["train"], parts["valid"], 2, 0, toy_run.spec.observations, 0)
-        nmi = agreement(held_out, truth).nmi
-        assert f"<td>{BASELINES[name]}, 3 held out</td><td>{nmi:.2f}</td>" in page.read_text()
-        for demo, kinds in zip(again, expected, strict=True):
-            np.testing.assert_array_equal(demo.labels[f"option_{name}"], kinds + 1)
-            np.testing.assert_array_equal(demo.labels[f"option_{name}_boundary"], np.diff(kinds, prepend=-1) != 0)
-        lanes = {lane["name"]: lane["names"] for lane in embedded(page.read_text())["lanes"]}
-        assert set(lanes[f"option_{name}"].values()) <= {"kind 1", "kind 2", "kind 3"}
-        assert [int(row[f"option_{name}"]) for row in rows] == [kind + 1 for kinds in expected for kind in kinds]
-        for row, (_, _, lanes) in enumerate(tracks(page.read_text()).values()):
-            steps = [value for value, start, end in lanes[f"option_{name}"] for _ in range(start, end)]
-            assert steps == (expected[row] + 1).tolist()
-
-
 def test_the_page_escapes_what_it_shows(toy_run, tmp_path, toy_spec):
     path = tmp_path / "<img src=x>.hdf5"
     demonstrations(toy_spec).write(path)
@@ -392,75 +357,3 @@ def test_what_cannot_be_written_of_a_lerobot_dataset(lerobot_run, tmp_path, argu
     named = [one.replace("OUT", str(tmp_path / "out")) for one in arguments]
     refused(message, lerobot_run.folder, LEROBOT, *named)
     assert not list(tmp_path.iterdir())
-
-
-# --- baselines that segment -------------------------------------------------------------------------------------------
-
-
-CENTRES = np.array([[-2.0, 0.0], [2.0, 0.0], [0.0, 3.0]])
-
-
-def planted(number=10, seed=0, noise=0.3):
-    """Three kinds of steps in an order of their own, at three places in units that differ; the gripper (control 1)
-    is closed in the second kind alone. ``place`` says where in one unit, control 0 in another.
-    """
-    random, rows = np.random.default_rng(seed), []
-    for _ in range(number):
-        kind = np.repeat(random.permutation(3), random.integers(6, 12, 3))
-        seen = CENTRES[kind] + noise * random.normal(size=(len(kind), 2))
-        controls = np.stack([seen[:, 0] / 50, np.where(kind == 1, 1.0, 0.0)], axis=1)
-        rows.append(({"place": 1000 * seen}, controls, {"kind": kind}))
-    return numbered(rows)
-
-
-def scores(name, valid, **settings):
-    found = segment(name, planted(), valid, 3, 0, **settings)
-    return agreement(found, [demo.labels["kind"] for demo in valid])
-
-
-@pytest.mark.parametrize("name", ["kmeans", "gmm", "hmm", "change_points"])
-def test_kinds_that_lie_apart_are_found_in_demonstrations_not_seen(name):
-    found = scores(name, planted(4, seed=1))
-    assert found.matched_globally.accuracy > 0.97
-    assert found.boundary_f1_1 > 0.97
-
-
-def test_equal_lengths():
-    (found,) = segment("equal", planted(), planted(1).select(["demo_0"]), 4, 0)
-    sizes = np.bincount(found)
-    assert len(sizes) == 4
-    assert sizes.max() - sizes.min() <= 1
-    assert (np.diff(found) >= 0).all()
-    short = numbered([({"place": np.zeros((2, 2))}, np.zeros((2, 2)))])
-    assert segment("equal", planted(), short, 4, 0)[0].tolist() == [0, 2]
-
-
-def test_gripper_changes():
-    closed = [[0, 0, 1, 1, 1, 0, 1], [1, 1, 0, 0, 0, 0, 0]]
-    valid = numbered(({"place": np.zeros((7, 1))}, np.stack([np.linspace(-1, 1, 7), one], 1)) for one in closed)
-    found = segment("gripper", planted(), valid, 2, 0)
-    assert [one.tolist() for one in found] == [[0, 0, 1, 1, 1, 2, 3], [0, 0, 1, 1, 1, 1, 1]]
-    assert segment("gripper", valid, valid, 2, 0, gripper=0)[0].tolist() == [0, 0, 0, 0, 1, 1, 1]
-    with pytest.raises(BadInput, match="there is no control dimension 2; there are 2"):
-        segment("gripper", valid, valid, 2, 0, gripper=2)
-
-
-@pytest.mark.parametrize("name", BASELINES)
-def test_it_is_what_the_seed_says_and_looks_at_observations_alone_that_are_named(name):
-    train, valid = planted(), planted(3, seed=1)
-    random = np.random.default_rng(3)
-
-    def noisy(demo):
-        return replace(demo, observations={**demo.observations, "noise": random.normal(size=(len(demo), 4))})
-
-    more = [Demonstrations(tuple(noisy(demo) for demo in demos)) for demos in (train, valid)]
-    named = segment(name, *more, 3, 5, observations=[ObservationSpec(key="place")])
-    for one, other in zip(segment(name, train, valid, 3, 5), named, strict=True):
-        np.testing.assert_array_equal(one, other)
-
-
-def test_a_package_that_is_missing_is_a_line(monkeypatch):
-    for name, package in (("hmm", "hmmlearn"), ("change_points", "ruptures")):
-        monkeypatch.setitem(sys.modules, package, None)
-        with pytest.raises(BadInput, match=r"needs \w+; install it with: pip install 'ddco-pyro\[segments\]'"):
-            segment(name, planted(2), planted(2), 2, 0)

@@ -185,7 +185,7 @@ def _record(path: str, asked: Asked, demo: Segments, frequency: float | None) ->
     states = {
         name: (level.options, [*asked.names_of(name), SOURCES[UNKNOWN + 1]]) for name, level in demo.levels.items()
     }
-    states |= {name: (own, [*SOURCES]) for name, own in demo.baselines.items() if name.endswith(SOURCE)}
+    states |= {name: (own, [*SOURCES]) for name, own in demo.sources.items()}
     for name, (values, words) in states.items():
         starts = np.flatnonzero(np.diff(values, prepend=-9))
         changes = rerun.StateChange.columns(state=[words[value] for value in values[starts]])

@@ -26,7 +26,6 @@ class Asked:
     :param out: the file or folder to write.
     :param demos: the path of the demonstrations; ``source`` is the same, open.
     :param level: the level whose options are subtasks.
-    :param baselines: names of further labels, ``<level>_<baseline>``.
     :param annotator: who labelled; empty where no one did.
     :param same_order: leave out demonstrations whose options follow another order than most, rather than refuse.
     """
@@ -38,7 +37,6 @@ class Asked:
     demos: Path
     source: Source
     level: str
-    baselines: tuple[str, ...] = ()
     same_order: bool = False
     annotator: str = ""
 
@@ -61,7 +59,7 @@ class Asked:
 
     def said_by(self, demo: Segments, start: int, stop: int) -> str | None:
         """Who says what steps of the level are, one of :data:`~ddco_pyro.segmenting.SOURCES`; None without a person."""
-        known = demo.baselines.get(self.level + SOURCE)
+        known = demo.sources.get(self.level + SOURCE)
         return None if known is None else SOURCES[known[start:stop].min()]
 
     def order(self, segmented: Segmented) -> list[int]:

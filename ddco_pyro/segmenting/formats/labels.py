@@ -34,11 +34,11 @@ COPIED = "segmented_from"
 def labels_of(demo: Segments) -> dict[str, np.ndarray]:
     """Labels of a demonstration: ``<level>``, its options [T], and ``<level>_boundary``, 1 at each new choice [T].
 
-    Baselines likewise, with ``<level>_<baseline>`` as name, and who says so.
+    ``<level>_source``, who says so, likewise.
     """
     labels = {}
     each = {name: (level.options, level.boundaries) for name, level in demo.levels.items()}
-    each |= {name: (kinds, np.diff(kinds, prepend=0) != 0) for name, kinds in demo.baselines.items()}
+    each |= {name: (sources, np.diff(sources, prepend=0) != 0) for name, sources in demo.sources.items()}
     for name, (options, boundaries) in each.items():
         labels[name] = options.astype(np.int16)
         labels[name + BOUNDARY] = boundaries.astype(np.int8)
@@ -52,19 +52,19 @@ def check(asked: Asked) -> None:
     """
     if not _same(asked.out, asked.demos):
         check_copy(asked.demos, asked.out)
-    check_labels(asked.demos, [*asked.fit.names, *asked.baselines], chosen_names(asked.source, asked.fit))
+    check_labels(asked.demos, asked.fit.names, chosen_names(asked.source, asked.fit))
 
 
 def write(asked: Asked, segmented: Segmented) -> str:
     """``labels/<level>`` and ``labels/<level>_boundary`` of every level, in a copy or in the file itself."""
     write_labels(asked.demos, asked.out, segmented)
-    return f"{asked.out}: labels/{', labels/'.join([*segmented.counts, *segmented.segments[0].baselines])}"
+    return f"{asked.out}: labels/{', labels/'.join(segmented.counts)}"
 
 
 def check_labels(path: Path, given: Iterable[str], names: Iterable[str]) -> None:
     """Check that demonstrations in ``path`` can be given these labels and their boundaries.
 
-    :param given: levels, and ``<level>_<baseline>`` for baselines.
+    :param given: their names.
     :raises BadInput: a demonstration has labels of that name from another source.
     """
     labels = [label for name in given for label in (name, name + BOUNDARY)]

@@ -172,7 +172,7 @@ def _columns(asked: Asked, rows: pyarrow.Table, demo: Segments, runs: list[Run])
     if EVENTS not in rows.column_names:
         events = pyarrow.struct([kind.field(name) for name in (*fields, "tool_calls") if name != "timestamp"])
         columns[EVENTS] = pyarrow.array([[]] * steps, pyarrow.list_(events))
-    who = demo.baselines.get(asked.level + SOURCE)
+    who = demo.sources.get(asked.level + SOURCE)
     if who is not None:
         said = who != SOURCES.index("proposed")
         columns[WHO] = pyarrow.array(who.astype(np.int64))

@@ -8,7 +8,7 @@ import numpy as np
 import pandas
 
 from ddco_pyro.data.files import whole_file
-from ddco_pyro.data.labels import BOUNDARY, SOURCE, UNKNOWN
+from ddco_pyro.data.labels import BOUNDARY, UNKNOWN
 from ddco_pyro.drawing.shown import stored_pictures
 from ddco_pyro.names import option_name
 from ddco_pyro.segmenting.formats.asked import Asked
@@ -22,7 +22,7 @@ FORMULA = ("=", "+", "-", "@", "\t", "\r")
 def table(segmented: Segmented) -> pandas.DataFrame:
     """A row for each step: of each level the option, whether it is a new choice, its probability and its name.
 
-    Then come the kinds of baselines, and who says so where a person labelled.
+    Then comes who says so, where a person labelled.
     """
     parts = []
     named = any(demo.task for demo in segmented.segments)
@@ -39,8 +39,7 @@ def table(segmented: Segmented) -> pandas.DataFrame:
             columns[f"{name}_probability"] = level.probability.astype(float)
             words = {option: option_name(option, names) for option in level.options.tolist()} | {UNKNOWN: ""}
             columns[f"{name}_name"] = [words[option] for option in level.options.tolist()]
-        for name, kinds in demo.baselines.items():
-            columns[name] = [SOURCES[kind] for kind in kinds] if name.endswith(SOURCE) else kinds
+        columns |= {name: [SOURCES[place] for place in sources] for name, sources in demo.sources.items()}
         parts.append(pandas.DataFrame(columns))
     return pandas.concat(parts, ignore_index=True)
 
