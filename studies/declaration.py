@@ -27,7 +27,7 @@ SKELETON = {
 }
 """A spec like those of ``init``, in which overrides are checked before there are demonstrations."""
 
-ALONE: Any = {"demonstrations.leave_one_out": False, "demonstrations.hold_out_by": None, "selection.grid": {}}
+ALONE: Any = {"demonstrations.hold_out_by": None, "selection.grid": {}}
 """What every method changes in the spec: a cell is one fit."""
 
 NATS = "nats"

@@ -18,7 +18,7 @@ from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.inspection import Field, Inspection, inspect
 from ddco_pyro.data.labels import BOUNDARY, EXCLUDE
 from ddco_pyro.errors import command
-from ddco_pyro.spec import parse_spec
+from ddco_pyro.spec import EACH, parse_spec
 from ddco_pyro.spec.yaml import read_yaml
 
 TEMPLATE = Path(__file__).with_suffix(".yaml.j2")
@@ -142,9 +142,10 @@ def starting_spec(
     count, many = _options(inspection, labels[0]) if labels else (0, "")
     counted = 1 < count <= MOST_OPTIONS * max(1, len(inspection.tasks) * inspection.several)
     count, many = (count, many) if counted else (OPTIONS, "")
-    apart = _held_out(inspection, hold_out_by) if hold_out_by else ""
+    each = hold_out_by == EACH
+    apart = _held_out(inspection, hold_out_by) if hold_out_by and not each else ""
     filled = {"labels": labels, "count": count, "many": many}
-    filled |= {"by": hold_out_by, "apart": apart, "small": decided or Decided()}
+    filled |= {"by": hold_out_by if apart else None, "each": each, "apart": apart, "small": decided or Decided()}
     text = _filled(inspection, str(path), observed, used, reasons, filled)
     parse_spec(read_yaml(text))  # the text is a valid spec
     said = [decided.why, "heavy tails: " + HEAVY if decided.heavy else ""] if decided else []
@@ -205,6 +206,7 @@ def _filled(
     batch = int(np.clip(round(recipe.batch_steps / np.mean(lengths)), 1, max(1, len(lengths) // 2)))
     epochs = round(recipe.gradient_steps / np.ceil(len(lengths) / batch), -1)
     em = bool(vectors) and not images
+    few = em and len(lengths) < FEW and not {"train", "valid"} & set(masks) and not decided["by"]
     unusable_labels = [(field.key, why) for field in inspection.labels if (why := _unusable(inspection, field))]
     return environment.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
         path=path,
@@ -231,9 +233,8 @@ def _filled(
         starts=("windows", *STARTS) if decided["small"].window else STARTS,
         margin=MARGIN,
         em=em,
-        few=em and len(lengths) < FEW and not {"train", "valid"} & set(masks) and not decided["by"],
         epochs=max(int(np.clip(epochs, recipe.epochs, MOST_EPOCHS)), EXACT_EPOCHS if em else 0),
-        **decided,
+        **decided | {"each": decided["each"] or few},
     )
 
 

@@ -196,7 +196,7 @@ def _fit_models(
             write_table(folder / "history.csv", ("restart", "stage", "epoch", "train", "tune"), trained.history)
             write_model(folder, hierarchy)
         alone = workers if _worth_a_process(spec, hierarchy, demos) else ALONE
-        apart = _leave_one_out(spec, demos, folder, on_event, alone)
+        apart = _without_each(spec, demos, folder, on_event, alone)
     fitted = Fit(spec, hierarchy, folder=folder, given=demos, beside=by_name, apart=apart)
     train, valid = len(trained.data.train), len(split.get("valid", ()))
     counts = {"train": train, "tune": len(split["train"]) - train, "valid": valid, "left_out": bool(apart)}
@@ -260,13 +260,13 @@ def _versions() -> dict[str, str]:
     return {package: found.version for package, found in installed.items() if found}
 
 
-def _leave_one_out(
+def _without_each(
     spec: Spec, demos: Demonstrations, folder: Path | None, on_event: OnEvent, workers: Workers
 ) -> dict[str, Hierarchy]:
     """The model trained without each demonstration, by its name; each is a fit that holds one demonstration out."""
-    if not spec.demonstrations.leave_one_out:
+    if not spec.demonstrations.holds_out_each:
         return {}
-    alone = with_overrides(spec, {"demonstrations.leave_one_out": False, "compare_with": []})
+    alone = with_overrides(spec, {"demonstrations.hold_out_by": None, "compare_with": []})
     places = left_out(folder, demos) if folder else {}
     calls = {}
     for name in demos.names:

@@ -46,7 +46,7 @@ class Fit:
     :param folder: the run folder; None where nothing was written.
     :param given: the demonstrations of the fit; None for those that the spec names.
     :param beside: the fitted baselines, by name; None for those in the run folder.
-    :param apart: models that were trained without a demonstration, by its name (``demonstrations.leave_one_out``); None
+    :param apart: models that were trained without a demonstration, by its name (``demonstrations.hold_out_by``); None
         for those in the run folder.
     :param named: the names of the options of each level that has names; :meth:`name_options` changes them.
     """
@@ -186,8 +186,8 @@ class Fit:
 
     @cached_property
     def without(self) -> Mapping[str, Hierarchy]:
-        """The model without each demonstration, by its name; empty without ``demonstrations.leave_one_out``."""
-        if self.apart is not None or self.folder is None or not self.spec.demonstrations.leave_one_out:
+        """The model without each demonstration, by its name; empty unless each is held out."""
+        if self.apart is not None or self.folder is None or not self.spec.demonstrations.holds_out_each:
             return self.apart or {}
         places = left_out(self.folder, self.demonstrations)
         return {name: read_model(place, self.spec) for name, place in places.items()}
@@ -209,7 +209,7 @@ class Fit:
         (6,) torch.Size([6, 10, 3]) torch.Size([6, 10])
 
         :param demos: :class:`~ddco_pyro.Demonstrations`, or an iterable that reads one after the other.
-        :param held_out: with ``demonstrations.leave_one_out``, each by the model that was trained without it.
+        :param held_out: with ``demonstrations.hold_out_by: demonstration``, each by the model trained without it.
         :raises DemonstrationsError: there are none, an observation or the control has another shape than in the fit, or
             a number is too large for networks.
         """

@@ -99,13 +99,7 @@ def for_new_task(path: Path, run: Path, overrides: Iterable[str] = (), allow_cod
     """
     alone = {
         "compare_with": [],
-        "demonstrations": {
-            "valid_fraction": 0,
-            "leave_one_out": False,
-            "hold_out_by": None,
-            "exclude": [],
-            "where": {},
-        },
+        "demonstrations": {"valid_fraction": 0, "hold_out_by": None, "exclude": [], "where": {}},
         "training": {"tune_fraction": 0, "library": {"run": str(run)}},
     }
     said = [f"{key}={dump_yaml(value)}" for part in (alone, read_mapping(path, "spec")) for key, value in _leaves(part)]

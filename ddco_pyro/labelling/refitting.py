@@ -106,7 +106,7 @@ def refit_spec(trained: Fit, level: str, count: int) -> Spec:
     changes: dict[str, Any] = {
         "compare_with": [],
         "demonstrations.labels": None,
-        "demonstrations.leave_one_out": False,
+        "demonstrations.hold_out_by": None,
         "demonstrations.valid_fraction": 0.0,
         "demonstrations.exclude": [],
         "training.starts": trained.spec.training.starts[:1],

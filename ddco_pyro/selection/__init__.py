@@ -26,7 +26,7 @@ from ddco_pyro.selection import choice as choosing
 from ddco_pyro.selection import grid
 from ddco_pyro.selection.choice import Choice
 from ddco_pyro.selection.grid import Candidate, assign, divide
-from ddco_pyro.spec import Spec, with_overrides
+from ddco_pyro.spec import EACH, Spec, with_overrides
 from ddco_pyro.training import data
 from ddco_pyro.training.networks import Dimensions, model_name
 from ddco_pyro.training.processes import one_thread
@@ -153,7 +153,7 @@ def _fitted(spec: Spec, demos: Demonstrations, folder: Path) -> Metrics | str:
     A failure does not stop other folds.
     """
     try:
-        spec = with_overrides(spec, WHOLE)
+        spec = with_overrides(spec, {"demonstrations.hold_out_by": None})  # masks alone say what is held out
         with one_thread():
             return fit_beside(model_name(spec), spec, data.seen(spec, demos), folder).metrics
     except Damaged:
@@ -162,14 +162,11 @@ def _fitted(spec: Spec, demos: Demonstrations, folder: Path) -> Metrics | str:
         return reason(error)
 
 
-WHOLE = {"demonstrations.hold_out_by": None, "demonstrations.leave_one_out": False}
-"""Masks alone say what is held out."""
-
-
 def final_spec(chosen: Candidate) -> Spec:
     """The spec of the final fit: the chosen candidate on all demonstrations but those that are set apart."""
-    apart = {} if chosen.spec.demonstrations.hold_out_by else {"demonstrations.valid_fraction": 0.0}
-    return with_overrides(chosen.spec, {**apart, "demonstrations.leave_one_out": False})
+    if chosen.spec.demonstrations.hold_out_by not in (None, EACH):
+        return chosen.spec
+    return with_overrides(chosen.spec, {"demonstrations.hold_out_by": None, "demonstrations.valid_fraction": 0.0})
 
 
 def _write(folder: Path, spec: Spec, choice: Choice, folds: Sequence[Demonstrations]) -> None:

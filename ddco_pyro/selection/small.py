@@ -148,7 +148,6 @@ def _sketch(spec: Spec) -> Spec:
         {
             "compare_with": [],
             "demonstrations.valid_fraction": 0,
-            "demonstrations.leave_one_out": False,
             "demonstrations.hold_out_by": None,
             "training.starts": spec.training.starts[:1],
             "training.epochs": min(EPOCHS, spec.training.epochs or EPOCHS),

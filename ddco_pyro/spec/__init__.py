@@ -8,6 +8,7 @@ from ddco_pyro.spec.model import BaselineSpec, HierarchySpec, LevelSpec
 from ddco_pyro.spec.networks import Activation, ConvolutionLayer, NetworkSpec, PolicySpec, Pool
 from ddco_pyro.spec.settings import (
     DISCRETE,
+    EACH,
     STEP,
     TASK,
     ControlSpec,
@@ -25,6 +26,7 @@ from ddco_pyro.spec.yaml import dump_spec, load_spec, spec_schema, user_code
 
 __all__ = [
     "DISCRETE",
+    "EACH",
     "STEP",
     "TASK",
     "Activation",

@@ -11,6 +11,9 @@ from pydantic import BeforeValidator, Field, InstanceOf, PlainSerializer
 
 from ddco_pyro.spec.base import Count, Items, Model, Positive, Problems, Seed, Share, Text, bare, invalid, nested, show
 
+EACH = "demonstration"
+"""In place of an attribute in ``demonstrations.hold_out_by``: each demonstration is held out from a further fit."""
+
 LabelNames = Annotated[Items[Text], Field(min_length=1)]
 Labels = Annotated[Text | LabelNames, nested((list, tuple), LabelNames, "a name, or a list with a name for each level")]
 
@@ -32,10 +35,9 @@ class DemonstrationsSpec(Model):
     """Fraction of the demonstrations held out for validation, unless the file has ``mask/valid``; 0 for none."""
     hold_out_by: Text | None = None
     """An attribute of demonstrations, such as the operator: all demonstrations with some of its values are held out,
-    about ``valid_fraction`` of all, whatever masks the file has. The spec's ``seed`` draws the values."""
-    leave_one_out: bool = False
-    """Whether every demonstration trains the model. Held-out results of a demonstration are then of a further fit,
-    which leaves it out. For few demonstrations; ``valid_fraction`` does not apply."""
+    about ``valid_fraction`` of all, whatever masks the file has. The spec's ``seed`` draws the values.
+    With ``demonstration``, every demonstration trains the model. Held-out results of a demonstration are then of a
+    further fit, which leaves it out. For few demonstrations; ``valid_fraction`` does not apply."""
     exclude: Items[Text] = ()
     """Names of demonstrations that are not read."""
     where: dict[str, Annotated[Items[Text], Field(min_length=1)]] = Field(default={})
@@ -45,9 +47,7 @@ class DemonstrationsSpec(Model):
     with a name for each level, lowest first. Steps labelled −1 are ignored."""
 
     def problems(self) -> Problems:
-        if self.hold_out_by is not None and self.leave_one_out:
-            yield "hold_out_by", "stands beside leave_one_out; keep one of the two"
-        elif self.hold_out_by is not None and not self.valid_fraction:
+        if self.hold_out_by not in (None, EACH) and not self.valid_fraction:
             yield "hold_out_by", "holds out about valid_fraction, which is 0; raise valid_fraction"
 
     @property
@@ -58,7 +58,12 @@ class DemonstrationsSpec(Model):
     @property
     def validates(self) -> bool:
         """Whether there are held-out results, by the spec alone."""
-        return self.leave_one_out or self.valid_fraction > 0
+        return self.holds_out_each or self.valid_fraction > 0
+
+    @property
+    def holds_out_each(self) -> bool:
+        """Whether every demonstration trains the model, and each is held out from a further fit."""
+        return self.hold_out_by == EACH
 
     @property
     def label_names(self) -> tuple[str, ...]:

@@ -58,14 +58,9 @@ def dimensions(spec: Spec, demos: Demonstrations | None = None) -> Dimensions:
 def train_and_valid(spec: Spec, demos: Demonstrations) -> dict[str, Demonstrations]:
     """The demonstrations to train with, ``train``, and the held-out ones, ``valid``, where there are any.
 
-    :raises DemonstrationsError: one part is empty, masks overlap, or masks hold out what ``leave_one_out`` trains with.
+    :raises DemonstrationsError: one part is empty, or masks overlap.
     """
-    if spec.demonstrations.leave_one_out:
-        if demos.masks.keys() & {"train", "valid"}:
-            raise DemonstrationsError(
-                "demonstrations.leave_one_out: trains with every demonstration, but the file has mask/train or "
-                "mask/valid; leave it out, or the masks"
-            )
+    if spec.demonstrations.holds_out_each:
         return {"train": demos, "valid": demos}
     if spec.demonstrations.valid_fraction == 0 and not demos.masks.keys() & {"train", "valid"}:
         return {"train": demos}
@@ -221,9 +216,11 @@ def _set_apart(spec: Spec, demos: Demonstrations) -> Demonstrations:
     given, own = spec.demonstrations, {demo.name: demo.attributes for demo in demos}
     if given.hold_out_by is None:
         return demos
+    others = {mask: names for mask, names in demos.masks.items() if mask not in ("train", "valid")}
+    if given.holds_out_each:
+        return replace(demos, masks=others)
     found = with_values(given.hold_out_by, own, given.valid_fraction, spec.seed)
     held_out = {name for members in found.values() for name in members}
-    others = {mask: names for mask, names in demos.masks.items() if mask != "train"}
     return replace(demos, masks={**others, "valid": tuple(name for name in demos.names if name in held_out)})
 
 

@@ -289,7 +289,7 @@ def test_few_demonstrations_all_train(path: Path, tmp_path: Path) -> None:
         return load_spec(write(tmp_path, starting_spec(inspect(path), path).text))
 
     few, more = spec(*[20] * 7), spec(*[20] * 8)
-    assert [one.demonstrations.leave_one_out for one in (few, more)] == [True, False]
+    assert [one.demonstrations.hold_out_by for one in (few, more)] == ["demonstration", None]
     assert [one.training.tune_fraction for one in (few, more)] == [0, 0.1]
 
 
@@ -364,7 +364,7 @@ def test_what_cannot_be_held_out_by(attribute: str, says: str, path: Path, tmp_p
     ended = call("init", of_operators(path, "ABCAB"), "--out", spec, "--hold-out-by", attribute)
     assert (ended.status, ended.out, ended.err) == (2, "", f"ddco-pyro: {path}: {says}\n")
     assert not spec.exists()
-    asked = [f"demonstrations.hold_out_by={attribute}", "demonstrations.leave_one_out=false"]
+    asked = [f"demonstrations.hold_out_by={attribute}"]
     assert call("init", path, "--out", spec).status == 0
     for command in ("check", "fit"):
         out = ["--out", tmp_path / "run"] if command == "fit" else []

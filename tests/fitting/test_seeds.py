@@ -16,7 +16,6 @@ from random_demonstrations import numbered
 from scipy import stats
 
 import ddco_pyro
-from ddco_pyro.data.demonstrations import DemonstrationsError
 from ddco_pyro.drawing import words
 from ddco_pyro.evaluation import verdicts
 from ddco_pyro.report import training
@@ -127,7 +126,7 @@ def test_what_cannot_be_repeated_is_refused_before_any_work(written, tmp_path, c
 
 def few_spec():
     return small_spec(
-        demonstrations={"path": "unused.hdf5", "leave_one_out": True, "labels": "skill"},
+        demonstrations={"path": "unused.hdf5", "hold_out_by": "demonstration", "labels": "skill"},
         control={"std": {"learn": True, "floor": 0.01, "per_option": True}},
         compare_with=[{"kind": "flat", "policy": LINEAR}],
         training={"optimizer": {"name": "em"}, "epochs": 30, "tune_fraction": 0, "starts": ["vq_controls"]},
@@ -153,7 +152,7 @@ def run(tmp_path_factory):
 def test_every_demonstration_trains_and_is_held_out_from_a_fit_without_it(run):
     demos, counts = planted(), run.metrics.demonstrations
     assert (counts.train, counts.tune, counts.valid, counts.left_out) == (4, 0, 4, True)
-    alone = {"demonstrations.leave_one_out": False, "compare_with": []}
+    alone = {"demonstrations.hold_out_by": None, "compare_with": []}
     masked, one = replace(demos, masks={"valid": ("demo_0",)}), demos.select(["demo_0"])
     for method, model in (("ddco", run), *run.baselines.items()):
         (held_out,) = (row.log_likelihood for row in model.metrics.valid if row.name == "demo_0")
@@ -183,10 +182,10 @@ def test_a_run_has_the_models_without_one_and_goes_on_with_them(run, tmp_path):
     assert unchanged.model_copy(update={"seconds": {}}) == run.metrics.model_copy(update={"seconds": {}})
 
 
-def test_what_masks_hold_out_cannot_be_trained_with():
+def test_what_masks_hold_out_is_trained_with():
     masked = replace(planted(), masks={"valid": ("demo_0",)})
-    with pytest.raises(DemonstrationsError, match="leave_one_out: trains with every demonstration"):
-        ddco_pyro.fit(few_spec(), masked)
+    spec = with_overrides(few_spec(), {"training.epochs": 1, "compare_with": []})
+    assert ddco_pyro.fit(spec, masked).metrics.demonstrations.train == len(masked)
 
 
 def test_runs_are_compared_by_what_the_fits_without_one_say(run):

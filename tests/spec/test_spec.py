@@ -264,10 +264,6 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         {"demonstrations": {"path": "a", "hold_out_by": "b", "valid_fraction": 0}},
         "demonstrations.hold_out_by: holds out",
     ),
-    (
-        {"demonstrations": {"path": "a", "hold_out_by": "b", "leave_one_out": True}},
-        "demonstrations.hold_out_by: stands",
-    ),
     ({"hierarchy.trunk": {"network": "constant"}}, "hierarchy.trunk.network: a constant has no features for others"),
     ({"hierarchy.meta_policy": {"network": "constant", "inputs": ["a"]}}, "hierarchy.meta_policy.inputs: a constant"),
     ({"hierarchy.meta_policy": {"network": "linear", "hidden": [8]}}, "hierarchy.meta_policy.hidden: unknown key"),
