@@ -234,7 +234,7 @@ def _filled(
         margin=MARGIN,
         em=em,
         epochs=max(int(np.clip(epochs, recipe.epochs, MOST_EPOCHS)), EXACT_EPOCHS if em else 0),
-        **decided | {"each": decided["each"] or few},
+        **{**decided, "each": decided["each"] or few},
     )
 
 
