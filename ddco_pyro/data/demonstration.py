@@ -179,7 +179,7 @@ def check(demo: Demonstration, first: Demonstration | None = None) -> None:
     for place, array in ours.items():
         if place.startswith("labels/") and (problem := problem_of(place, array.shape[1:], array.dtype)):
             raise DemonstrationsError(f"{demo.name}: {place} {problem}")
-        if problem := unlike(array, len(demo), theirs[place].shape[1:], other.name):
+        if problem := different(array, len(demo), theirs[place].shape[1:], other.name):
             raise DemonstrationsError(f"{demo.name}: {place} {problem}")
 
 
@@ -203,7 +203,7 @@ def problem_of(place: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
     )
 
 
-def unlike(array: Observed, steps: int, shape: tuple[int, ...], first: str) -> str:
+def different(array: Observed, steps: int, shape: tuple[int, ...], first: str) -> str:
     """How an array differs from the controls in steps, or from the first demonstration in shape; empty if neither."""
     if array.shape[:1] != (steps,):
         return f"has {array.shape[0] if array.shape else 'no'} steps, but actions has {steps}"

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from ddco_pyro.data.arrays import LARGEST, NUMBERS, LazyArray, Observed, blocks, network_input, usable
-from ddco_pyro.data.coincidences import CLOCKS, Jumps, Leaks, copies
+from ddco_pyro.data.arrays import LARGEST, NUMBERS, LazyArray, Observed, blocks, is_picture, network_input, usable
+from ddco_pyro.data.coincidences import CLOCKS, Beside, Jumps, copies, generated, jumps
 from ddco_pyro.data.controls import (
     FEWEST,
     MOST_DIMENSIONS,
@@ -26,12 +26,12 @@ from ddco_pyro.data.controls import (
     rounding,
     same,
 )
-from ddco_pyro.data.demonstration import NOTHING, Attribute, problem_of, unlike
+from ddco_pyro.data.demonstration import NOTHING, Attribute, different, problem_of
 from ddco_pyro.data.division import check_division, problems_of_masks
 from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.labels import UNKNOWN, label_names
-from ddco_pyro.data.likeness import EXCLUDE, Likeness, reasons_told
+from ddco_pyro.data.likeness import EXCLUDE, Traits, reasons_told, traits_of, unlike
 from ddco_pyro.data.sources import Source, open_source
 from ddco_pyro.data.sources.metadata import clock_fault
 from ddco_pyro.data.tasks import Where, are_several, by_task, task_of
@@ -185,7 +185,7 @@ class Inspection:
     :param excluded: names of demonstrations that were skipped.
     :param unreadable: names of demonstrations that could not be read.
     :param clocks: a line for the first fault of each clock among observations, by place.
-    :param turns: the angles in radians and the first numbers of quaternions that jump, by place of the array.
+    :param turns: the angles and quaternions that jump, by place of the array.
     :param odd: names of demonstrations that are dead, unlike the others, or change the kind of a control dimension, and
         why.
     :param attributes: of each demonstration by its name.
@@ -201,12 +201,12 @@ class Inspection:
     problems: list[str] = field(default_factory=list)
     control: tuple[ControlDimension, ...] = ()
     coincidences: tuple[str, ...] = ()
-    leaks: Mapping[str, str] = field(default_factory=dict)
+    leaks: dict[str, str] = field(default_factory=dict)
     relative_to: str | None = None
     excluded: tuple[str, ...] = ()
     unreadable: list[str] = field(default_factory=list)
     odd: Mapping[str, str] = field(default_factory=dict)
-    turns: dict[str, tuple[tuple[int, ...], tuple[int, ...]]] = field(default_factory=dict)
+    turns: dict[str, Jumps] = field(default_factory=dict)
     clocks: dict[str, str] = field(default_factory=dict)
     attributes: dict[str, Mapping[str, Attribute]] = field(default_factory=dict)
     where: Where = field(default_factory=dict)
@@ -306,10 +306,9 @@ class _Inspector:
     def __init__(self, source: Source, found: Inspection) -> None:
         self.source, self.found = source, found
         self.problems: dict[tuple[str, str], list[str]] = {}  # messages by kind and subject
-        self.controls: dict[str, np.ndarray] = {}
-        self.digests: dict[str, Any] = {}
-        self.leaks, self.likeness = Leaks(), Likeness()
-        self.jumps: dict[str, Jumps] = {}
+        self.vectors: dict[str, dict[str, np.ndarray]] = {}  # controls and narrow observations, by place and name
+        self.digests: dict[str, bytes] = {}
+        self.traits: list[Traits] = []
 
     def read(self, names: Sequence[str]) -> None:
         """Read these demonstrations."""
@@ -320,52 +319,62 @@ class _Inspector:
             except DemonstrationsError as error:
                 self._problem("unreadable", str(error), re.sub(r"\d+", "", str(error).removeprefix(name)))
                 found.unreadable.append(name)
-                self.digests.pop(name, None)
-                self.controls.pop(name, None)
-                self.likeness.discard(name)
         for name, there in places.items():
             for place in (place for place in fields if place not in there):
                 self._problem("missing", f"{name}: {place} is missing", place)
         self._name_labels()
-        found.control = control_dimensions(self.controls)
-        odd = self.likeness.unlike() | self._odd(found.control)
+        controls = self.vectors.get("actions", {})
+        found.control = control_dimensions(controls)
+        odd = unlike(self.traits) | self._odd(found.control, controls)
         found.odd = {name: odd[name] for name in found.lengths if name in odd}
         kinds = (
             messages[0] if len(messages) == 1 else f"{messages[0]}; the first of {len(messages)} such"
             for messages in self.problems.values()
         )
         found.problems = [*kinds, *_problems_of_division(self.source, names, found.masks), *_problems(found)]
-        self._coincidences()
+        self._coincidences(controls)
 
-    def _coincidences(self) -> None:
+    def _coincidences(self, controls: Mapping[str, np.ndarray]) -> None:
         """What of the demonstrations coincides, and the control minus what it is a target of."""
         found = self.found
         varying = [dimension.number for dimension in found.control if not dimension.constant]
-        reasons = {array.place: self.leaks.reason(array.place, varying, array.constant) for array in found.observations}
-        found.leaks = {place: why for place, why in reasons.items() if why}
+        beside = {}
+        for array in found.observations:
+            known = {name: rows for name, rows in self.vectors.get(array.place, {}).items() if name in controls}
+            if known:
+                commands = [controls[name] for name in known]
+                beside[array.place] = Beside(array.place, [*known.values()], commands, varying, array.constant)
+            if array.key.rpartition("/")[2] in CLOCKS and array.minimum.shape == (1,):
+                faults = ((name, clock_fault(rows[:, 0].astype(np.float64), GAP)) for name, rows in known.items())
+                for line in (f"{array.place} {fault}, in {name}" for name, fault in faults if fault):
+                    found.clocks.setdefault(array.place, line)
+            why = generated(array.place) or (beside[array.place].reason if known else "")
+            found.leaks |= {array.place: why} if why else {}
         if not any(dimension.integer or len(dimension.values) == 2 for dimension in found.control):
-            seen = (one for one in found.observations if found.everywhere(one) and not reasons[one.place])
-            found.relative_to = next((one.key for one in seen if self.leaks.followed(one.place, varying)), None)
+            seen = (one for one in found.observations if found.everywhere(one) and one.place in beside)
+            targets = (one.key for one in seen if one.place not in found.leaks and beside[one.place].followed)
+            found.relative_to = next(targets, None)
         if (key := found.relative_to) is not None:
-            found.control = control_dimensions({name: self.source.read(name).controls(key) for name in self.controls})
-        lines = [
-            *copies(self.digests, found.masks), *self.leaks.notes(varying, {*found.leaks, f"obs/{key}"})
-        ]  # fmt: skip
-        for place, jumps in self.jumps.items():
-            low, high = found.fields[place].minimum, found.fields[place].maximum
-            lines += jumps.notes(place, low, high)
-            if any(turns := (tuple(jumps.angles(low, high)["2π"]), tuple(jumps.quaternions))):
-                found.turns[place] = turns
+            found.control = control_dimensions(
+                {name: rows - self.vectors[f"obs/{key}"][name] for name, rows in controls.items()}
+            )
+        lines = [*copies(self.digests, found.masks)]
+        for place, one in beside.items():
+            lines += one.notes() if place not in (*found.leaks, f"obs/{key}") else ()
+        for place, each in self.vectors.items():
+            if found.fields[place].dtype.kind == "f" and (turning := jumps(each)):
+                found.turns[place] = turning
+                lines += turning.notes(place)
         found.coincidences = tuple(lines)
 
-    def _odd(self, dimensions: Sequence[ControlDimension]) -> dict[str, str]:
+    def _odd(self, dimensions: Sequence[ControlDimension], controls: Mapping[str, np.ndarray]) -> dict[str, str]:
         """Names of demonstrations to exclude, and why.
 
         Dead ones are, and the few without which a control dimension is a switch.
         """
         if any(dimension.integer for dimension in dimensions):
             return {}
-        long = {name: rows for name, rows in self.controls.items() if len(rows) >= FEWEST}
+        long = {name: rows for name, rows in controls.items() if len(rows) >= FEWEST}
         still = {name: rows for name, rows in long.items() if same(rows.min(0).astype(float), rows.max(0)).all()}
         dead = [name for name, rows in still.items() if not rows.any()]
         others = [name for name in still if name not in dead]
@@ -386,52 +395,47 @@ class _Inspector:
             self._problem("names", str(error), "labels")
 
     def _read(self, name: str) -> Collection[str]:
-        """Read a demonstration; the places of its arrays."""
+        """Read a demonstration, vectors whole and pictures in blocks; the places of its arrays."""
         demo = self.source.read(name)
+        arrays = {
+            place: np.asarray(array) if _vector(place, array) else array for place, array in demo.arrays().items()
+        }
         self.found.lengths[name], self.found.attributes[name] = len(demo), demo.attributes
-        self.digests[name] = hashlib.sha256()
-        arrays = demo.arrays()
+        task, digest, vectors = task_of(demo.attributes), hashlib.sha256(), dict[str, np.ndarray]()
         for place, array in arrays.items():
             field = self.found.fields.get(place) or Field(place, array.shape[1:], array.dtype, np.zeros(0), np.zeros(0))
-            if problem := unlike(array, len(demo), field.shape, "the first"):
+            if problem := different(array, len(demo), field.shape, "the first"):
                 self._problem("shape", f"{name}: {place} {problem}", place)
                 continue
             self.found.fields[place] = field
             field.having.append(name)
             field.video = field.video or (isinstance(array, LazyArray) and array.video)
-            if not field.video and field.numeric:
-                self._read_array(field, array, name)
+            if field.video or not field.numeric:
+                continue
+            step, first, label = 0, np.zeros((0, 0)), place.startswith("labels/")
+            digest.update(b"" if label else place.encode())
+            for block in blocks(array):
+                values = block.reshape(len(block), -1)
+                first = first if step else values[:1].copy()
+                digest.update(b"" if label else np.ascontiguousarray(values).tobytes())
+                field.add(values, name, task, step, first)
+                step += len(values)
+            if step and not label and isinstance(array, np.ndarray) and _vector(place, array):
+                vectors[place] = array.reshape(step, -1)
+        self.digests[name] = digest.digest()
+        for place, rows in vectors.items():
+            self.vectors.setdefault(place, {})[name] = rows
+        self.traits += [traits_of(name, task, vectors)] if "actions" in vectors else []
         return arrays.keys()
-
-    def _read_array(self, field: Field, array: Observed, name: str) -> None:
-        """Feed an array to every statistic: in blocks, and whole if its steps are narrow."""
-        narrow = field.place == "actions" or math.prod(field.shape) <= MOST_DIMENSIONS
-        array, step, first = np.asarray(array) if narrow else array, 0, np.zeros((0, 0))
-        label, digest = field.place.startswith("labels/"), self.digests[name]
-        digest.update(b"" if label else field.place.encode())
-        for block in blocks(array):
-            values = block.reshape(len(block), -1)
-            first = first if step else values[:1].copy()
-            digest.update(b"" if label else np.ascontiguousarray(values).tobytes())
-            field.add(values, name, task_of(self.found.attributes[name]), step, first)
-            step += len(values)
-        if label or not step or not isinstance(array, np.ndarray):
-            return
-        values = array.reshape(len(array), -1)
-        if field.place == "actions":
-            self.controls[name] = array
-            self.likeness.add(name, field.place, values, task_of(self.found.attributes[name]))
-        elif not field.image and name in self.controls:
-            self.likeness.add(name, field.place, values)
-            self.leaks.add(field.place, values, self.controls[name].reshape(len(values), -1))
-            clock = field.key.rpartition("/")[2] in CLOCKS and values.shape[1] == 1
-            if clock and (fault := clock_fault(values[:, 0].astype(np.float64), GAP)):
-                self.found.clocks.setdefault(field.place, f"{field.place} {fault}, in {name}")
-        if field.dtype.kind == "f" and values.shape[1] <= MOST_DIMENSIONS:
-            self.jumps.setdefault(field.place, Jumps(values.shape[1])).add(values, name)
 
     def _problem(self, kind: str, message: str, about: str) -> None:
         self.problems.setdefault((kind, about), []).append(message)
+
+
+def _vector(place: str, array: Observed) -> bool:
+    """Whether an array is the control, or an observation of few numbers that is read whole."""
+    narrow = place == "actions" or math.prod(array.shape[1:]) <= MOST_DIMENSIONS
+    return array.dtype.kind in NUMBERS and narrow and not is_picture(array)
 
 
 def _problems_of_division(source: Source, names: Sequence[str], masks: Mapping[str, Sequence[str]]) -> Iterator[str]:

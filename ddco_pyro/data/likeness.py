@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
-from copy import deepcopy
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from ddco_pyro.data.arrays import is_picture
-from ddco_pyro.data.coincidences import NEARLY, TURNS
 from ddco_pyro.data.controls import MOST_DIMENSIONS, few, listed
 from ddco_pyro.data.demonstration import Demonstration
 from ddco_pyro.data.tasks import are_several, task_of
@@ -42,13 +39,8 @@ RESTS = 0.4
 
 These are .5 and more of grippers' steps, and at most .32 of others', whose sign depends on where an object is."""
 
-JUMP = 2.0
-"""Numbers jump if they change by so many times their usual largest change, and any other change of the demonstration.
-
-Where recordings are joined, a quarter of the moving numbers and two at least do so at once."""
-
-FASTER = 2.0
-"""Another rate makes steps longer by this factor at least, and demonstrations shorter by about as much."""
+OTHER_RATE = 0.05
+"""Rates are of other data if their logarithms differ by more."""
 
 SAMPLED = 200
 """Steps of each demonstration, about, by which a control's range is judged."""
@@ -58,13 +50,28 @@ EXCLUDE = "; exclude such ones (demonstrations.exclude)"
 
 
 @dataclass(frozen=True)
+class Traits:
+    """What is compared of a demonstration.
+
+    :param sampled: some of its controls [S, A].
+    :param sizes: by place, the size, the span and the mean change in a step of each number [3, D].
+    :param correlations: by place, of each control with each number, its change, and for ``actions`` time [A, F].
+    """
+
+    name: str
+    task: str
+    sampled: np.ndarray
+    sizes: Mapping[str, np.ndarray]
+    correlations: Mapping[str, np.ndarray]
+
+
+@dataclass(frozen=True)
 class Usual:
     """What the demonstrations of a fit have in common.
 
-    :param statistics: by place, the lowest, the median and the highest of each statistic of a number [3, 5, D].
+    :param statistics: by place, the lowest, the median and the highest of each of the sizes of a number [3, 3, D].
     :param correlations: of each control dimension with observations and time [A, F].
     :param agreement: the cosine with these that nine in ten demonstrations exceed [A].
-    :param length: the median number of steps.
     :param frequency: control steps per second, Hz; None if unknown.
     :param unlike: why demonstrations are unlike the others, by name.
     """
@@ -72,185 +79,130 @@ class Usual:
     statistics: dict[str, list[list[list[float]]]]
     correlations: list[list[float]]
     agreement: list[float]
-    length: float
     frequency: float | None
     unlike: dict[str, str]
 
 
-class Likeness:
-    """Statistics of each number of demonstrations, which are added array by array, controls first."""
+def traits(demo: Demonstration, keys: Collection[str]) -> Traits:
+    """What is compared of a demonstration and its observations with these keys, except pictures."""
+    seen = {f"obs/{key}": demo.observations[key] for key in keys}
+    vectors = {place: np.asarray(array) for place, array in seen.items() if not is_picture(array)}
+    return traits_of(demo.name, task_of(demo.attributes), {"actions": demo.actions, **vectors})
 
-    def __init__(self) -> None:
-        self._lengths: dict[str, int] = {}
-        self._tasks: dict[str, str] = {}
-        self._controls = np.zeros((0, 0))  # of the demonstration whose arrays are added
-        self._sampled: dict[str, np.ndarray] = {}
-        self._statistics: dict[str, dict[str, np.ndarray]] = {}
-        self._correlations: dict[str, dict[str, np.ndarray]] = {}
 
-    def add(self, name: str, place: str, rows: np.ndarray, task: str = "") -> None:
-        """Add an array [T, D] of a demonstration of a task, unless it is too wide.
+def traits_of(name: str, task: str, arrays: Mapping[str, np.ndarray]) -> Traits:
+    """What is compared of a demonstration's arrays [T, ...] by place, of which ``actions`` is the control.
 
-        The statistics of a number are its size, its span, its mean and its largest change in a step, and the step of
-        the latter, −1 where another change is nearly as large.
-        """
-        if rows.shape[1] > MOST_DIMENSIONS or (place != "actions" and name not in self._lengths):
-            return
-        rows = np.nan_to_num(rows.astype(np.float64), posinf=0, neginf=0)
-        if place == "actions":
-            self._lengths[name], self._tasks[name], self._controls = len(rows), task, rows
-            self._sampled[name] = rows[:: 1 + len(rows) // SAMPLED]
+    Wide arrays do not count.
+    """
+    control, sizes, correlations = np.zeros((0, 0)), {}, {}
+    for place, array in sorted(arrays.items(), key=lambda item: item[0] != "actions"):
+        rows = np.nan_to_num(array.reshape(len(array), -1).astype(np.float64), posinf=0, neginf=0)
+        if rows.shape[1] > MOST_DIMENSIONS:
+            continue
+        control = rows if place == "actions" else control
         with np.errstate(over="ignore", invalid="ignore"):
             after = np.concatenate([rows[1:], rows[-1:]])
-            changes = np.abs(after - rows)
-            turned = np.abs(after + rows) < (1 - NEARLY) * changes  # as a quaternion
-            for turn in TURNS.values():
-                turned |= np.abs(changes - turn) < (1 - NEARLY) * turn
-            moves = np.where(turned, 0, changes)
-            second, largest = np.partition(np.concatenate([0 * rows[:1], moves]), -2, axis=0)[-2:]
-            at = np.where(largest > JUMP * second, moves.argmax(0), -1)
-            found = [np.abs(rows).max(0), np.ptp(rows, axis=0), changes.mean(0), largest, at]
+            largest = np.abs(rows).max(0), np.ptp(rows, axis=0), np.abs(after - rows).mean(0)
+            sizes[place] = np.nan_to_num(np.stack(largest), posinf=0)
             phase = np.cos(np.pi * np.outer(np.arange(len(rows)) / len(rows), (1, 2, 3)))
             around = phase if place == "actions" else np.concatenate([rows, after - rows], axis=1)
-            self._statistics.setdefault(place, {})[name] = np.nan_to_num(np.stack(found), posinf=0)
-            self._correlations.setdefault(place, {})[name] = _correlations(self._controls, around)
+            correlations[place] = _correlations(control, around)
+    return Traits(name, task, control[:: 1 + len(control) // SAMPLED], sizes, correlations)
 
-    def discard(self, name: str) -> None:
-        """Forget a demonstration."""
-        known: list[dict[str, Any]] = [self._lengths, self._tasks, self._sampled]
-        for kept in (*known, *self._statistics.values(), *self._correlations.values()):
-            kept.pop(name, None)
 
-    def add_all(self, demo: Demonstration, keys: Collection[str]) -> None:
-        """Add the controls of a demonstration, and its observations with these keys, except pictures."""
-        arrays = {"actions": demo.actions} | {f"obs/{key}": demo.observations[key] for key in keys}
-        for place, array in arrays.items():
-            if not is_picture(array):
-                self.add(demo.name, place, np.asarray(array).reshape(len(demo), -1), task_of(demo.attributes))
+def usual(known: Sequence[Traits], frequency: float | None) -> Usual:
+    """What demonstrations have in common; ``frequency`` is their rate, Hz."""
+    extremes = {place: np.quantile(each, (0, 0.5, 1), axis=0).tolist() for place, each in _sizes(known).items()}
+    reference, agreement = _agreement(known)
+    return Usual(extremes, reference.tolist(), np.quantile(agreement, 0.1, axis=0).tolist(), frequency, unlike(known))
 
-    def usual(self, frequency: float | None) -> Usual:
-        """What the demonstrations have in common."""
-        extremes = {place: np.quantile(each, (0, 0.5, 1), axis=0).tolist() for place, each in self._each.items()}
-        reference, agreement = self._agreement()
-        least = np.quantile(agreement, 0.1, axis=0).tolist()
-        return Usual(extremes, reference.tolist(), least, self._length, frequency, self.unlike())
 
-    def unlike(self, usual: Usual | None = None, frequency: float | None = None) -> dict[str, str]:
-        """Why demonstrations are unlike the others of their task, or unlike the usual ones of a fit, by their names.
+def unlike(known: Sequence[Traits], usual: Usual | None = None, frequency: float | None = None) -> dict[str, str]:
+    """Why demonstrations are unlike the others of their task, or unlike the usual ones of a fit, by their names.
 
-        :param frequency: control steps per second of these demonstrations, Hz.
-        """
-        reasons: dict[str, str] = {}
-        if usual is None and are_several([*self._tasks.values()]):
-            for task in dict.fromkeys(self._tasks.values()):
-                part = deepcopy(self)
-                for name in [name for name, own in self._tasks.items() if own != task]:
-                    part.discard(name)
-                reasons |= part.unlike()
-            return reasons
-        if len(self._lengths) < (LEAST if usual is None else 1):
-            return reasons
-        for found in (self._units(usual), self._reversed(usual), self._rate(usual, frequency), self._joined(usual)):
-            for why, names in found.items():
-                reasons |= {name: why for name in names if name not in reasons}
-        return reasons
-
-    @property
-    def _length(self) -> float:
-        return float(np.median([*self._lengths.values()] or [0]))
-
-    @property
-    def _each(self) -> dict[str, np.ndarray]:
-        """The statistics [N, 5, D] of each array that all demonstrations have."""
-        whole = sorted(place for place, known in self._statistics.items() if len(known) == len(self._lengths))
-        return {place: np.stack([*self._statistics[place].values()]) for place in whole}
-
-    def _units(self, usual: Usual | None) -> dict[str, list[str]]:
-        """Names of demonstrations with numbers in other units, by why."""
-        found: dict[tuple[str, ...], dict[str, list[int]]] = {}
-        for place, each in self._each.items():
-            for dim, own in enumerate(np.moveaxis(each[:, :3], 2, 0)):
-                others = _larger_part(own) if usual is None else np.array(usual.statistics[place])[:, :3, dim]
-                others = others[others.min(1) > 0]
-                if len(others) > (len(own) // 2 if usual is None else 0):
-                    ratios = _ratios(own, others)
-                    out = tuple(name for name, ratio in zip(self._lengths, ratios, strict=True) if ratio)
-                    why = _times(float(np.median(ratios[ratios > 0])), usual) if out else ""
-                    found.setdefault((why, *out), {}).setdefault(place, []).append(dim)
-        return {
-            f"{few([f'{place} {listed(dims)}' for place, dims in about.items()])}: {why}": names
-            for (why, *names), about in found.items()
-            if names
-        }
-
-    def _agreement(self, usual: Usual | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """The usual correlations of controls [A, F], and the cosine of each demonstration's with them [N, A]."""
-        if not self._lengths:
-            return np.zeros((0, 0)), np.zeros((1, 0))
-        each = np.concatenate([np.stack([*self._correlations[place].values()]) for place in self._each], axis=2)
-        reference = np.median(each, axis=0) if usual is None else np.array(usual.correlations)
-        for _ in range(3 if usual is None else 0):  # with the signs of most demonstrations
-            signs = np.where(_cosines(each, reference) < 0, -1, 1)
-            reference = np.median(each * (signs * np.where(signs.sum(0) < 0, -1, 1))[..., None], axis=0)
-        return reference, _cosines(each, reference)
-
-    def _reversed(self, usual: Usual | None) -> dict[str, list[str]]:
-        """Names of demonstrations with a reversed control, by why."""
-        _, agreement = self._agreement(usual)
-        if usual is None:
-            steps = np.concatenate([*self._sampled.values()])
-            low, high = steps.min(0), steps.max(0)
-            rests = np.minimum(steps - low, high - steps) < 0.1 * (high - low)
-            known = (rests.mean(0) > RESTS) & (np.quantile(np.abs(agreement), 0.1, axis=0) > SURE)
-        else:
-            known = np.array(usual.agreement) > SURE
-        found: dict[str, list[str]] = {}
-        for dim in np.flatnonzero(known & (agreement < -SURE).any(0)).tolist():
-            why = f"control dimension {dim} has the other sign than {_where(usual)}, perhaps reversed"
-            found[why] = [name for name, own in zip(self._lengths, agreement[:, dim], strict=True) if own < -SURE]
-        return found
-
-    def _joined(self, usual: Usual | None) -> dict[str, list[str]]:
-        """Names of demonstrations in which numbers jump together, by why."""
-        each = {place: values[:, 3:] for place, values in self._each.items() if place != "actions"}
-        found: dict[str, int] = {}
-        if each:
-            own = np.concatenate([*each.values()], axis=2)
-            known = [np.array(usual.statistics[place])[1, 3] for place in each] if usual else [np.median(own[:, 0], 0)]
-            moves = np.concatenate(known)
-            for name, (largest, at) in zip(self._lengths, own, strict=True):
-                steps = np.bincount(at[(at >= 0) & (largest > JUMP * moves) & (moves > 0)].astype(int))
-                if steps.max(initial=0) >= max(2, np.count_nonzero(moves) / 4):
-                    found[name] = int(steps.argmax()) + 1
-        if not found or (usual is None and 2 * len(found) > len(self._lengths)):
-            return {}
-        first, step = next(iter(found.items()))
-        return {f"observations jump at once, in {first} at step {step}: perhaps two recordings are joined": [*found]}
-
-    def _rate(self, usual: Usual | None, frequency: float | None) -> dict[str, list[str]]:
-        """The names of all demonstrations where their rate is not that of the fit, by why."""
-        if usual is None:
-            return {}
-        names = [*self._lengths]
-        if frequency and usual.frequency:
-            other = abs(math.log(frequency / usual.frequency)) > 0.05
-            return {f"{frequency:g} Hz, and {usual.frequency:g} Hz in the fit": names} if other else {}
-        each = {place: np.median(values[:, 2], axis=0) for place, values in self._each.items() if place != "actions"}
-        changes = np.concatenate(
-            [np.zeros((2, 0)), *([own, usual.statistics[place][1][2]] for place, own in each.items())], 1
-        )
-        moving = changes[:, changes.min(0) > 0]
-        faster = float(np.median(moving[0] / moving[1])) if moving.size else 1.0
-        shorter = usual.length / self._length
-        if max(faster, 1 / faster) < FASTER or not 1 / FASTER < faster / shorter < FASTER:
-            return {}
-        return {f"steps are {faster:.2g} times as long as in the fit, perhaps at another rate": names}
+    :param frequency: control steps per second of these demonstrations, Hz.
+    """
+    tasks = [one.task for one in known]
+    if usual is None and are_several(tasks):
+        parts = (unlike([one for one in known if one.task == task]) for task in dict.fromkeys(tasks))
+        return {name: why for part in parts for name, why in part.items()}
+    if len(known) < (LEAST if usual is None else 1):
+        return {}
+    reasons = dict[str, str]()
+    for why, names in (*_other_units(known, usual), *_reversed(known, usual), *_other_rate(known, usual, frequency)):
+        reasons |= {name: why for name in names if name not in reasons}
+    return reasons
 
 
 def reasons_told(reasons: Mapping[str, str], number: int, remedy: str = "") -> list[str]:
     """A line for each reason why some of so many demonstrations are unlike the others, with their names."""
     names = {why: [name for name in reasons if reasons[name] == why] for why in reasons.values()}
     return [f"{few(members)} ({len(members)} of {number}): {why}{remedy}" for why, members in names.items()]
+
+
+# --- reasons, each with the names of its demonstrations ---------------------------------------------------------------
+
+
+def _other_units(known: Sequence[Traits], usual: Usual | None) -> Iterator[tuple[str, Sequence[str]]]:
+    """Numbers in other units."""
+    found: dict[tuple[str, tuple[str, ...]], dict[str, list[int]]] = {}
+    for place, each in _sizes(known).items():
+        for dim, own in enumerate(np.moveaxis(each, 2, 0)):
+            others = _larger_part(own) if usual is None else np.array(usual.statistics[place])[:, :3, dim]
+            others = others[others.min(1) > 0]
+            if len(others) > (len(own) // 2 if usual is None else 0):
+                ratios = _ratios(own, others)
+                if out := tuple(one.name for one, ratio in zip(known, ratios, strict=True) if ratio):
+                    why = _times(float(np.median(ratios[ratios > 0])), usual)
+                    found.setdefault((why, out), {}).setdefault(place, []).append(dim)
+    for (why, names), about in found.items():
+        yield f"{few([f'{place} {listed(dims)}' for place, dims in about.items()])}: {why}", names
+
+
+def _reversed(known: Sequence[Traits], usual: Usual | None) -> Iterator[tuple[str, Sequence[str]]]:
+    """Controls with the other sign."""
+    _, agreement = _agreement(known, usual)
+    if usual is None:
+        steps = np.concatenate([one.sampled for one in known])
+        low, high = steps.min(0), steps.max(0)
+        rests = np.minimum(steps - low, high - steps) < 0.1 * (high - low)
+        sure = (rests.mean(0) > RESTS) & (np.quantile(np.abs(agreement), 0.1, axis=0) > SURE)
+    else:
+        sure = np.array(usual.agreement) > SURE
+    for dim in np.flatnonzero(sure & (agreement < -SURE).any(0)).tolist():
+        names = [one.name for one, own in zip(known, agreement[:, dim], strict=True) if own < -SURE]
+        yield f"control dimension {dim} has the other sign than {_where(usual)}, perhaps reversed", names
+
+
+def _other_rate(
+    known: Sequence[Traits], usual: Usual | None, frequency: float | None
+) -> Iterator[tuple[str, Sequence[str]]]:
+    """All demonstrations, where their rate is not that of the fit."""
+    if usual and usual.frequency and frequency and abs(math.log(frequency / usual.frequency)) > OTHER_RATE:
+        yield f"{frequency:g} Hz, and {usual.frequency:g} Hz in the fit", [one.name for one in known]
+
+
+def _shared(known: Sequence[Traits]) -> list[str]:
+    """The places of arrays that all demonstrations have."""
+    return sorted(set.intersection(*({*one.sizes} for one in known))) if known else []
+
+
+def _sizes(known: Sequence[Traits]) -> dict[str, np.ndarray]:
+    """The sizes [N, 3, D] of each array that all demonstrations have."""
+    return {place: np.stack([one.sizes[place] for one in known]) for place in _shared(known)}
+
+
+def _agreement(known: Sequence[Traits], usual: Usual | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """The usual correlations of controls [A, F], and the cosine of each demonstration's with them [N, A]."""
+    if not (places := _shared(known)):
+        return np.zeros((0, 0)), np.zeros((1, 0))
+    each = np.stack([np.concatenate([one.correlations[place] for place in places], axis=1) for one in known])
+    reference = np.median(each, axis=0) if usual is None else np.array(usual.correlations)
+    for _ in range(3 if usual is None else 0):  # with the signs of most demonstrations
+        signs = np.where(_cosines(each, reference) < 0, -1, 1)
+        reference = np.median(each * (signs * np.where(signs.sum(0) < 0, -1, 1))[..., None], axis=0)
+    return reference, _cosines(each, reference)
 
 
 def _ratios(own: np.ndarray, usual: np.ndarray) -> np.ndarray:

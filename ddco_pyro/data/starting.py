@@ -222,9 +222,11 @@ def _filled(
         tasks=inspection.tasks if inspection.several and vectors and not images else {},
         where={name: list(values) for name, values in inspection.where.items()},
         relative=_relative(vectors),
-        turns=inspection.turns,
+        turns={
+            place: {"angles": one.angles["2π"], "quaternions": one.quaternions}
+            for place, one in inspection.turns.items()
+        },
         relative_to=inspection.relative_to,
-        zip=zip,
         images=images,
         pictures=not vectors,
         left_out=[(field, why) for field in observed if (why := _left_out(inspection, field))],

@@ -14,7 +14,7 @@ import numpy as np
 from ddco_pyro.data.arrays import LazyArray, Observed, blocks
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
-from ddco_pyro.data.likeness import Likeness, Usual
+from ddco_pyro.data.likeness import Usual, traits, usual
 from ddco_pyro.errors import BadInput
 from ddco_pyro.metrics import Record, read_record
 
@@ -76,16 +76,13 @@ def digest(demos: Demonstrations, known: Digest | None = None) -> Digest:
         labels={name: _sha256(demo.labels[name] for demo in demos) for name in sorted(demos[0].labels)},
         masks={name: [*demos.masks[name]] for name in ("train", "valid") if name in demos.masks},
         files=files,
-        usual=known.usual if known else usual(demos),
+        usual=known.usual if known else usual_of(demos),
     )
 
 
-def usual(demos: Demonstrations) -> Usual:
+def usual_of(demos: Demonstrations) -> Usual:
     """What demonstrations have in common."""
-    likeness = Likeness()
-    for demo in demos:
-        likeness.add_all(demo, demo.observations)
-    return likeness.usual(demos.frequency)
+    return usual([traits(demo, demo.observations) for demo in demos], demos.frequency)
 
 
 def _sha256(arrays: Iterable[Observed]) -> str:

@@ -16,10 +16,10 @@ from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.monitor import Monitor, run_lengths
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.division import unknown
-from ddco_pyro.data.likeness import Likeness, Usual, reasons_told
+from ddco_pyro.data.likeness import Traits, Usual, reasons_told, unlike
 from ddco_pyro.errors import BadInput, path_of
 from ddco_pyro.evaluation.inferred import Inferred, Segmentation, infer
-from ddco_pyro.fitting.digest import record, recorded, usual
+from ddco_pyro.fitting.digest import record, recorded, usual_of
 from ddco_pyro.fitting.draws import Draws, draw
 from ddco_pyro.fitting.names import Named, checked, read_names, write_names
 from ddco_pyro.fitting.run import RunError, is_finished, read_model
@@ -130,18 +130,18 @@ class Fit:
         kept = None if self.folder is None else recorded(self.folder)
         if kept is None and self.given is None:
             return None
-        return (kept and kept.usual) or usual(self.demonstrations)
+        return (kept and kept.usual) or usual_of(self.demonstrations)
 
-    def unlike(self, likeness: Likeness, nats: Mapping[str, float], frequency: float | None) -> list[str]:
+    def unlike(self, known: Sequence[Traits], nats: Mapping[str, float], frequency: float | None) -> list[str]:
         """A line for each reason why demonstrations are unlike those of the fit.
 
         :param nats: log p(ξ) per step of each, by name. It is unusual if it lies below that of the fit's by their whole
             range, and a nat for each control dimension: a control one σ farther off costs that.
         :param frequency: control steps per second, Hz; None if unknown.
         """
-        reasons = {} if self.usual is None else likeness.unlike(self.usual, frequency)
-        known = [row.log_likelihood_per_step[self.name] for row in self.metrics.demonstrations_by_likelihood]
-        low, high = min(known), max(known)
+        reasons = {} if self.usual is None else unlike(known, self.usual, frequency)
+        fitted = [row.log_likelihood_per_step[self.name] for row in self.metrics.demonstrations_by_likelihood]
+        low, high = min(fitted), max(fitted)
         less = [name for name in nats if nats[name] < 2 * low - high - self.hierarchy.scaling.size]
         why = (
             f"{np.median([nats[name] for name in less] or [0]):.1f} nats a step, and {low:.1f} to {high:.1f} in the fit"

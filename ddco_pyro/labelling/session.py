@@ -20,7 +20,7 @@ from ddco_pyro.data.arrays import is_picture
 from ddco_pyro.data.demonstration import NOTHING
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.labels import EXCLUDE, SOURCE
-from ddco_pyro.data.likeness import Likeness
+from ddco_pyro.data.likeness import traits
 from ddco_pyro.data.sources import Source, format_of, open_source
 from ddco_pyro.data.sources.metadata import FREQUENCY
 from ddco_pyro.data.tasks import Where, with_task
@@ -438,14 +438,12 @@ class Session:
         return [*([] if self._unchanged() else [changed]), *filter(None, [self.error]), *self.unlike]
 
     def _unlike(self) -> list[str]:
-        likeness, nats = Likeness(), dict[str, float]()
-        for demo in self.demos:
-            likeness.add_all(demo, self.fit.hierarchy.encoder.shapes)
+        known = [traits(demo, self.fit.hierarchy.encoder.shapes) for demo in self.demos]
+        nats = dict[str, float]()
         for piece in self.proposals.pieces:
             nats |= dict(zip(piece.names, (piece.log_likelihood / piece.lengths).tolist(), strict=True))
-        return [
-            f"unlike the demonstrations of the fit: {line}" for line in self.fit.unlike(likeness, nats, self.frequency)
-        ]
+        lines = self.fit.unlike(known, nats, self.frequency)
+        return [f"unlike the demonstrations of the fit: {line}" for line in lines]
 
     def _unchanged(self) -> bool:
         return self.path.exists() and self.version == self._version()

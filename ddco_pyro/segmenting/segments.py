@@ -15,10 +15,10 @@ from ddco_pyro.data.demonstration import check_fitted, needed
 from ddco_pyro.data.demonstrations import Demonstration
 from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.labels import BOUNDARY, SOURCE, label_names
-from ddco_pyro.data.likeness import Likeness
+from ddco_pyro.data.likeness import Traits, traits
 from ddco_pyro.data.memory import INFERENCE, refuse_too_much
 from ddco_pyro.data.sources import Source, open_source
-from ddco_pyro.data.tasks import are_several, of_tasks, task_of, with_task
+from ddco_pyro.data.tasks import are_several, of_tasks, with_task
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.evaluation.agreement import EQUAL, of_equal_lengths
 from ddco_pyro.evaluation.agreement import agreement as scores_of
@@ -162,15 +162,14 @@ def segments(fit: Fit, source: Source, on_event: OnEvent = ignore, intervals: bo
     fit.refuse_flat()
     chosen, known = chosen_names(source, fit), label_names(source.attributes)
     labels: dict[str, dict[str, np.ndarray]] = {}
-    tasks: dict[str, str] = {}
+    compared: dict[str, Traits] = {}
     segmented: list[Segments] = []
-    likeness = Likeness()
-    for piece in fit.infer(_demonstrations(source, chosen, fit, labels, tasks, likeness)):
-        segmented += (replace(one, task=tasks[one.name]) for one in of_piece(fit, piece, labels, intervals))
+    for piece in fit.infer(_demonstrations(source, chosen, fit, labels, compared)):
+        segmented += (replace(one, task=compared[one.name].task) for one in of_piece(fit, piece, labels, intervals))
         on_event(DemonstrationsDone(len(segmented), len(chosen)))
     segmented, named = _labels_of_tasks(segmented, known)
     nats = {demo.name: demo.log_likelihood for demo in segmented}
-    unlike = fit.unlike(likeness, nats, source.frequency)
+    unlike = fit.unlike([*compared.values()], nats, source.frequency)
     return replace(of_run(fit, segmented, source.frequency, named), unlike=unlike)
 
 
@@ -229,17 +228,15 @@ def _demonstrations(
     names: Sequence[str],
     fit: Fit,
     labels: dict[str, dict[str, np.ndarray]],
-    tasks: dict[str, str],
-    likeness: Likeness,
+    compared: dict[str, Traits],
 ) -> Iterator[Demonstration]:
     """Each demonstration as the run's networks observe it.
 
-    Ground-truth labels go into ``labels``, tasks into ``tasks``, and what else is known of it into ``likeness``.
+    Ground-truth labels go into ``labels``, and what is compared with the fit into ``compared``.
     """
     before = 0  # steps whose labels are in memory
     for name in names:
         found = source.read(name)
-        tasks[name] = task_of(found.attributes)
         seen = {key: array for key, array in found.observations.items() if key in fit.hierarchy.encoder.shapes}
         inferred = INFERENCE * len(found) + FOUND * fit.hierarchy.depth * (before + len(found))
         whole = needed([Demonstration.stored(name, seen, found.actions)]) + inferred
@@ -248,7 +245,7 @@ def _demonstrations(
             key: values for key, values in found.labels.items() if values.dtype.kind in "iub" and values.ndim == 1
         }
         demo = _demonstration(found, fit)
-        likeness.add_all(demo, demo.observations)
+        compared[name] = traits(demo, demo.observations)
         before += len(demo)
         yield demo
 
