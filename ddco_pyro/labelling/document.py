@@ -1,7 +1,6 @@
 """What a person has said of the options of one level, with undo and redo without end, and the file that keeps it.
 
-A document knows no model. Every edit is a list of changes that undo each other, so a list of edits is the document.
-Each edit is on disk before it is acknowledged.
+A document knows no model, and the list of its edits is all of it. Each edit is on disk before it is acknowledged.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +33,9 @@ Change = tuple[Any, ...]
 """(:data:`PAINT` or :data:`CONFIRM`, demonstration, start, stop, option), ("cut", demonstration, step, whether),
 ("accept", demonstration, whether, steps of it that were expected wrong, steps of it that were), ("mark", demonstration,
 one of :data:`MARKS`, its value), ("names", names of the options 1 to k) or ("colour", name of an option, colour)."""
+
+Edit = list[tuple[dict[str, Any], str, Any]]
+"""Values to put into tables of a document: (table, key, value), where None takes the key away."""
 
 MARKS = ("exclude", "flag", "note")
 """What a person can say of a demonstration as a whole: leave it out, look at it again, and a text."""
@@ -60,49 +61,40 @@ class Document:
     names: tuple[str, ...]
     labels: dict[str, np.ndarray] = field(init=False)
     given: dict[str, np.ndarray] = field(init=False)
-    cuts: dict[str, set[int]] = field(init=False)
+    cuts: dict[str, frozenset[int]] = field(init=False)
     accepted: dict[str, tuple[float, int]] = field(init=False, default_factory=dict)
     marks: dict[str, dict[str, Any]] = field(init=False)
     colours: dict[str, str] = field(init=False, default_factory=dict)
-    done: list[tuple[Change, ...]] = field(init=False, default_factory=list)
-    undone: list[tuple[Change, ...]] = field(init=False, default_factory=list)
+    done: list[Edit] = field(init=False, default_factory=list)
+    undone: list[Edit] = field(init=False, default_factory=list)
 
     def __post_init__(self) -> None:
         self.labels = {name: np.full(length, FREE, np.int16) for name, length in self.lengths.items()}
         self.given = {name: np.ones(length, bool) for name, length in self.lengths.items()}
-        self.cuts = {name: set() for name in self.lengths}
+        self.cuts = dict.fromkeys(self.lengths, frozenset())
         self.marks = {name: {} for name in self.lengths}
 
-    def alters(self, kind: str, *of: Any) -> bool:
+    def alters(self, change: Change) -> bool:
         """Whether a change makes a difference."""
-        if kind == "names":
-            return self.names != tuple(of[0])
-        if kind == "colour":
-            return self.colours.get(of[0]) != of[1]
-        name, *what = of
-        if kind == "mark":
-            return bool(self.marks[name].get(what[0]) != what[1])
-        if kind in (PAINT, CONFIRM):
-            steps = slice(*what[:2])
-            return bool(
-                (self.labels[name][steps] != what[2]).any() or (self.given[name][steps] != (kind == PAINT)).any()
-            )
-        if kind == "cut":
-            return (what[0] in self.cuts[name]) != what[1]
-        return (name in self.accepted) != what[0]
+        return any(not np.array_equal(table.get(key), value) for table, key, value in self._puts(*change))
 
     def edit(self, changes: Sequence[Change]) -> None:
         """Make an edit; what was undone can no longer be done again."""
-        self.done.append(self._apply(changes))
+        self.done.append(_put(put for change in changes for put in self._puts(*change)))
         self.undone.clear()
 
     def undo(self) -> None:
         """Take the last edit back."""
-        self.undone.append(self._apply(self.done.pop()))
+        self.undone.append(_put(self.done.pop()))
 
     def redo(self) -> None:
         """Make the edit again that was taken back last."""
-        self.done.append(self._apply(self.undone.pop()))
+        self.done.append(_put(self.undone.pop()))
+
+    def touched(self, edit: Edit) -> list[str]:
+        """The demonstrations of an edit."""
+        tables = (self.labels, self.given, self.cuts, self.accepted, self.marks)
+        return list(dict.fromkeys(key for table, key, _ in edit if any(table is own for own in tables)))
 
     def said(self, name: str) -> np.ndarray:
         """Whether a person has named each step, [T]."""
@@ -112,47 +104,39 @@ class Document:
         """The labels of a demonstration, [T]; -1 where nothing is said."""
         return np.where(self.said(name), self.labels[name], FREE).astype(np.int16)
 
-    def _apply(self, changes: Sequence[Change]) -> tuple[Change, ...]:
-        """Make changes, and give those that take them back."""
-        return tuple(back for change in changes for back in self._change(*change))[::-1]
-
-    def _change(self, kind: str, *of: Any) -> list[Change]:
+    def _puts(self, kind: str, *of: Any) -> Edit:
+        """The values that a change puts in place of others, which are never changed themselves."""
         if kind == "names":
-            back: Change = ("names", self.names)
-            self.names = tuple(of[0])
-            return [back]
+            return [(vars(self), "names", tuple(of[0]))]
         if kind == "colour":
-            return [("colour", of[0], _put(self.colours, *of))]
-        name = of[0]
+            return [(self.colours, *of)]
+        name, *what = of
         if kind == "mark":
-            return [("mark", name, of[1], _put(self.marks[name], *of[1:]))]
+            mark, value = what
+            others = {key: own for key, own in self.marks[name].items() if key != mark}
+            return [(self.marks, name, others if value is None else {**others, mark: value})]
         if kind in (PAINT, CONFIRM):
-            start, stop, option = of[1:]
-            labels, given = self.labels[name], self.given[name]
-            differs = (np.diff(labels[start:stop]) != 0) | (np.diff(given[start:stop]) != 0)
-            edges = [start, *(np.flatnonzero(differs) + start + 1).tolist(), stop]
-            backs: list[Change] = [
-                (PAINT if given[one] else CONFIRM, name, one, after, int(labels[one])) for one, after in pairwise(edges)
-            ]
+            start, stop, option = what
+            labels, given = self.labels[name].copy(), self.given[name].copy()
             labels[start:stop], given[start:stop] = option, kind == PAINT
-            return backs
+            return [(self.labels, name, labels), (self.given, name, given)]
         if kind == "cut":
-            step, whether = of[1:]
-            before = step in self.cuts[name]
-            (self.cuts[name].add if whether else self.cuts[name].discard)(step)
-            return [("cut", name, step, before)]
-        known = self.accepted.pop(name, None)
-        if of[1]:
-            self.accepted[name] = (of[2], of[3])
-        return [("accept", name, known is not None, *(known or (0.0, 0)))]
+            step, whether = what
+            return [(self.cuts, name, self.cuts[name] | {step} if whether else self.cuts[name] - {step})]
+        whether, *wrong = what
+        return [(self.accepted, name, tuple(wrong) if whether else None)]
 
 
-def _put(table: dict[str, Any], key: str, value: Any) -> Any:
-    """Put a value under a key, nothing for None, and give what was there."""
-    before = table.pop(key, None)
-    if value is not None:
-        table[key] = value
-    return before
+def _put(edit: Iterable[tuple[dict[str, Any], str, Any]]) -> Edit:
+    """Put values where an edit says, and give the edit that takes that back."""
+    back: Edit = []
+    for table, key, value in edit:
+        back.append((table, key, table.get(key)))
+        if value is None:
+            table.pop(key, None)
+        else:
+            table[key] = value
+    return back[::-1]
 
 
 # --- the file of edits ------------------------------------------------------------------------------------------------
@@ -241,7 +225,8 @@ class Journal:
             fcntl.flock(self.file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             self.file.close()
-            raise BadInput(f"{path}: is open in {self._holder()}; end it, or give another --out") from None
+            holder = self._lock.read_text() if self._lock.exists() else "another process"
+            raise BadInput(f"{path}: is open in {holder}; end it, or give another --out") from None
         self.file.seek(0)
         try:
             whole, self.saved = replay(path, self.file.read(), document, labels)
@@ -251,7 +236,7 @@ class Journal:
         self.file.truncate(whole)  # a torn last line was never acknowledged
         if not whole:
             self._append({"labels": labels, "names": list(document.names)})
-        self._held_by(f"a process of {getpass.getuser()}, {os.getpid()}")
+        self.at()
 
     def edit(self, changes: Sequence[Change]) -> None:
         """Make an edit of the document, once it is on disk."""
@@ -275,9 +260,9 @@ class Journal:
             raise BadInput("nothing to redo")
         self._write(REDO)
 
-    def at(self, address: str) -> None:
-        """Say where the document can be edited, for processes that are refused."""
-        self._held_by(f"a process of {getpass.getuser()}, {os.getpid()}, at {address}")
+    def at(self, address: str = "") -> None:
+        """Say who has the file, and where it can be edited, for processes that are refused."""
+        self._lock.write_text(f"a process of {getpass.getuser()}, {os.getpid()}{address and f', at {address}'}")
 
     def close(self) -> None:
         """Leave the file to other processes."""
@@ -307,12 +292,3 @@ class Journal:
     @property
     def _lock(self) -> Path:
         return self.path.with_name(self.path.name + ".lock")
-
-    def _held_by(self, text: str) -> None:
-        self._lock.write_text(text)
-
-    def _holder(self) -> str:
-        try:
-            return self._lock.read_text()
-        except OSError:
-            return "another process"

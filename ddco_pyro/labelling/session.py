@@ -30,7 +30,7 @@ from ddco_pyro.errors import BadInput, reason
 from ddco_pyro.evaluation.inferred import Inferred, runs, within
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.labelling.background import Background
-from ddco_pyro.labelling.commands import Segment, View, whole
+from ddco_pyro.labelling.commands import View, whole
 from ddco_pyro.labelling.document import FREE, OPEN, SUFFIX, Change, Document, Journal, digest, version
 from ddco_pyro.labelling.following import Following
 from ddco_pyro.labelling.proposals import (
@@ -138,6 +138,7 @@ class Session:
         self.background = Background(self.lock, self._ended, "ddco_pyro.labelling.refitting", "sklearn.linear_model")
         self.shown, self.wrong, self.sure = dict[str, Shown](), dict[str, float](), 0.0
         self.untouched = dict[str, Shown]()
+        self.view = View(self.document, self.shown, self.untouched, lambda name: self.proposals.change_points(name))
         self.rows, self.recent = dict[str, list[list[Any]]](), dict[str, Inferred]()
         trajectory = fit.spec.report.trajectory
         self.following: Following = first.following if first else Following(path, self.demos, trajectory)
@@ -195,8 +196,7 @@ class Session:
         """
         with self.lock:
             before, count, edits = self._shown_now(), len(self.document.names), self.edits
-            labels = self._labels()
-            accepted = [*self.document.accepted]
+            labels, accepted = dict(self.document.labels), [*self.document.accepted]
         proposals = Proposals(fit, self.demos, [*fit.names].index(self.level) + 1, labels, count, before)
         held_out = proposals.held_out(labels, accepted if len(accepted) > 1 else ())
 
@@ -212,9 +212,6 @@ class Session:
 
         return take
 
-    def _labels(self) -> dict[str, np.ndarray]:
-        return {name: own.copy() for name, own in self.document.labels.items()}
-
     def _shown_now(self) -> dict[str, np.ndarray]:
         return {name: shown.options for name, shown in self.shown.items()}
 
@@ -223,7 +220,7 @@ class Session:
         for name in names:
             before, labels = self.shown.get(name), self.document.labels[name]
             shown = self.shown[name] = self.proposals.shown(name, labels)
-            self.rows[name] = [[own.start, own.option, own.source] for own in self.segments(name)]
+            self.rows[name] = [[own.start, own.option, own.source] for own in self.view.segments(name)]
             if (labels == FREE).all():
                 self.untouched[name] = shown
             if before is not None and name != edited and not np.array_equal(before.options, shown.options):
@@ -270,7 +267,7 @@ class Session:
             if not self.behind:
                 self.inferring = False
                 return False
-            edits, current, labels = self.edits, self.proposals, self._labels()
+            edits, current, labels = self.edits, self.proposals, dict(self.document.labels)
             recent = [*self.recent]
             names = sorted(self.demos.names, key=lambda name: (name not in recent, self.inferred[name]))
             ours = copy(current)
@@ -280,7 +277,7 @@ class Session:
             with self.lock:
                 if self.proposals is not current or not self.behind:
                     return True
-                still = [name for name in piece.names if np.array_equal(labels[name], self.document.labels[name])]
+                still = [name for name in piece.names if labels[name] is self.document.labels[name]]
                 current.learned = ours.learned
                 current.paths |= {name: found[name] for name in still}
                 self.inferred |= dict.fromkeys(still, edits)
@@ -317,11 +314,6 @@ class Session:
         ]
         self.uncertain = [{"demo": place, "step": step} for _, place, step in sorted(found)[:UNCERTAIN]]
         self.revision += 1
-
-    @property
-    def view(self) -> View:
-        """The labels, and what is shown."""
-        return View(self.document, self.shown, self.untouched, lambda name: self.proposals.change_points(name))
 
     # --- what is shown ------------------------------------------------------------------------------------------------
 
@@ -448,10 +440,6 @@ class Session:
     def _unchanged(self) -> bool:
         return self.path.exists() and self.version == self._version()
 
-    def segments(self, name: str) -> list[Segment]:
-        """The segments of a demonstration that are shown."""
-        return self.view.segments(name)
-
     def demo(self, index: int) -> dict[str, Any]:
         """One demonstration with its segments, boundaries, and what follows the cursor."""
         with self.lock:
@@ -463,7 +451,7 @@ class Session:
                 self.revision += not np.array_equal(before.options, self.shown[name].options)
             piece, number = self.recent[name], self.proposals.level
             row, lasts = piece.names.index(name), self.proposals.lasts
-            shown, drawn, own = self.shown[name], piece.drawn(row, lasts)[number - 1], self.segments(name)
+            shown, drawn, own = self.shown[name], piece.drawn(row, lasts)[number - 1], self.view.segments(name)
             boundaries = [
                 {
                     **_band(segment.start, drawn.get(segment.start, np.array([], int))),
@@ -480,7 +468,7 @@ class Session:
                     "name": own.level,
                     "names": list(own.document.names),
                     "colours": own.colours,
-                    "segments": [vars(segment) for segment in own.segments(name)],
+                    "segments": [vars(segment) for segment in own.view.segments(name)],
                 }
                 for own in self.beside
             ]
@@ -558,24 +546,22 @@ class Session:
                 return self.first.edit(command)
             if do in ("undo", "redo"):
                 getattr(self.journal, do)()
-                changes = list((document.undone if do == "undo" else document.done)[-1])
             else:
                 asked = self._taken(name, command) if do == "take" else self.view.changes(str(do), name, command)
-                changes = [one for one in asked if document.alters(*one)]
-                if changes:
-                    self.journal.edit(changes)
-            of = ("names", "colour")
-            touched = list(dict.fromkeys(change[1] for change in changes if change[0] not in of))
+                changes = list(filter(document.alters, asked))
+                if not changes:
+                    return {"revision": self.revision, "demo": index, "done": False}
+                self.journal.edit(changes)
+            touched = document.touched((document.undone if do == "undo" else document.done)[-1])
             if do in ("undo", "redo"):
                 index = self.demos.names.index(touched[0]) if touched else None
-            if changes:
-                self.edits += 1
-                if len(names) != len(document.names) and do != "new":
-                    self._renumber(names, shown, command.get("into", 0) if do == "drop" else 0)
-                self._follow(touched, None if index is None else self.demos.names[index])
-                if do == "accept":
-                    self.refit()
-            return {"revision": self.revision, "demo": index, "done": bool(changes)}
+            self.edits += 1
+            if len(names) != len(document.names) and do != "new":
+                self._renumber(names, shown, command.get("into", 0) if do == "drop" else 0)
+            self._follow(touched, None if index is None else self.demos.names[index])
+            if do == "accept":
+                self.refit()
+            return {"revision": self.revision, "demo": index, "done": True}
 
     def _taken(self, name: str | None, command: Mapping[str, Any]) -> list[Change]:
         """The changes by which another annotator's labels of a demonstration become one's own."""
@@ -594,12 +580,13 @@ class Session:
         now = self.document.names
         numbers = np.array([0, *(now.index(name) + 1 if name in now else 0 for name in names)])
         numbers[numbers == 0] = numbers[into]
-        before, labels = {name: numbers[own] for name, own in shown.items()}, self._labels()
+        before, labels = {name: numbers[own] for name, own in shown.items()}, self.document.labels
         self.proposals.renumber(labels, len(now), before)
         self.proposals.learned = self.proposals.learn(labels)
         if self.proposed is not self.proposals:
             self.proposed.renumber(labels, len(now), before)
-        self.untouched, self.recent = {}, {}
+        self.untouched.clear()
+        self.recent = {}
         self._show(self.demos.names)
 
     def _follow(self, touched: Sequence[str], edited: str | None) -> None:

@@ -141,12 +141,12 @@ def labels(session, demo):
 
 
 def starts(session, demo):
-    return [one.start for one in session.segments(session.demos.names[demo])]
+    return [one.start for one in session.view.segments(session.demos.names[demo])]
 
 
 def test_each_key_does_what_the_list_says(tab, session):
     demo = session.state()["order"][0]
-    own, first = labels(session, demo), starts(session, demo)
+    first = starts(session, demo)
     keys(tab, "ArrowRight", "ArrowRight", "Shift+ArrowRight", "ArrowLeft")
     assert at(tab) == 11
     keys(tab, "Home", "j")
@@ -158,19 +158,19 @@ def test_each_key_does_what_the_list_says(tab, session):
     assert starts(session, demo)[2] == first[1] + 2
     keys(tab, "3")
     said(tab, "option 3 in")
-    assert set(own[first[1] + 2 : first[2]]) == {3}
-    assert (own[: first[1] + 2] == FREE).all()
+    assert set(labels(session, demo)[first[1] + 2 : first[2]]) == {3}
+    assert (labels(session, demo)[: first[1] + 2] == FREE).all()
     keys(tab, "k", "m")
     said(tab, "Merged")
     keys(tab, "0")
     said(tab, "Left open")
-    assert (own == OPEN).any()
+    assert (labels(session, demo) == OPEN).any()
     keys(tab, "u", "Control+z")
     said(tab, "Undone")
     keys(tab, "Control+z", "u")
     playwright.expect(tab.get_by_role("button", name="Undo")).to_be_disabled()
     assert starts(session, demo) == first
-    assert (own == FREE).all()
+    assert (labels(session, demo) == FREE).all()
     keys(tab, "Shift+U", "Control+Shift+Z", "Shift+U")
     said(tab, "Done again")
     keys(tab, "Shift+Digit2")
