@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
 from shutil import get_terminal_size
@@ -20,58 +21,40 @@ BRACKET = "[" if NARROW else "\\["
 """A bracket in a help text, which tables would take for markup."""
 
 
-def out_stream(text: str | os.PathLike[str]) -> Path:
-    """The name of a file to write, which never replaces an HDF5 file.
+@dataclass(frozen=True)
+class Place:
+    """The parser of an option that names a place to write: of a kind of :class:`~ddco_pyro.data.files.Output`."""
 
-    :raises typer.BadParameter: the name is empty, or that of a folder.
-    """
-    name = os.fspath(text)
-    if name.endswith(os.sep) or (name and not Path(name).name):
-        raise typer.BadParameter(f"{name} names a folder; name a file")
-    return out_folder(name)
+    kind: Literal["folder", "file", "stream"]
+    __name__ = "path"
 
-
-def out_file(text: str | os.PathLike[str]) -> Path:
-    """The same for a file of any kind."""
-    return out_stream(text)
-
-
-def out_folder(text: str | os.PathLike[str]) -> Path:
-    """The name of a folder to write.
-
-    :raises typer.BadParameter: the name is empty.
-    """
-    if not os.fspath(text):
-        raise typer.BadParameter("the name is empty; name a place")
-    return Path(text)
+    def __call__(self, text: str | os.PathLike[str]) -> Path:
+        """:raises typer.BadParameter: the name is empty, or that of a folder where it has to be a file."""
+        name = os.fspath(text)
+        if not name:
+            raise typer.BadParameter("the name is empty; name a place")
+        if self.kind != "folder" and (name.endswith(os.sep) or not Path(name).name):
+            raise typer.BadParameter(f"{name} names a folder; name a file")
+        return Path(name)
 
 
-def written(parser: Any, text: str, **how: Any) -> Any:
-    """An option that names a place to write; ``parser`` is a key of :data:`KINDS`."""
-    return typer.Option(help=text, parser=parser, metavar="PATH", **how)
-
-
-KINDS: Mapping[Any, Literal["folder", "file", "stream"]] = {
-    out_stream: "stream", out_file: "file", out_folder: "folder"
-}  # fmt: skip
+def written(kind: Literal["folder", "file", "stream"], text: str, **how: Any) -> Any:
+    """An option that names a place to write."""
+    return typer.Option(help=text, parser=Place(kind), metavar="PATH", **how)
 
 
 def checking(command: Callable[..., None]) -> Callable[..., None]:
-    """A command that first refuses what cannot be written where its options say.
-
-    An output is a parameter of a parser in :data:`KINDS`; other paths are what the command reads.
-    """
+    """A command that first refuses what cannot be written where its options say; other paths are what it reads."""
 
     @wraps(command)
     def checked(**given: Any) -> None:
         outputs, read = list[Output](), list[Path]()
         for name, hint in get_type_hints(command, include_extras=True).items():
-            parsers = {getattr(about, "parser", None) for about in getattr(hint, "__metadata__", ())}
+            places = [getattr(about, "parser", None) for about in getattr(hint, "__metadata__", ())]
             values = given[name] if isinstance(given.get(name), list) else [given.get(name)]
             for path in (value for value in values if isinstance(value, Path)):
-                kinds = [kind for parser, kind in KINDS.items() if parser in parsers]
-                option = f"--{name.replace('_', '-')}"
-                outputs += [Output(option, path, kind) for kind in kinds]
+                kinds = [place.kind for place in places if isinstance(place, Place)]
+                outputs += [Output(f"--{name.replace('_', '-')}", path, kind) for kind in kinds]
                 read += [] if kinds else [path]
         check_outputs(outputs, read)
         command(**given)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from ddco_pyro.cli import AllowCode, Overrides, SpecPath, Wheres, out_file, out_stream, where_of, written
+from ddco_pyro.cli import AllowCode, Overrides, SpecPath, Wheres, where_of, written
 from ddco_pyro.data.files import write_text
 from ddco_pyro.data.formats import FORMATS
 from ddco_pyro.errors import BadInput, Failed, command
@@ -35,7 +35,7 @@ FormatOption = Annotated[
 
 def collect(
     spec: SpecPath,
-    out: Annotated[Path | None, written(out_file, "The HDF5 file; by default in the cache, by content.")] = None,
+    out: Annotated[Path | None, written("file", "The HDF5 file; by default in the cache, by content.")] = None,
     overrides: Overrides = [],  # noqa: B006
     allow_code: AllowCode = False,
 ) -> None:
@@ -100,7 +100,7 @@ def _compare_annotators(first: Path, second: Path, tolerance: int, as_json: bool
 
 def init(
     file: SourcePath,
-    out: Annotated[Path, written(out_stream, "Where to write the spec.")] = Path("spec.yaml"),
+    out: Annotated[Path, written("stream", "Where to write the spec.")] = Path("spec.yaml"),
     hold_out_by: Annotated[
         str | None,
         typer.Option(
@@ -184,7 +184,7 @@ def import_(
     sources: Annotated[
         list[Path], typer.Argument(metavar="FILE...", help="Demonstrations, as inspect takes them; several are pooled.")
     ],
-    out: Annotated[Path, written(out_file, "The HDF5 file to write.")],
+    out: Annotated[Path, written("file", "The HDF5 file to write.")],
     form: FormatOption = None,
     observations: Annotated[
         list[str], typer.Option("--observation", metavar="KEY", help="Import only this one; repeatable.")
@@ -269,7 +269,7 @@ def encode(
     encoder: Annotated[
         str, typer.Option(metavar="NAME", help="timm:NAME, such as timm:resnet18.a1_in1k, or your own module:function.")
     ],
-    out: Annotated[Path, written(out_file, "The HDF5 file to write.")],
+    out: Annotated[Path, written("file", "The HDF5 file to write.")],
     size: Annotated[
         int | None, typer.Option(min=1, help="Principal components to keep; 64 unless there are fewer features.")
     ] = None,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ddco_pyro.cli import AllowCode, Overrides, SpecPath, Wheres, out_folder, where_of, written
+from ddco_pyro.cli import AllowCode, Overrides, SpecPath, Wheres, where_of, written
 from ddco_pyro.errors import BadInput, Failed, command
 from ddco_pyro.events import Event, Log
 from ddco_pyro.jobs import Workers
@@ -61,7 +61,7 @@ def check(
 
 def fit(
     spec: SpecPath,
-    out: Annotated[Path | None, written(out_folder, "The run folder; by default runs/SPEC-TIME.")] = None,
+    out: Annotated[Path | None, written("folder", "The run folder; by default runs/SPEC-TIME.")] = None,
     overrides: Overrides = [],  # noqa: B006
     library: Annotated[
         Path | None,
@@ -181,7 +181,7 @@ def _held_out(fitted: Fit) -> dict[str, float]:
 
 def select(
     spec: SpecPath,
-    out: Annotated[Path | None, written(out_folder, "The folder; by default runs/SPEC-select-TIME.")] = None,
+    out: Annotated[Path | None, written("folder", "The folder; by default runs/SPEC-select-TIME.")] = None,
     overrides: Overrides = [],  # noqa: B006
     folds: Annotated[int | None, typer.Option(help="Number of folds; by default the spec's selection.folds.")] = None,
     jobs: Annotated[int, typer.Option(help="Processes that train folds; -1 is one for each core.")] = -1,

@@ -108,7 +108,7 @@ def _names(skills: str | None) -> list[str]:
 
 
 def _fitted(file: Path, count: int = 0, where: Mapping[str, Sequence[str]] = {}) -> Path:
-    """A run fitted to the file, without baselines and report; a finished one is used again.
+    """A run fitted to the file, without baselines, left-out demonstrations and report; a finished one is used again.
 
     Of a dataset of another library, the numbers are imported for it.
 
@@ -131,7 +131,9 @@ def _fitted(file: Path, count: int = 0, where: Mapping[str, Sequence[str]] = {})
             import_demonstrations(file, numbers)
         if not spec.exists():
             demos.write_spec(numbers, spec, where=where)
-        options = [f"hierarchy.levels.0.count={count}"] if count else []
+        changes = ["compare_with=[]", *([f"hierarchy.levels.0.count={count}"] if count else [])]
+        if load_spec(spec).demonstrations.leave_one_out:
+            changes += ["demonstrations.leave_one_out=false", "demonstrations.valid_fraction=0"]
         with console.Progress() as progress:
-            fit(load_spec(spec, ["compare_with=[]", *options]), None, run, progress)
+            fit(load_spec(spec, changes), None, run, progress)
     return run

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ddco_pyro.cli import BRACKET, KINDS, AllowCode, Overrides, RunPath, Wheres, out_folder, where_of, written
+from ddco_pyro.cli import BRACKET, AllowCode, Overrides, RunPath, Wheres, where_of, written
 from ddco_pyro.data.files import Output, check_outputs
 from ddco_pyro.errors import BadInput
-from ddco_pyro.segmenting.formats import FORMATS, check_format, write_format
+from ddco_pyro.segmenting.formats import FORMATS, Asked, check_format, write_format
 
 if TYPE_CHECKING:
     from ddco_pyro.exporting import Exported
@@ -37,7 +37,7 @@ def compare(
     runs: Annotated[
         list[Path], typer.Argument(metavar="RUN RUN...", help="Run folders; a run's baselines are runs, too.")
     ],
-    out: Annotated[Path | None, written(out_folder, "The folder to write to; by default runs/compare-TIME.")] = None,
+    out: Annotated[Path | None, written("folder", "The folder to write to; by default runs/compare-TIME.")] = None,
     allow_code: AllowCode = False,
 ) -> None:
     """Compare runs on the demonstrations that all of them held out, and on rollouts from the same initial states."""
@@ -113,8 +113,7 @@ def _check_run(run: Path, *names: str) -> None:
 def _to(option: str) -> Any:
     """The option of a format."""
     form = FORMATS[option]
-    (parser,) = (parser for parser, kind in KINDS.items() if kind == form.kind)
-    return written(parser, form.text, rich_help_panel="Formats")
+    return written(form.kind, form.text, rich_help_panel="Formats")
 
 
 def segment(
@@ -168,7 +167,6 @@ def segment(
     from ddco_pyro.cli import console
     from ddco_pyro.data.sources import open_source
     from ddco_pyro.fitting.fitted import load
-    from ddco_pyro.segmenting.formats.asked import Asked
     from ddco_pyro.segmenting.segments import segments
 
     fit = load(run, allow_code)
@@ -190,9 +188,9 @@ def segment(
 
 def export(
     run: RunPath,
-    out: Annotated[Path | None, written(out_folder, "The folder to write.")] = None,
+    out: Annotated[Path | None, written("folder", "The folder to write.")] = None,
     lerobot: Annotated[
-        Path | None, written(out_folder, "The folder of a LeRobot policy, for lerobot_policy_ddco.")
+        Path | None, written("folder", "The folder of a LeRobot policy, for lerobot_policy_ddco.")
     ] = None,
     best: Best = False,
     onnx: Annotated[

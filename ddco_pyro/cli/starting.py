@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from ddco_pyro.cli import demos, fits, out_folder, runs, written
+from ddco_pyro.cli import demos, fits, runs, written
 from ddco_pyro.errors import BadInput, Failed, command
 from ddco_pyro.spec import load_spec
 
@@ -23,7 +23,7 @@ Show = Annotated[
 
 def new(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="An HDF5 file of demonstrations.")],
-    out: Annotated[Path | None, written(out_folder, "The folder to write to; by default runs/FILE.")] = None,
+    out: Annotated[Path | None, written("folder", "The folder to write to; by default runs/FILE.")] = None,
     show: Show = True,
 ) -> None:
     """From a file to segments on a page: inspect, init, fit and segment.
@@ -67,7 +67,7 @@ TASK = "needle"
 
 
 def demo(
-    out: Annotated[Path, written(out_folder, "The folder to write to.")] = Path("runs/demo"), show: Show = True
+    out: Annotated[Path, written("folder", "The folder to write to.")] = Path("runs/demo"), show: Show = True
 ) -> None:
     """Fit a small example: the simulated needle task, or generated pick-and-place where it cannot be simulated.
 

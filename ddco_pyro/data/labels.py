@@ -20,6 +20,9 @@ EXCLUDE = "exclude"
 BOUNDARY, SOURCE = "_boundary", "_source"
 """Ends of the names of labels beside those of a level: 1 where a segment begins, and who says what a step is."""
 
+SOURCES = ("open", "proposed", "accepted", "given")
+"""Who says what a step is: none, as a person left it open; the model; a person who accepts that; a person."""
+
 
 def label_names(attributes: Mapping[str, object]) -> dict[str, list[str]]:
     """The names of labels 0, 1, ... in the attributes of a file (:data:`LABEL_NAMES`), by name of labels.

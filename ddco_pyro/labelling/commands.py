@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from ddco_pyro.data.labels import SOURCES
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.inferred import runs
 from ddco_pyro.labelling.document import CONFIRM, FREE, MARKS, OPEN, PAINT, Change, Document
 from ddco_pyro.labelling.proposals import Shown, first_wrong, labels_shown, sources_shown
-from ddco_pyro.segmenting.segments import SOURCES
 
 LONGEST = 80
 """Characters of a name."""
@@ -26,7 +26,7 @@ REACH = 2
 class Segment:
     """A segment that is shown: an option 0 to k from one step to before another.
 
-    :param source: who says so, one of :data:`~ddco_pyro.segmenting.SOURCES`; the option of an open segment is 0.
+    :param source: who says so, one of :data:`~ddco_pyro.data.labels.SOURCES`; the option of an open segment is 0.
     """
 
     start: int

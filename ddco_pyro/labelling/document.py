@@ -34,7 +34,7 @@ Change = tuple[Any, ...]
 ("accept", demonstration, whether, steps of it that were expected wrong, steps of it that were), ("mark", demonstration,
 one of :data:`MARKS`, its value), ("names", names of the options 1 to k) or ("colour", name of an option, colour)."""
 
-Edit = list[tuple[dict[str, Any], str, Any]]
+Edit = list[tuple[Any, str, Any]]
 """Values to put into tables of a document: (table, key, value), where None takes the key away."""
 
 MARKS = ("exclude", "flag", "note")
@@ -127,7 +127,7 @@ class Document:
         return [(self.accepted, name, tuple(wrong) if whether else None)]
 
 
-def _put(edit: Iterable[tuple[dict[str, Any], str, Any]]) -> Edit:
+def _put(edit: Iterable[tuple[Any, str, Any]]) -> Edit:
     """Put values where an edit says, and give the edit that takes that back."""
     back: Edit = []
     for table, key, value in edit:

@@ -15,7 +15,7 @@ from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.data.labels import BOUNDARY, EXCLUDE, SOURCE, UNKNOWN, label_names
+from ddco_pyro.data.labels import BOUNDARY, EXCLUDE, SOURCE, SOURCES, UNKNOWN, label_names
 from ddco_pyro.data.sources import Source
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.agreement import agreement
@@ -25,7 +25,7 @@ from ddco_pyro.labelling.document import CONFIRM, FREE, OPEN, PAINT, Change, Doc
 from ddco_pyro.model.recogniser import SCALES, Windows
 from ddco_pyro.model.tables import NEVER, Tables
 from ddco_pyro.names import choice_names, label_name, option_name
-from ddco_pyro.segmenting.segments import SOURCES, LevelLabels, Segmented, Segments, segments
+from ddco_pyro.segmenting.segments import LevelLabels, Segmented, Segments, segments
 from ddco_pyro.training.recognition import SHARES, learn
 
 RIDGE = 50.0
@@ -326,7 +326,7 @@ def _starts(document: Document, name: str, options: np.ndarray) -> np.ndarray:
 
 
 def sources_shown(document: Document, name: str) -> np.ndarray:
-    """The place in :data:`~ddco_pyro.segmenting.SOURCES` of who says what each step is, [T]."""
+    """The place in :data:`~ddco_pyro.data.labels.SOURCES` of who says what each step is, [T]."""
     labels = document.labels[name]
     said = np.where(document.given[name], SOURCES.index("given"), SOURCES.index("accepted"))
     return np.select([labels == OPEN, labels == FREE], [SOURCES.index("open"), SOURCES.index("proposed")], said)

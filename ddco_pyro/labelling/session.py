@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import heapq
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import ExitStack
 from copy import copy
 from dataclasses import replace
 from functools import cached_property, partial
-from itertools import repeat
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ from ddco_pyro.errors import BadInput, reason
 from ddco_pyro.evaluation.inferred import Inferred, runs, within
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.labelling.background import Background
-from ddco_pyro.labelling.commands import View, whole
+from ddco_pyro.labelling.commands import Segment, View, whole
 from ddco_pyro.labelling.document import FREE, OPEN, SUFFIX, Change, Document, Journal, digest, version
 from ddco_pyro.labelling.following import Following
 from ddco_pyro.labelling.proposals import (
@@ -47,8 +47,7 @@ from ddco_pyro.labelling.proposals import (
 from ddco_pyro.labelling.refitting import refit
 from ddco_pyro.labelling.team import Others, Team, agreement, taken
 from ddco_pyro.names import option_name
-from ddco_pyro.segmenting.formats import FORMATS, check_format, write_format
-from ddco_pyro.segmenting.formats.asked import Asked
+from ddco_pyro.segmenting.formats import FORMATS, Asked, check_format, write_format
 from ddco_pyro.segmenting.formats.labels import check_copy, check_labels, write_labels
 from ddco_pyro.segmenting.segments import Segmented
 
@@ -119,7 +118,9 @@ class Session:
             self.demos = replace(self.demos, demonstrations=tuple(with_task(demo, tasks) for demo in self.demos))
         self.form, self.in_place = format_of(path), out.exists() and out.samefile(path)
         self._check_out()
-        self.version, self.frequency = self._version(), self.demos.frequency
+        with open_source(path, where=where) as source:
+            self.files = source.files
+        self.version, self.frequency = version(self.files), self.demos.frequency
         known = [*skills, *fit.names[self.level][1 + len(skills) :]]
         self.document = Document({demo.name: len(demo) for demo in self.demos}, tuple(known))
         ours = digest(self.demos, self.level)
@@ -132,14 +133,15 @@ class Session:
             if said := said_in(there, self.level, self.document.names, self.form == "lerobot", first is None):
                 self.journal.edit(said)
                 self.journal.save()
-        self.lock, self.revision, self.edits, self.changed = threading.RLock(), 0, 0, set[int]()
+        self.lock = first.lock if first else threading.RLock()
+        self.revision, self.edits, self.changed = 0, 0, set[int]()
         self.behind, self.inferring, self.inferred = False, False, dict.fromkeys(self.demos.names, 0)
         self.refits, self.again = 0, False
         self.background = Background(self.lock, self._ended, "ddco_pyro.labelling.refitting", "sklearn.linear_model")
         self.shown, self.wrong, self.sure = dict[str, Shown](), dict[str, float](), 0.0
         self.untouched = dict[str, Shown]()
         self.view = View(self.document, self.shown, self.untouched, lambda name: self.proposals.change_points(name))
-        self.rows, self.recent = dict[str, list[list[Any]]](), dict[str, Inferred]()
+        self.segments, self.recent = dict[str, list[Segment]](), dict[str, Inferred]()
         trajectory = fit.spec.report.trajectory
         self.following: Following = first.following if first else Following(path, self.demos, trajectory)
         self.error = ""
@@ -161,12 +163,6 @@ class Session:
                 raise BadInput(
                     f"--out {self.out}: exists and is not a labelled copy of {self.path}; choose another --out"
                 )
-
-    def _version(self) -> list[tuple[int, int]]:
-        if self.form == "robomimic":
-            return version([self.path])
-        with open_source(self.path, where=self.where) as source:
-            return version(source.files)
 
     def begin(self) -> None:
         """Refit where something is labelled already; else have the process ready for it."""
@@ -220,7 +216,7 @@ class Session:
         for name in names:
             before, labels = self.shown.get(name), self.document.labels[name]
             shown = self.shown[name] = self.proposals.shown(name, labels)
-            self.rows[name] = [[own.start, own.option, own.source] for own in self.view.segments(name)]
+            self.segments[name] = self.view.segments(name)
             if (labels == FREE).all():
                 self.untouched[name] = shown
             if before is not None and name != edited and not np.array_equal(before.options, shown.options):
@@ -296,21 +292,18 @@ class Session:
         """Rank demonstrations by the worth of labelling them, and boundaries by how uncertain they are."""
         lengths, accepted = self.document.lengths, self.document.accepted
         wrong, steps = np.array([self.wrong[name] for name in lengths]), np.array([*lengths.values()])
-        edits = 1 + np.array([len(self.rows[name]) for name in lengths]) * wrong / steps
+        edits = 1 + np.array([len(self.segments[name]) for name in lengths]) * wrong / steps
         self.order, self.farthest = ranking(
             wrong, edits, self.proposals.whole, np.array([name in accepted for name in lengths])
         )
-        left_out, me = self.excluded, self.team.me
-        apart = {
-            place: (name in left_out, me not in (*self.shares[name], *([] if self.shares[name] else [me])))
-            for place, name in enumerate(self.demos.names)
-        }
-        self.order.sort(key=lambda place: (apart[place][0], self.demos.names[place] in accepted, apart[place][1]))
+        left_out, names = self.excluded, self.demos.names
+        others = {name for name, people in self.shares.items() if people and self.team.me not in people}
+        self.order.sort(key=lambda place: [names[place] in last for last in (left_out, accepted, others)])
         found = [
-            (float(self.shown[name].probability[max(start - 1, 0) : start + 1].min()), place, start)
+            (float(self.shown[name].probability[own.start - 1 : own.start + 1].min()), place, own.start)
             for place, name in enumerate(self.demos.names)
-            for start, _, _ in self.rows[name][1:]
-            if self.document.labels[name][start - 1 : start + 1].min() == FREE
+            for own in self.segments[name][1:]
+            if self.document.labels[name][own.start - 1 : own.start + 1].min() == FREE
         ]
         self.uncertain = [{"demo": place, "step": step} for _, place, step in sorted(found)[:UNCERTAIN]]
         self.revision += 1
@@ -335,7 +328,7 @@ class Session:
                     "marks": self.first.document.marks[name],
                     "people": [*self.shares[name]],
                     "done_by": [other for other, own in others.items() if name in own.accepted],
-                    "strip": self.rows[name],
+                    "strip": [[own.start, own.option, own.source] for own in self.segments[name]],
                 }
                 for place, name in enumerate(names)
             ]
@@ -438,7 +431,7 @@ class Session:
         return [f"unlike the demonstrations of the fit: {line}" for line in lines]
 
     def _unchanged(self) -> bool:
-        return self.path.exists() and self.version == self._version()
+        return self.path.exists() and self.version == version(self.files)
 
     def demo(self, index: int) -> dict[str, Any]:
         """One demonstration with its segments, boundaries, and what follows the cursor."""
@@ -451,7 +444,7 @@ class Session:
                 self.revision += not np.array_equal(before.options, self.shown[name].options)
             piece, number = self.recent[name], self.proposals.level
             row, lasts = piece.names.index(name), self.proposals.lasts
-            shown, drawn, own = self.shown[name], piece.drawn(row, lasts)[number - 1], self.view.segments(name)
+            shown, drawn, own = self.shown[name], piece.drawn(row, lasts)[number - 1], self.segments[name]
             boundaries = [
                 {
                     **_band(segment.start, drawn.get(segment.start, np.array([], int))),
@@ -468,7 +461,7 @@ class Session:
                     "name": own.level,
                     "names": list(own.document.names),
                     "colours": own.colours,
-                    "segments": [vars(segment) for segment in own.view.segments(name)],
+                    "segments": [vars(segment) for segment in own.segments[name]],
                 }
                 for own in self.beside
             ]
@@ -516,20 +509,17 @@ class Session:
         """The segments of other demonstrations that are most like the one at a step."""
         with self.lock:
             name = self._name(index)
-            here, rows, proposals = self.view.at(name, step), dict(self.rows), self.proposals
-        found, mine = list[tuple[float, int, int]](), np.zeros(0)
-        starts = {other: [start for start, _, _ in own] for other, own in rows.items()}
-        mine = proposals.centres(name, starts[name])[starts[name].index(here.start)]
+            here, segments, proposals = self.view.at(name, step), dict(self.segments), self.proposals
+        centres = {other: proposals.centres(other, [one.start for one in own]) for other, own in segments.items()}
+        mine, found = centres[name][segments[name].index(here)], []
         for place, other in enumerate(self.demos.names):
             if other != name:
-                away = np.linalg.norm(proposals.centres(other, starts[other]) - mine, axis=1)
-                found += zip(away.tolist(), repeat(place), range(len(away)))
-        nearest = []
-        for _, place, own in sorted(found)[:NEAREST]:
-            (start, option, _), ends = rows[self.demos.names[place]][own], starts[self.demos.names[place]]
-            stop = [*ends, self.document.lengths[self.demos.names[place]]][own + 1]
-            nearest.append({"index": place, "start": start, "stop": stop, "option": option})
-        return nearest
+                away = np.linalg.norm(centres[other] - mine, axis=1).tolist()
+                found += [(distance, place, own) for distance, own in zip(away, segments[other], strict=True)]
+        return [
+            {"index": place, "start": own.start, "stop": own.stop, "option": own.option}
+            for _, place, own in heapq.nsmallest(NEAREST, found, key=itemgetter(0))
+        ]
 
     # --- what a person says -------------------------------------------------------------------------------------------
 
@@ -632,8 +622,15 @@ class Session:
             if not self._is_labelled():
                 raise BadInput("refit: nothing is labelled yet")
             self.again = self.background.running
-            if not self.again:
-                self.background.begin(self._refitting(), self._refitted)
+            if self.again:
+                return
+            names = [name for name in self.demos.names if name not in self.excluded]
+            labels = {name: self.document.in_file(name) for name in names}
+            shown, waiting = self._shown_now(), self.proposals.waiting(labels)
+            kept = {name: np.where(np.isin(shown[name], waiting), shown[name], FREE) for name in names}
+            trained, count = replace(self.fit, given=None), len(self.document.names)
+            call = partial(refit, trained, self.level, count, self._observed.select(names), labels, kept)
+            self.background.begin(call, self._refitted)
 
     def _refitted(self, fit: Fit) -> Callable[[], None]:
         take = self._prepare(fit)
@@ -651,17 +648,6 @@ class Session:
 
     def _is_labelled(self) -> bool:
         return any(bool(self.document.said(name).any()) for name in self.demos.names)
-
-    def _refitting(self) -> Callable[..., Fit]:
-        """The call that fits to what is said so far."""
-        with self.lock:
-            names = [name for name in self.demos.names if name not in self.excluded]
-            labels = {name: self.document.in_file(name) for name in names}
-            waiting = self.proposals.waiting(labels)
-            shown = self._shown_now()
-            kept = {name: np.where(np.isin(shown[name], waiting), shown[name], FREE) for name in names}
-            trained, count = replace(self.fit, given=None), len(self.document.names)
-        return partial(refit, trained, self.level, count, self._observed.select(names), labels, kept)
 
     @cached_property
     def _observed(self) -> Demonstrations:
@@ -688,9 +674,7 @@ class Session:
         :raises BadInput: the demonstrations changed underneath.
         """
         every = (self, *self.beside)
-        with ExitStack() as held:
-            for own in every:
-                held.enter_context(own.lock)
+        with self.lock:
             if not self._unchanged():
                 raise BadInput(self.warnings()[0])
             documents = {own.level: own.document for own in every}
@@ -702,7 +686,7 @@ class Session:
                     self._write("--lerobot", self.out, source, labels, self.first.level)
             if self.in_place:
                 for own in every:
-                    own.version = self._version()
+                    own.version = version(self.files)
             for own in every:
                 own.journal.save()
             steps = sum(int(self.document.said(name).sum()) for name in self.demos.names)

@@ -27,9 +27,6 @@ from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Scores
 
-SOURCES = ("open", "proposed", "accepted", "given")
-"""Who says what a step is: none, as a person left it open; the model; a person who accepts that; a person."""
-
 
 @dataclass(frozen=True)
 class LevelLabels:
@@ -65,7 +62,8 @@ class Segments:
     :param log_likelihood: log p(ξ) per step, nats.
     :param held_out: whether the run's fit held the demonstration out.
     :param labels: ground-truth labels in the file, name to [T].
-    :param sources: where a person labelled, ``<level>_source`` to the place in :data:`SOURCES` [T].
+    :param sources: where a person labelled: ``<level>_source`` to the place in
+        :data:`~ddco_pyro.data.labels.SOURCES` [T].
     :param task: the demonstration's own; empty where none is known.
     """
 

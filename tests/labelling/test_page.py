@@ -141,7 +141,7 @@ def labels(session, demo):
 
 
 def starts(session, demo):
-    return [one.start for one in session.view.segments(session.demos.names[demo])]
+    return [one.start for one in session.segments[session.demos.names[demo]]]
 
 
 def test_each_key_does_what_the_list_says(tab, session):

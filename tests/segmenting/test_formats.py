@@ -24,8 +24,7 @@ from ddco_pyro.data.planted import pick_and_place
 from ddco_pyro.data.sources import open_source
 from ddco_pyro.errors import BadInput
 from ddco_pyro.exporting.runner import Runner
-from ddco_pyro.segmenting.formats import check_format, write_format
-from ddco_pyro.segmenting.formats.asked import Asked
+from ddco_pyro.segmenting.formats import Asked, check_format, write_format
 from ddco_pyro.segmenting.segments import LevelLabels, Segmented, Segments
 
 HERE = Path(__file__).parents[1]

@@ -22,7 +22,7 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.importing import import_demonstrations
 from ddco_pyro.data.sources import open_source
 from ddco_pyro.fitting.fit import fit
-from ddco_pyro.segmenting.formats.asked import Asked
+from ddco_pyro.segmenting.formats import Asked
 from ddco_pyro.segmenting.formats.lerobot import write_subtasks
 from ddco_pyro.segmenting.segments import LevelLabels, Segmented, Segments, recorded, segments
 from ddco_pyro.spec import parse_spec

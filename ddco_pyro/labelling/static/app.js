@@ -84,9 +84,9 @@ function status({ refit, warnings, dirty }) {
 // Every answer says which demonstration it shows, and of which revision. What is no longer wanted, or older than what is shown, is dropped.
 async function show(index, step, keep = true) {
   wanted = { index, step: step ?? (index === wanted?.index ? wanted.step : undefined), keep };
-  const found = await ask(`view/${index}`);
-  if (found.demo.index !== wanted.index || found.state.levels[level] !== found.state.level || found.state.revision < (state?.revision ?? 0)) return;
-  if (state && state.refit.done < found.state.refit.done) say(`Refit ${found.state.refit.done} is done${change(state.summary, found.state.summary)}`);
+  const found = await ask(`view/${index}`), known = state?.level === found.state.level ? state : null;
+  if (found.demo.index !== wanted.index || found.state.levels[level] !== found.state.level || found.state.revision < (known?.revision ?? 0)) return;
+  if (known && known.refit.done < found.state.refit.done) say(`Refit ${found.state.refit.done} is done${change(known.summary, found.state.summary)}`);
   [state, demo, silent, cursor] = [found.state, found.demo, false, wanted.step ?? cursor];
   wanted.step = undefined;
   render(wanted.keep && list.active === index);
@@ -99,13 +99,13 @@ async function begin() {
 }
 const open = (index, step = 0, keep = true) => tried(async () => { stop(); await show(index, step, keep); });
 
-const enter = number => tried(async () => {  // another level of the same demonstration
+const enter = number => waiting = waiting.then(() => tried(async () => {  // another level of the same demonstration
   if (number === level) return;
   stop();
-  [level, state] = [number, null];
+  level = number;
   await show(demo.index, cursor);
   say(`Level ${state.level}`);
-});
+}));
 const compare = ({ annotator, agreement }, x, y) => popup(x, y, annotator, [[`Take the labels of ${annotator}${agreement ? `: ${agrees(agreement)}` : ""}`, () => edit({ do: "take", demo: demo.index, annotator }, `Labels of ${annotator} taken`)]]);
 
 // One edit after the other: each is in the journal when the server answers.

@@ -12,10 +12,10 @@ import numpy as np
 
 from ddco_pyro.data.arrays import NUMBERS, blocks, is_picture
 from ddco_pyro.data.files import whole_folder, write_text
-from ddco_pyro.data.labels import SOURCE, UNKNOWN
+from ddco_pyro.data.labels import SOURCE, SOURCES, UNKNOWN
 from ddco_pyro.drawing.colours import option_colour
-from ddco_pyro.segmenting.formats.asked import Asked
-from ddco_pyro.segmenting.segments import SOURCES, Segmented, Segments
+from ddco_pyro.segmenting.formats import Asked
+from ddco_pyro.segmenting.segments import Segmented, Segments
 
 SCHEMA = "http://www.mpi.nl/tools/elan/EAFv3.0.xsd"
 UNDETERMINED = "und"

@@ -19,7 +19,7 @@ from ddco_pyro.data.hdf5 import attributes_of, opened, written
 from ddco_pyro.data.labels import BOUNDARY, EXCLUDE, LABEL_NAMES, SOURCE, label_names
 from ddco_pyro.errors import BadInput
 from ddco_pyro.names import choice_names
-from ddco_pyro.segmenting.formats.asked import Asked
+from ddco_pyro.segmenting.formats import Asked
 from ddco_pyro.segmenting.segments import Segmented, Segments, chosen_names
 
 OURS = "segmented_by"

@@ -16,12 +16,12 @@ import pyarrow
 from pyarrow import parquet
 
 from ddco_pyro.data.files import whole_folder, write_text
-from ddco_pyro.data.labels import SOURCE, UNKNOWN
+from ddco_pyro.data.labels import SOURCE, SOURCES, UNKNOWN
 from ddco_pyro.data.sources.lerobot import ANNOTATIONS, SUBTASK, WHO, LeRobot
 from ddco_pyro.data.sources.metadata import inside
 from ddco_pyro.errors import BadInput
-from ddco_pyro.segmenting.formats.asked import Asked, Run
-from ddco_pyro.segmenting.segments import SOURCES, Segmented, Segments
+from ddco_pyro.segmenting.formats import Asked, Run
+from ddco_pyro.segmenting.segments import Segmented, Segments
 
 PERSISTENT, EVENTS = "language_persistent", "language_events"
 ATOM = ("role", "content", "style", "timestamp", "tool_calls")

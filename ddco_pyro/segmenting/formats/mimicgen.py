@@ -13,7 +13,7 @@ import numpy as np
 from ddco_pyro.data.files import whole_file
 from ddco_pyro.data.hdf5 import opened, written
 from ddco_pyro.errors import BadInput
-from ddco_pyro.segmenting.formats.asked import Asked, Run
+from ddco_pyro.segmenting.formats import Asked, Run
 from ddco_pyro.segmenting.segments import Segmented, chosen_names
 
 

@@ -8,12 +8,12 @@ import numpy as np
 import pandas
 
 from ddco_pyro.data.files import whole_file
-from ddco_pyro.data.labels import BOUNDARY, UNKNOWN
+from ddco_pyro.data.labels import BOUNDARY, SOURCES, UNKNOWN
 from ddco_pyro.drawing.shown import stored_pictures
 from ddco_pyro.names import option_name
-from ddco_pyro.segmenting.formats.asked import Asked
+from ddco_pyro.segmenting.formats import Asked
 from ddco_pyro.segmenting.page import timelines, write_page
-from ddco_pyro.segmenting.segments import SOURCES, Segmented, recorded
+from ddco_pyro.segmenting.segments import Segmented, recorded
 
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
 """First characters of a text that a spreadsheet may execute as a formula."""
