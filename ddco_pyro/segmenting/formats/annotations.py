@@ -8,6 +8,7 @@ from datetime import UTC, datetime
 from typing import Any
 from xml.etree import ElementTree
 
+import jinja2
 import numpy as np
 
 from ddco_pyro.data.arrays import NUMBERS, blocks, is_picture
@@ -17,9 +18,6 @@ from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.segmenting.formats import Asked
 from ddco_pyro.segmenting.segments import Segmented, Segments
 
-SCHEMA = "http://www.mpi.nl/tools/elan/EAFv3.0.xsd"
-UNDETERMINED = "und"
-"""ELAN's name of no language in particular."""
 STEP = 1000.0
 """Milliseconds of a step where the steps per second are not known."""
 
@@ -32,60 +30,33 @@ def write_elan(asked: Asked, segmented: Segmented) -> str:
     A controlled vocabulary has the names of all choices of a level.
     """
     milliseconds = 1000 / segmented.frequency if segmented.frequency else STEP
+    loader = jinja2.PackageLoader("ddco_pyro.segmenting.formats", ".")
+    environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    template = environment.get_template("elan.eaf.j2")
+    when = datetime.now(UTC).isoformat(timespec="seconds")
+    names = {level: asked.names_of(level) for level in segmented.counts} | {asked.level + SOURCE: SOURCES}
     with whole_folder(asked.out) as folder:
         for demo in segmented.segments:
-            write_text(folder / f"{demo.name}.eaf", _document(asked, demo, milliseconds))
+            tiers = _tiers(asked, demo)
+            steps = {0, len(demo)}.union(*(run[1:] for tier in tiers.values() for run in tier))
+            times = {step: round(step * milliseconds) for step in sorted(steps)}
+            text = template.render(when=when, times=times, tiers=tiers, vocabularies=names)
+            write_text(folder / f"{demo.name}.eaf", text + "\n")
     unit = "" if segmented.frequency else "; a step is one second, since the demonstrations have no frequency"
     return f"{asked.out}: {len(segmented)} files{unit}"
 
 
-def _document(asked: Asked, demo: Segments, milliseconds: float) -> str:
-    when = datetime.now(UTC).isoformat(timespec="seconds")
-    root = ElementTree.Element(
-        "ANNOTATION_DOCUMENT",
-        {"AUTHOR": "ddco-pyro", "DATE": when, "FORMAT": "3.0", "VERSION": "3.0",
-         "xmlns:xsi": "http://www.w3.org/2001/XMLSchema-instance", "xsi:noNamespaceSchemaLocation": SCHEMA},
-    )  # fmt: skip
-    ElementTree.SubElement(root, "HEADER", MEDIA_FILE="", TIME_UNITS="milliseconds")
-    times = ElementTree.SubElement(root, "TIME_ORDER")
-    levels = dict(reversed(demo.levels.items()))
+def _tiers(asked: Asked, demo: Segments) -> dict[str, list[tuple[str, int, int]]]:
+    """The segments of each level, the highest first, and who says each segment where a person labelled."""
     tiers = {
-        name: [
-            (asked.names_of(name)[option], start, stop)
-            for option, start, stop in level.runs(anew=False)
-            if option != UNKNOWN
-        ]
-        for name, level in levels.items()
+        name: [(names[run[0]], run[1], run[2]) for run in level.runs(anew=False) if run[0] != UNKNOWN]
+        for name, level in reversed(demo.levels.items())
+        for names in [asked.names_of(name)]
     }
-    ends = [(start, stop) for _, start, stop in asked.runs(demo)]
-    if said := [(word, *each) for each in ends if (word := asked.said_by(demo, *each)) is not None]:
-        tiers[asked.level + SOURCE] = said
-    edges = {0, len(demo)}.union(*(run[1:] for runs in tiers.values() for run in runs))
-    for step in sorted(edges):
-        value = str(round(step * milliseconds))
-        ElementTree.SubElement(times, "TIME_SLOT", TIME_SLOT_ID=f"ts{step}", TIME_VALUE=value)
-    number = 0
-    for name, segments in tiers.items():
-        tier = ElementTree.SubElement(root, "TIER", TIER_ID=name, LINGUISTIC_TYPE_REF=name)
-        for word, start, stop in segments:
-            number += 1
-            annotation = ElementTree.SubElement(ElementTree.SubElement(tier, "ANNOTATION"), "ALIGNABLE_ANNOTATION")
-            annotation.attrib |= {
-                "ANNOTATION_ID": f"a{number}", "TIME_SLOT_REF1": f"ts{start}", "TIME_SLOT_REF2": f"ts{stop}"
-            }  # fmt: skip
-            ElementTree.SubElement(annotation, "ANNOTATION_VALUE").text = word
-    for name in tiers:
-        kind = {"LINGUISTIC_TYPE_ID": name, "TIME_ALIGNABLE": "true", "CONTROLLED_VOCABULARY_REF": name}
-        ElementTree.SubElement(root, "LINGUISTIC_TYPE", kind)
-    ElementTree.SubElement(root, "LANGUAGE", LANG_ID=UNDETERMINED)
-    for name in tiers:
-        vocabulary = ElementTree.SubElement(root, "CONTROLLED_VOCABULARY", CV_ID=name)
-        ElementTree.SubElement(vocabulary, "DESCRIPTION", LANG_REF=UNDETERMINED)
-        for option, word in enumerate(asked.names_of(name) if name in levels else SOURCES):
-            entry = ElementTree.SubElement(vocabulary, "CV_ENTRY_ML", CVE_ID=f"{name}_{option}")
-            ElementTree.SubElement(entry, "CVE_VALUE", LANG_REF=UNDETERMINED).text = word
-    ElementTree.indent(root)
-    return '<?xml version="1.0" encoding="UTF-8"?>\n' + ElementTree.tostring(root, "unicode") + "\n"
+    if asked.level + SOURCE in demo.sources:
+        runs = asked.runs(demo)
+        tiers[asked.level + SOURCE] = [(str(asked.said_by(demo, start, stop)), start, stop) for _, start, stop in runs]
+    return tiers
 
 
 # --- Label Studio -----------------------------------------------------------------------------------------------------
