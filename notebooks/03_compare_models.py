@@ -27,8 +27,7 @@ warnings.filterwarnings("ignore", message="IProgress")  # progress needs no widg
 
 from ddco_pyro import load_spec
 from ddco_pyro.cli.console import Progress
-from ddco_pyro.comparison import compare
-from ddco_pyro.comparison.page import write
+from ddco_pyro.comparison import compare, write
 from ddco_pyro.fitting.fit import fit
 
 RUNS = Path(os.environ.get("NOTEBOOK_RUNS", "../runs/notebooks"))

@@ -41,17 +41,16 @@ def compare(
     allow_code: AllowCode = False,
 ) -> None:
     """Compare runs on the demonstrations that all of them held out, and on rollouts from the same initial states."""
+    from ddco_pyro import comparison
     from ddco_pyro.cli import console
-    from ddco_pyro.comparison import compare as compare_runs
-    from ddco_pyro.comparison import page
 
     folder = out or Path("runs") / time.strftime("compare-%Y%m%d-%H%M%S")
-    compared = compare_runs(runs, allow_code)
-    for table in (page.run_table(compared), page.agreement_table(compared), page.rollout_table(compared)):
-        if table is not None:
-            console.show(table)
-    print(page.verdict(compared))
-    print(f"comparison: {page.write(compared, folder)}")
+    compared = comparison.compare(runs, allow_code)
+    for table in (comparison.run_table, comparison.agreement_table, comparison.rollout_table):
+        if (found := table(compared)) is not None:
+            console.show(found)
+    print(comparison.verdict(compared))
+    print(f"comparison: {comparison.write(compared, folder)}")
 
 
 def rollout(

@@ -17,9 +17,8 @@ from made_metrics import made_metrics
 from scipy import stats
 from sklearn.metrics import normalized_mutual_info_score
 
-from ddco_pyro import load
-from ddco_pyro.comparison import CompareError, Comparison, Row, compare, page
-from ddco_pyro.comparison.page import write
+from ddco_pyro import comparison, load
+from ddco_pyro.comparison import CompareError, Comparison, Row, compare, write
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.rollouts import roll_out
@@ -104,7 +103,7 @@ def test_the_verdict_says_whether_a_difference_is_outside_its_error(each, said):
     apart, error = sum(each), 2 * float(np.std(each, ddof=1))
     rows = [row("a", 0, each), replace(row("b", 1, [0.0] * 4, in_training=0.1), difference=apart, dse=error)]
     found = Comparison(rows, tuple("klmn"), (1, 1, 1, 1), [], [], "a")
-    assert page.verdict(found) == (
+    assert comparison.verdict(found) == (
         f"a explains held-out demonstrations {said} (± is one standard error over 4 held-out demonstrations, for one "
         "fit of each model)."
     )
@@ -120,7 +119,7 @@ def test_a_run_that_fell_apart_comes_first_in_the_verdict():
     runs = [("a", "flat", [4.0] * 4, 4.1), ("b", "ddco", [-9.0, -8.0] * 2, 6.0), ("c", "mixture", [-20.0] * 4, 5.0)]
     rows = [row(name, rank, each, model, own) for rank, (name, model, each, own) in enumerate(runs)]
     known = Marginal(train=0.0, valid=-1.0, controls=2)
-    said = page.verdict(Comparison(rows, tuple("klmn"), (1, 1, 1, 1), [], [], "b", known))
+    said = comparison.verdict(Comparison(rows, tuple("klmn"), (1, 1, 1, 1), [], [], "b", known))
     assert said.startswith("b fell apart on held-out demonstrations: −8.50 nats per step there, 6.00 in training.")
     assert "c fell apart" in said
     assert "b is below a by 12.50 ± 0.29 nats per step" in said
@@ -130,7 +129,7 @@ def test_a_run_that_fell_apart_comes_first_in_the_verdict():
 def test_one_run_of_each_model_tests_options_against_the_mixture():
     runs = [("a", "ddco", [4.0, 4.1, 4.2, 4.1]), ("b", "mixture", [3.0, 3.1, 3.0, 3.1])]
     rows = [row(name, rank, each, model, 3.5) for rank, (name, model, each) in enumerate(runs)]
-    said = page.verdict(Comparison(rows, tuple("klmn"), (1, 1, 1, 1), [], [], "a"))
+    said = comparison.verdict(Comparison(rows, tuple("klmn"), (1, 1, 1, 1), [], [], "a"))
     assert "options that last predict held-out controls better than the mixture does: +1.05 ± " in said
     assert "Success was not measured." in said
 
@@ -294,17 +293,17 @@ def test_the_files_say_the_same(found, tmp_path):
     assert data["trajectories"] == list(found.trajectories)
     text = (folder / "compare.md").read_text()
     table = [re.split(r" *\| *", line.strip("| ")) for line in text.splitlines() if line.startswith("|")]
-    runs = page.run_table(found)
+    runs = comparison.run_table(found)
     assert table[0] == runs.head
     assert table[2 : 2 + len(found.rows)] == runs.rows
     html = path.read_text()
-    rest = [page.agreement_table(found), page.demonstration_table(found)]
+    rest = [comparison.agreement_table(found), comparison.demonstration_table(found)]
     assert all(f">{cell}<" in html for one in (runs, *rest) for row in (one.head, *one.rows) for cell in row)
     assert not re.search(r'(src|href)="(?!data:)', html)  # nothing is loaded from elsewhere
     assert data["demonstrations"] == found.worst_first
-    assert text.startswith(page.verdict(found))
+    assert text.startswith(comparison.verdict(found))
     assert data["agreement"] == found.agreement
-    assert f'<p class="verdict">{page.verdict(found)}</p>' in html
+    assert f'<p class="verdict">{comparison.verdict(found)}</p>' in html
     drawn = "".join(ElementTree.parse(folder / "compare.svg").getroot().itertext())
     assert all(row.name in drawn for row in found.rows)
 
@@ -312,5 +311,5 @@ def test_the_files_say_the_same(found, tmp_path):
 def test_the_command_ends_with_the_verdict(folders, found, tmp_path):
     ended = call("compare", *folders, "--out", tmp_path / "x")
     *_, verdict, place = ended.out.splitlines()
-    assert verdict == page.verdict(found)
+    assert verdict == comparison.verdict(found)
     assert place == f"comparison: {tmp_path / 'x' / 'compare.html'}"

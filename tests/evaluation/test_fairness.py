@@ -13,8 +13,7 @@ from command_line import call
 from selecting import Told, spec_at
 
 import ddco_pyro
-from ddco_pyro.comparison import compare
-from ddco_pyro.comparison.page import write
+from ddco_pyro.comparison import compare, write
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.names import method
 from ddco_pyro.selection import Workers, select
