@@ -8,7 +8,7 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import chain, islice, zip_longest
 from typing import Any
 
@@ -33,94 +33,51 @@ PICTURE_HEIGHT = 96
 
 
 @dataclass(frozen=True)
-class Lane:
-    """A row of every demonstration: a level of options, or labels.
-
-    :param names: of each choice of a level, control first, or of each label.
-    :param colours: of each choice, or of each label that has one.
-    """
-
-    name: str
-    names: Sequence[str] | Mapping[int, str]
-    colours: Sequence[str] | Mapping[int, str] = ()
-
-
-@dataclass(frozen=True)
-class Runs:
-    """The segments of one demonstration in one lane.
-
-    :param starts: first steps.
-    :param values: the option or the label of each segment.
-    :param intervals: of each first step, [segments, 2]; None for labels.
-    :param probability: of the option at each step [T]; None for labels.
-    """
-
-    starts: Sequence[int]
-    values: Sequence[int]
-    intervals: np.ndarray | None = None
-    probability: np.ndarray | None = None
-
-    def data(self) -> dict[str, Any]:
-        """The segments for JSON; the interval of a first step is left out where its ends are that step."""
-        found: dict[str, Any] = {"s": list(self.starts), "v": list(self.values)}
-        if self.intervals is not None:
-            pairs = zip(self.starts, self.intervals.tolist(), strict=True)
-            found["i"] = {place: ends for place, (start, ends) in enumerate(pairs) if ends != [start, start]}
-        if self.probability is not None:
-            found["p"] = text(np.rint(255 * self.probability))
-        return found
-
-
-@dataclass(frozen=True)
-class Track:
-    """One demonstration.
-
-    :param anchor: the ``id`` by which links lead here.
-    :param facts: a line on the demonstration, such as its length.
-    :param runs: of each lane; None where the demonstration lacks it.
-    :param follows: what follows the cursor, of :func:`following`.
-    """
-
-    name: str
-    anchor: str
-    facts: str
-    held_out: bool
-    steps: int
-    runs: Sequence[Runs | None]
-    follows: Mapping[str, Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
 class Timelines:
     """Demonstrations under one axis of time.
 
+    :param lanes: the rows of every demonstration, a level of options or labels each: its ``name``, and the ``names``
+        and ``colours`` of its values, by value.
+    :param tracks: of each demonstration ``name``, ``steps``, ``held_out``, a line of ``facts``, the ``anchor`` by which
+        links lead to it, its ``lanes`` (:func:`coded`; None of one that it lacks), and what follows the cursor
+        (:func:`following`).
     :param frequency: steps per second (Hz); None where unknown.
     :param rows: demonstrations that are seen at once, about; None for as many as a window has room for.
     """
 
-    lanes: Sequence[Lane]
-    tracks: Sequence[Track]
+    lanes: Sequence[Mapping[str, Any]]
+    tracks: Sequence[Mapping[str, Any]]
     frequency: float | None = None
     rows: int | None = None
 
     @property
     def json(self) -> str:
         """The data of the script; without ``<``, so that no text ends the element that holds them."""
-        data = {
-            "frequency": self.frequency,
-            "longest": max(track.steps for track in self.tracks),
-            "lanes": [{"name": lane.name, "names": lane.names, "colours": lane.colours} for lane in self.lanes],
-            "tracks": [
-                {
-                    "name": track.name,
-                    "steps": track.steps,
-                    "lanes": [None if runs is None else runs.data() for runs in track.runs],
-                    **track.follows,
-                }
-                for track in self.tracks
-            ],
-        }
+        longest = max(track["steps"] for track in self.tracks)
+        data = {"frequency": self.frequency, "longest": longest, "lanes": self.lanes, "tracks": self.tracks}
         return json.dumps(data, separators=(",", ":"), ensure_ascii=False).replace("<", "\\u003c")
+
+
+def coded(
+    starts: Sequence[int],
+    values: Sequence[int],
+    intervals: np.ndarray | None = None,
+    probability: np.ndarray | None = None,
+) -> dict[str, Any]:
+    """The segments of one demonstration in one lane, for the script.
+
+    :param starts: first steps.
+    :param values: the option or the label of each segment.
+    :param intervals: of each first step, [segments, 2]; None for labels. Those that are a single step are left out.
+    :param probability: of the option at each step [T]; None for labels.
+    """
+    found: dict[str, Any] = {"s": list(starts), "v": list(values)}
+    if intervals is not None:
+        pairs = zip(starts, intervals.tolist(), strict=True)
+        found["i"] = {place: ends for place, (start, ends) in enumerate(pairs) if ends != [start, start]}
+    if probability is not None:
+        found["p"] = text(np.rint(255 * probability))
+    return found
 
 
 def text(values: np.ndarray) -> str:

@@ -41,7 +41,7 @@ def write_report(fit: Fit, demos: Demonstrations) -> Path:
         shown = skills.Shown(ordered, pictures(ordered) or _stored(fit, ordered), paths)
         drawn = timelines(segmented, ordered, shown.pictures, paths, options.MOST_STEPS)
         every = skills.skills(fit, segmented)
-        tiles, anchors = skills.overview(fit, every, shown), {track.anchor for track in drawn.tracks}
+        tiles, anchors = skills.overview(fit, every, shown), {track["anchor"] for track in drawn.tracks}
         by_options = {
             "skills": skills.section(fit, every, shown, segmented),
             "segments": options.segments(drawn, len(metrics.demonstrations_by_likelihood)),

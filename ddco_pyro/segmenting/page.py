@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from itertools import accumulate, islice
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -16,7 +17,7 @@ from ddco_pyro.data.files import write_text
 from ddco_pyro.data.labels import BOUNDARY, SOURCE, SOURCES, UNKNOWN
 from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.drawing.page import Block, Cell, Page, Section, Table, Text, footnote, note
-from ddco_pyro.drawing.timeline import Lane, Runs, Timelines, Track, following
+from ddco_pyro.drawing.timeline import Timelines, coded, following
 from ddco_pyro.drawing.words import NAT, duration, number, percent
 from ddco_pyro.evaluation.agreement import EXPLAINED, agreement_table, tolerances
 from ddco_pyro.evaluation.options import on_paths
@@ -99,29 +100,30 @@ def timelines(
     :param demos: in the order of their segments; their numbers, paths and pictures follow the cursor.
     :param pictures: of each demonstration; empty for none.
     """
-    lanes = {}
+    lanes: dict[str, tuple[Any, Any]] = {}  # the names and the colours of values
     for name, count in reversed(segmented.counts.items()):
         names = [option_name(choice, segmented.names.get(name, ())) for choice in range(count + 1)]
         known = dict(enumerate(names)) | {UNKNOWN: SOURCES[0]} if name + SOURCE in segmented.label_names else names
-        lanes[name] = Lane(name, known, list(map(option_colour, range(count + 1))))
-    lanes |= {name: Lane(name, names, segmented.label_colours(name)) for name, names in _values(segmented).items()}
+        lanes[name] = known, list(map(option_colour, range(count + 1)))
+    lanes |= {name: (names, segmented.label_colours(name)) for name, names in _values(segmented).items()}
     before = accumulate((len(demo) * len(segmented.counts) for demo in segmented.segments), initial=0)
     shown = [demo for demo, steps in zip(segmented.segments, before, strict=False) if steps < most_steps]
     steps = min(sum(map(len, segmented.segments)), most_steps / len(segmented.counts))
     follows = following(islice(demos, len(shown)), pictures[: len(shown)], int(steps), paths)
     tracks = [
-        Track(
-            demo.name,
-            anchor(demo.name),
-            ", ".join(filter(None, (demo.task, duration(segmented.frequency, len(demo)), _nats(demo)))),
-            demo.held_out,
-            len(demo),
-            [_runs(demo, name) for name in lanes],
-            follow,
-        )
+        {
+            "name": demo.name,
+            "anchor": anchor(demo.name),
+            "facts": ", ".join(filter(None, (demo.task, duration(segmented.frequency, len(demo)), _nats(demo)))),
+            "held_out": demo.held_out,
+            "steps": len(demo),
+            "lanes": [_runs(demo, name) for name in lanes],
+            **follow,
+        }
         for demo, follow in zip(shown, follows, strict=True)
     ]
-    return Timelines(list(lanes.values()), tracks, segmented.frequency)
+    rows = [{"name": name, "names": names, "colours": colours} for name, (names, colours) in lanes.items()]
+    return Timelines(rows, tracks, segmented.frequency)
 
 
 def _nats(demo: Segments) -> str:
@@ -141,13 +143,13 @@ def _values(segmented: Segmented) -> dict[str, dict[int, str]]:
     return found
 
 
-def _runs(demo: Segments, name: str) -> Runs | None:
+def _runs(demo: Segments, name: str) -> dict[str, Any] | None:
     """The segments of a demonstration in a lane; None where the demonstration lacks it."""
     if level := demo.levels.get(name):
         options, starts, _ = zip(*level.runs(), strict=True)
-        return Runs(starts, options, level.intervals, level.probability)
+        return coded(starts, options, level.intervals, level.probability)
     values = demo.labels.get(name, demo.sources.get(name))
     if values is None:
         return None
     found = np.flatnonzero(np.diff(values, prepend=values[0] - 1))
-    return Runs(found.tolist(), values[found].tolist())
+    return coded(found.tolist(), values[found].tolist())
