@@ -72,6 +72,24 @@ def paired_difference(ours: Sequence[float], theirs: Sequence[float]) -> Against
     return Against(only_ours=only_ours, only_theirs=only_theirs, trials=len(ours), p_value=p_value)
 
 
+def matching(counts: np.ndarray) -> np.ndarray:
+    """The row that each column is matched with, one to one with the largest sum (Hungarian assignment).
+
+    A column without a row has -1.
+
+    >>> matching(np.array([[3, 4, 0], [0, 5, 0]])).tolist()
+    [0, 1, -1]
+
+    :param counts: what a row and a column have in common, such as steps.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    match = np.full(counts.shape[1], -1)
+    rows, columns = linear_sum_assignment(counts, maximize=True)
+    match[columns] = rows
+    return match
+
+
 def edit_score(ours: np.ndarray, theirs: np.ndarray) -> float:
     """1 − Levenshtein distance of two sequences of segments / the longer one's length, of options [T] at each step.
 

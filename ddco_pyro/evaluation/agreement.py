@@ -26,7 +26,7 @@ from ddco_pyro.drawing.words import duration, number
 from ddco_pyro.errors import BadInput
 from ddco_pyro.metrics import METRICS, Confusion, Matched, Scores
 from ddco_pyro.names import label_name
-from ddco_pyro.statistics import edit_score
+from ddco_pyro.statistics import edit_score, matching
 
 TOLERANCES = (1, 3, 5)
 """Tolerances of boundary F1, in steps."""
@@ -183,13 +183,8 @@ def _counts(ours: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 def _matching(counts: np.ndarray) -> np.ndarray:
     """The label of each option [options]; a distinct number above all labels for an unmatched option."""
-    from scipy.optimize import linear_sum_assignment
-
-    match = LARGEST + np.arange(counts.shape[1])
-    for label, option in zip(*linear_sum_assignment(counts, maximize=True), strict=True):
-        if counts[label, option]:
-            match[option] = label
-    return match
+    match, options = matching(counts), np.arange(counts.shape[1])
+    return np.where((match >= 0) & (counts[match, options] > 0), match, LARGEST + options)
 
 
 LARGEST = 2**32
@@ -208,37 +203,16 @@ def _matched(ours: Sequence[np.ndarray], truth: Sequence[np.ndarray], labels: in
     )
 
 
-def _starts(sequence: np.ndarray) -> np.ndarray:
-    """The first step of each segment."""
-    return np.concatenate([[0], _boundaries(sequence)])
-
-
 def _boundaries(sequence: np.ndarray) -> np.ndarray:
     return np.flatnonzero(np.diff(sequence)) + 1
 
 
-def _f1(right: int, ours: int, theirs: int) -> float:
-    """F1 = 2 PR / (P + R) of so many right ones; 1 where both sides are empty."""
-    return 2 * right / (ours + theirs) if ours + theirs else 1.0
-
-
 def _boundary_f1(ours: Sequence[np.ndarray], truth: Sequence[np.ndarray], tolerance: int) -> float:
+    """F1 = 2 PR / (P + R); 1 where neither side has a boundary."""
     pairs = [(_boundaries(h), _boundaries(label)) for h, label in zip(ours, truth, strict=True)]
-    right = sum(_within(a, b, tolerance) for a, b in pairs)
-    return _f1(right, sum(len(a) for a, _ in pairs), sum(len(b) for _, b in pairs))
-
-
-def _within(ours: np.ndarray, theirs: np.ndarray, tolerance: int) -> int:
-    """The number of disjoint pairs of sorted steps at most ``tolerance`` apart."""
-    i = j = pairs = 0
-    while i < len(ours) and j < len(theirs):
-        if abs(ours[i] - theirs[j]) <= tolerance:
-            i, j, pairs = i + 1, j + 1, pairs + 1
-        elif ours[i] < theirs[j]:
-            i += 1
-        else:
-            j += 1
-    return pairs
+    right = sum(len(boundary_distances(a, b, tolerance)) for a, b in pairs)
+    every = sum(len(a) + len(b) for a, b in pairs)
+    return 2 * right / every if every else 1.0
 
 
 def boundary_distances(ours: np.ndarray, theirs: np.ndarray, tolerance: int) -> np.ndarray:
@@ -256,29 +230,21 @@ def boundary_distances(ours: np.ndarray, theirs: np.ndarray, tolerance: int) -> 
 
 
 def _overlap_f1(ours: Sequence[np.ndarray], truth: Sequence[np.ndarray], overlap: float) -> float:
+    """F1 of segments: right is one that overlaps enough with the segment of its label with which it overlaps most."""
     right = segments = 0
     for h, label in zip(ours, truth, strict=True):
-        a, b = _starts(h), _starts(label)
-        right += _overlapping((h, a), (label, b), overlap)
-        segments += len(a) + len(b)
+        starts, begins = (np.concatenate([[0], _boundaries(sequence)]) for sequence in (h, label))
+        ends, closes = np.append(starts[1:], len(h)), np.append(begins[1:], len(label))
+        taken = np.zeros(len(begins), dtype=bool)
+        for start, end in zip(starts, ends, strict=True):
+            both = np.minimum(end, closes) - np.maximum(start, begins)
+            either = np.maximum(end, closes) - np.minimum(start, begins)
+            ratio = np.where(label[begins] == h[start], both / either, 0.0)
+            best = int(ratio.argmax())
+            taken[best] |= ratio[best] >= overlap
+        right += int(taken.sum())
+        segments += len(starts) + len(begins)
     return 2 * right / segments
-
-
-def _overlapping(ours: tuple[np.ndarray, np.ndarray], theirs: tuple[np.ndarray, np.ndarray], overlap: float) -> int:
-    """Segments of ours that overlap enough with the true segment of their label with which they overlap most.
-
-    :param ours: the labels of all steps, and where segments start; ``theirs`` likewise.
-    """
-    (h, starts), (label, begins) = ours, theirs
-    ends, closes = np.append(starts[1:], len(h)), np.append(begins[1:], len(label))
-    taken = np.zeros(len(begins), dtype=bool)
-    for start, end in zip(starts, ends, strict=True):
-        both = np.minimum(end, closes) - np.maximum(start, begins)
-        either = np.maximum(end, closes) - np.minimum(start, begins)
-        ratio = np.where(label[begins] == h[start], both / either, 0.0)
-        best = int(ratio.argmax())
-        taken[best] |= ratio[best] >= overlap
-    return int(taken.sum())
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------
@@ -313,8 +279,8 @@ def agreement_table(scores: Mapping[str, Scores | None]) -> Table:
             rows.append([name, *["–"] * (len(head) - 1)])
             continue
         first = [name, *(number(getattr(known, key)) for key in UNMATCHED)]
-        for key, matching in MATCHINGS.items():
-            rows.append([*first, matching, *(number(value) for _, value in getattr(known, key))])
+        for key, way in MATCHINGS.items():
+            rows.append([*first, way, *(number(value) for _, value in getattr(known, key))])
             first = [""] * len(first)
     return Table(head, rows, {0, 1 + len(UNMATCHED)})
 
@@ -407,32 +373,28 @@ def compared(
     """
     from sklearn.metrics import cohen_kappa_score
 
-    values = [np.unique(np.concatenate(side)) for side in zip(*pairs, strict=True)]
-    each = [
-        {int(own): label_name(name, int(own), known[n]) for own in side if own != UNKNOWN}
-        for n, side in enumerate(values)
+    words = [
+        {value: label_name(name, value, own) for value in np.unique(np.concatenate(side)).tolist() if value != UNKNOWN}
+        for side, own in zip(zip(*pairs, strict=True), known, strict=True)
     ]
-    names = list(dict.fromkeys([*each[0].values(), *each[1].values()]))
+    names = list(dict.fromkeys([*words[0].values(), *words[1].values()]))
     counts, boundaries, distances = np.zeros((len(names), len(names)), int), [0, 0], list[int]()
     for labels in pairs:
         said = (labels[0] != UNKNOWN) & (labels[1] != UNKNOWN)
-        a, b = (
-            np.array([names.index(of[int(value)]) for value in own[said]], int)
-            for own, of in zip(labels, each, strict=True)
-        )
-        np.add.at(counts, (a, b), 1)
+        both = [[names.index(of[value]) for value in own[said].tolist()] for own, of in zip(labels, words, strict=True)]
+        np.add.at(counts, tuple(np.array(both, int)), 1)
         inner = said[1:] & said[:-1]
-        starts = [np.flatnonzero((np.diff(own) != 0) & inner) + 1 for own in labels]
-        boundaries = [number + len(own) for number, own in zip(boundaries, starts, strict=True)]
-        distances += boundary_distances(starts[0], starts[1], tolerance).tolist()
-    a, b = (place.repeat(counts.ravel()) for place in np.indices(counts.shape).reshape(2, -1))
-    kappa = float(cohen_kappa_score(a, b)) if len(np.union1d(a, b)) > 1 else None
+        first, second = (np.flatnonzero((np.diff(own) != 0) & inner) + 1 for own in labels)
+        boundaries = [boundaries[0] + len(first), boundaries[1] + len(second)]
+        distances += boundary_distances(first, second, tolerance).tolist()
+    several = np.count_nonzero(counts.sum(0) + counts.sum(1)) > 1
+    rows, columns = np.indices(counts.shape).reshape(2, -1)
     return Annotators(
         demonstrations=len(pairs),
         steps=sum(len(own) for own, _ in pairs),
         both=int(counts.sum()),
         same=int(np.trace(counts)),
-        kappa=kappa,
+        kappa=float(cohen_kappa_score(rows, columns, sample_weight=counts.ravel())) if several else None,
         boundaries=(boundaries[0], boundaries[1]),
         distances=sorted(distances),
         names=names,

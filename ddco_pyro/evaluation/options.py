@@ -265,51 +265,32 @@ def diagnose(
       demonstration;
     - high-fitting: a caller that emits the control itself more than half of the time that it acts.
     """
-    findings: list[Finding] = []
+    found: list[Finding] = []
     for level, use in enumerate(options, start=1):
-        everything = segments[level - 1].demonstrations if segments else 0
-        for option in use[1:]:
-            least = MOSTLY if 2 * option.having <= everything else WHOLE
-            findings += _of_option(level, option, least, alone=len(use) == 2)
-        findings += _of_pairs(level, use, divergences[level - 1] if divergences else ())
-        if segments and segments[level - 1].brief:
-            own = segments[level - 1]
-            findings.append(Finding("brief", level, 0, own.median, times=own.twitches / own.number))
+        own = segments[level - 1] if segments else None
+        used = [one for one in use[1:] if one.share >= UNUSED_SHARE]
+        found += [Finding("unused", level, one.choice, one.share) for one in use[1:] if one not in used]
+        for one in used:
+            if one.share > DOMINATING_SHARE and len(use) > 2:
+                found.append(Finding("dominating", level, one.choice, one.share))
+            least = MOSTLY if own and 2 * one.having <= own.demonstrations else WHOLE
+            if one.within is not None and one.within >= least:
+                found.append(Finding("whole", level, one.choice, one.within, times=one.having))
+            times = one.selected / one.demonstrations if one.demonstrations else 0.0
+            if one.duration is not None and one.duration < SHORTEST_DURATION and times >= AGAIN_AND_AGAIN:
+                found.append(Finding("never_persisting", level, one.choice, one.duration, times=times))
+        for pair in divergences[level - 1] if divergences else ():
+            both = {one.choice for one in used}.issuperset(pair.options)
+            if both and pair.divergence is not None and pair.divergence < SMALLEST_DIVERGENCE:
+                found.append(Finding("redundant", level, pair.options[1], pair.divergence, pair.options[0]))
+        if own and own.brief:
+            found.append(Finding("brief", level, 0, own.median, times=own.twitches / own.number))
+        # the caller of a level acts unless the level above emits the control
         above = options[level][0].share if level < len(options) else 0.0
-        findings += _of_caller(level, use[0].share, above)
-    return findings
-
-
-def _of_option(level: int, use: Use, least: float, alone: bool) -> list[Finding]:
-    if use.share < UNUSED_SHARE:
-        return [Finding("unused", level, use.choice, use.share)]
-    findings = []
-    if use.share > DOMINATING_SHARE and not alone:
-        findings.append(Finding("dominating", level, use.choice, use.share))
-    if use.within is not None and use.within >= least:
-        findings.append(Finding("whole", level, use.choice, use.within, times=use.having))
-    selections = use.selected / use.demonstrations if use.demonstrations else 0.0
-    if use.duration is not None and use.duration < SHORTEST_DURATION and selections >= AGAIN_AND_AGAIN:
-        findings.append(Finding("never_persisting", level, use.choice, use.duration, times=selections))
-    return findings
-
-
-def _of_pairs(level: int, use: Sequence[Use], alike: Sequence[Alike]) -> list[Finding]:
-    used = {row.choice for row in use if row.share >= UNUSED_SHARE}
-    return [
-        Finding("redundant", level, pair.options[1], pair.divergence, pair.options[0])
-        for pair in alike
-        if used.issuperset(pair.options) and pair.divergence is not None and pair.divergence < SMALLEST_DIVERGENCE
-    ]
-
-
-def _of_caller(level: int, control: float, not_acting: float) -> list[Finding]:
-    """The caller of a level acts unless the level above emits the control, ``not_acting`` of the time."""
-    acting = 1.0 - not_acting
-    if acting < UNUSED_SHARE:
-        return []
-    own = (control - not_acting) / acting
-    return [Finding("high_fitting", level, 0, own)] if own > HIGH_FITTING_SHARE else []
+        itself = (use[0].share - above) / (1.0 - above) if 1.0 - above >= UNUSED_SHARE else 0.0
+        if itself > HIGH_FITTING_SHARE:
+            found.append(Finding("high_fitting", level, 0, itself))
+    return found
 
 
 # --- signs in words ---------------------------------------------------------------------------------------------------

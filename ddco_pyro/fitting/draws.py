@@ -11,6 +11,7 @@ import torch
 
 from ddco_pyro.errors import BadInput, check_whole, nearest
 from ddco_pyro.evaluation.inferred import Boundary, Inferred, boundaries
+from ddco_pyro.statistics import matching
 
 if TYPE_CHECKING:
     from xarray import DataTree
@@ -156,15 +157,10 @@ def matched(ours: Sequence[torch.Tensor], theirs: Sequence[torch.Tensor], sizes:
     :param ours: the posterior u of each demonstration, the levels' choices beside each other, [T, Σ (1 + k_d)].
     :param sizes: 1 + k_d of each level.
     """
-    from scipy.optimize import linear_sum_assignment
-
     together = torch.cat(list(ours)).T @ torch.cat(list(theirs))
     found, first = [], 0
     for size in sizes:
         both = together[first + 1 : first + size, first + 1 : first + size].numpy()
-        order = np.zeros(size, dtype=np.int64)
-        rows, columns = linear_sum_assignment(both, maximize=True)
-        order[1 + columns] = 1 + rows
-        found.append(order)
+        found.append(np.concatenate([[0], 1 + matching(both)]))
         first += size
     return found

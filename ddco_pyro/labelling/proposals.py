@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 from torch import Tensor
 
@@ -26,6 +25,7 @@ from ddco_pyro.model.recogniser import SCALES, Windows
 from ddco_pyro.model.tables import NEVER, Tables
 from ddco_pyro.names import choice_names, label_name, option_name
 from ddco_pyro.segmenting.segments import LevelLabels, Segmented, Segments, segments
+from ddco_pyro.statistics import matching
 from ddco_pyro.training.recognition import SHARES, learn
 
 RIDGE = 50.0
@@ -167,10 +167,9 @@ class Proposals:
             known = own[:, : total.shape[1]]
             total[:, : known.shape[1]] += known
         best = total.argmax(1)
-        ours, theirs = linear_sum_assignment(-total)
         best[total.sum(1) == 0] = GONE - 1
-        best[ours] = theirs
-        return np.array([0, *(best + 1)])
+        matched = matching(total.T)
+        return np.array([0, *(np.where(matched < 0, best, matched) + 1)])
 
     def _common(self, name: str, labels: np.ndarray, count: int) -> np.ndarray:
         """The steps that the model by itself expects to have in common with labels 1 to count, [its options, count]."""
