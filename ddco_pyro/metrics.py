@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from operator import not_
 from pathlib import Path
@@ -17,12 +18,14 @@ from pydantic import (
     ConfigDict,
     Discriminator,
     Field,
+    PlainSerializer,
     Tag,
     TypeAdapter,
     ValidationError,
     model_validator,
 )
 
+from ddco_pyro.data.controls import ControlDimension
 from ddco_pyro.data.files import Damaged, json_text, write_text
 from ddco_pyro.errors import command
 from ddco_pyro.spec.base import invalid, lines
@@ -120,13 +123,12 @@ def read_successes(folder: Path) -> dict[tuple[str, int], float]:
     path = folder / "rollouts.csv"
     if not path.exists():
         return {}
-    rows = read_table(path, _success, f"remove it and roll out again: {command('rollout', folder)}")
-    return {(method, seed): value for method, seed, value in rows if value is not None}
-
-
-def _success(row: Mapping[str, str]) -> tuple[str, int, float | None]:
-    said = row.get("success")
-    return row["method"], int(row["seed"]), float(said) if said else None
+    rows = read_table(
+        path,
+        lambda row: ((row["method"], int(row["seed"])), float(row.get("success") or math.nan)),
+        f"remove it and roll out again: {command('rollout', folder)}",
+    )
+    return {place: value for place, value in rows if not math.isnan(value)}
 
 
 def refit(folder: Path, remove: str = "it") -> str:
@@ -134,17 +136,18 @@ def refit(folder: Path, remove: str = "it") -> str:
     return f"remove {remove} and fit again: {command('fit', folder / 'spec.yaml', '--out', folder, '--resume')}"
 
 
-class PerStep(Record):
-    """Log-likelihood in nats per step; ``valid`` where demonstrations were held out."""
+class Parts(Record, Generic[T]):
+    """A number of the training demonstrations, and of the held-out ones where there are any."""
 
-    train: Finite
-    valid: Finite | None
+    train: T
+    valid: T | None
 
 
-class Marginal(PerStep):
-    """The same of a density of the control that reads no observation, fitted to the training demonstrations.
+class Marginal(Parts[Finite]):
+    """The log-likelihood per step of a density of the control that reads no observation.
 
-    It has the kinds of the model. ``controls`` is the number of control dimensions that vary.
+    It has the kinds of the model, and is fitted to the training demonstrations. ``controls`` is the number of control
+    dimensions that vary.
     """
 
     controls: AtLeastOne
@@ -254,7 +257,7 @@ class Training(Record):
 class Compared(Record):
     """A baseline and the model's difference to it."""
 
-    log_likelihood_per_step: PerStep
+    log_likelihood_per_step: Parts[Finite]
     difference: Difference
     parameters: int
     training: Training
@@ -294,14 +297,16 @@ class Worth(Record, Generic[T]):
 class Seeds(Record):
     """Results of a fit and its repetitions, in the order of their training seeds.
 
-    ``held_out`` has log-likelihoods per step by model. ``worth`` has the parts of :class:`Worth`, nats per step, and
-    ``standard_error`` their errors over held-out demonstrations.
+    ``worth`` has the parts of :class:`Worth`. After fits it is in nats per step, with ``standard_error`` over held-out
+    demonstrations and log-likelihoods per step by model (``held_out``). After rollouts it has differences of success
+    rates, with the rates by method (``success``).
     """
 
     training_seeds: Annotated[list[int], Field(min_length=2)]
-    held_out: dict[str, list[Finite]]
     worth: dict[str, list[Finite]]
-    standard_error: dict[str, list[Finite | None]]
+    held_out: LeftOut[dict[str, list[Finite]]] = {}
+    standard_error: LeftOut[dict[str, list[Finite | None]]] = {}
+    success: LeftOut[dict[str, list[Finite]]] = {}
 
 
 class Dimensions(Record):
@@ -311,13 +316,6 @@ class Dimensions(Record):
     options: Finite
 
 
-class ByDimension(Record):
-    """The contributions in each part of the data."""
-
-    train: Dimensions
-    valid: Dimensions | None
-
-
 class Listed(Record):
     """A demonstration of a part (``train`` or ``valid``), and its log-likelihood per step under each method."""
 
@@ -325,19 +323,6 @@ class Listed(Record):
     part: str
     steps: AtLeastOne
     log_likelihood_per_step: dict[str, Finite]
-
-
-class ControlRange(Record):
-    """Statistics of a control dimension in the demonstrations."""
-
-    number: int
-    minimum: Finite
-    maximum: Finite
-    at_minimum: int
-    at_maximum: int
-    steps: AtLeastOne
-    inside: Finite | None
-    at_inside: int
 
 
 class BranchUse(Record):
@@ -439,14 +424,6 @@ class Method(Record):
     against: LeftOut[Against | None] = None
 
 
-class SuccessOfSeeds(Record):
-    """Success rates of a fit and its repetitions by method, and differences of rates, by training seed."""
-
-    training_seeds: Annotated[list[int], Field(min_length=2)]
-    success: dict[str, list[Finite]]
-    worth: dict[str, list[Finite]]
-
-
 class Rollouts(Record):
     """The rollouts of all methods, from the same initial states."""
 
@@ -454,7 +431,7 @@ class Rollouts(Record):
     episodes: AtLeastOne
     methods: dict[str, Method]
     worth: LeftOut[Worth[Against] | None] = None
-    seeds: LeftOut[SuccessOfSeeds | None] = None
+    seeds: LeftOut[Seeds | None] = None
 
     @property
     def success_rates(self) -> dict[str, Rate]:
@@ -567,8 +544,8 @@ class Metrics(Record, frozen=False):
     """The contents of ``metrics.json``. What does not apply to a run is None or empty, and left out of the file."""
 
     model: str
-    log_likelihood_per_step: PerStep
-    log_likelihood_by_dimension: ByDimension
+    log_likelihood_per_step: Parts[Finite]
+    log_likelihood_by_dimension: Parts[Dimensions]
     marginal: LeftOut[Marginal | None] = None
     valid: list[HeldOut]
     demonstrations_by_likelihood: list[Listed]
@@ -587,7 +564,7 @@ class Metrics(Record, frozen=False):
     engine_check: Engines
     demonstrations: Counts
     measure: dict[str, Annotated[list[Any], Field(min_length=1)]]
-    control_dimensions: list[ControlRange]
+    control_dimensions: list[Annotated[ControlDimension, PlainSerializer(ControlDimension.as_data)]]
     parameters: int
     training: Training
     seconds: dict[str, float]

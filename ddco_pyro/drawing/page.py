@@ -70,7 +70,7 @@ def _line(cells: Sequence[str]) -> str:
 
 @dataclass(frozen=True)
 class Text:
-    """A paragraph, a small ``note``, a ``verdict`` in larger letters, or a ``heading`` inside a section."""
+    """A paragraph, a small ``note``, a ``verdict`` in larger letters, ``code``, or a ``heading`` inside a section."""
 
     text: str
     kind: str = "paragraph"
@@ -99,26 +99,10 @@ class Folded:
 
 
 @dataclass(frozen=True)
-class Picture:
-    """A figure on a page: PNG as a data URI, its alternative text and its caption."""
-
-    uri: str
-    alt: str
-    caption: str
-
-
-@dataclass(frozen=True)
 class Columns:
     """Blocks side by side."""
 
     blocks: Sequence[Block]
-
-
-@dataclass(frozen=True)
-class Code:
-    """Preformatted text."""
-
-    text: str
 
 
 @dataclass(frozen=True)
@@ -147,9 +131,9 @@ class Films:
 
 @dataclass(frozen=True)
 class Drawing:
-    """A drawing in SVG inside the page, and its caption."""
+    """A drawing in SVG, or a picture, inside the page, and its caption."""
 
-    svg: Markup
+    content: Markup
     caption: str
 
 
@@ -161,7 +145,7 @@ class Card:
     blocks: Sequence[Block]
 
 
-Block = Text | Table | Picture | Facts | Folded | Columns | Code | Warned | Films | Drawing | Card | Timelines
+Block = Text | Table | Facts | Folded | Columns | Warned | Films | Drawing | Card | Timelines
 
 
 def footnote(text: str) -> Folded:

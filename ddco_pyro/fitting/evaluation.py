@@ -27,14 +27,14 @@ from ddco_pyro.metrics import (
     Agreement,
     Alike,
     Below,
-    ByDimension,
     Compared,
     Dimensions,
+    Finite,
     HeldOut,
     Listed,
     Marginal,
     Metrics,
-    PerStep,
+    Parts,
     Segments,
     TrainedLabels,
     Use,
@@ -167,8 +167,8 @@ def evaluate(
     options, segments, alike = _options(fitted, demos, on_event) if depth else ([], [], [])
     return Metrics(
         model=fitted.name,
-        log_likelihood_per_step=PerStep(train=per_step["train"], valid=per_step.get("valid")),
-        log_likelihood_by_dimension=ByDimension(train=by_dimension["train"], valid=by_dimension.get("valid")),
+        log_likelihood_per_step=Parts[Finite](train=per_step["train"], valid=per_step.get("valid")),
+        log_likelihood_by_dimension=Parts[Dimensions](train=by_dimension["train"], valid=by_dimension.get("valid")),
         valid=[
             HeldOut(name=demo.name, steps=len(demo), log_likelihood=float(value))
             for demo, value in zip(valid or (), values.get("valid", ()), strict=True)

@@ -14,7 +14,7 @@ from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.jobs import Workers, run_all
-from ddco_pyro.metrics import Metrics, Seeds, SuccessOfSeeds
+from ddco_pyro.metrics import Metrics, Seeds
 from ddco_pyro.spec import Spec, with_overrides
 
 
@@ -80,7 +80,7 @@ def roll_out_repetitions(first: Fit, on_event: OnEvent = ignore, jobs: int = -1)
         for part in PARTS
         if pairs[0].get(part)
     }
-    found = SuccessOfSeeds.model_validate({"training_seeds": seeds.training_seeds, "success": rates, "worth": worth})
+    found = Seeds.model_validate({"training_seeds": seeds.training_seeds, "success": rates, "worth": worth})
     first.metrics.rollouts = rollouts.model_copy(update={"seeds": found})
     first.metrics.write(first.run_folder)
 

@@ -7,7 +7,6 @@ from collections.abc import Collection, Mapping
 import numpy as np
 from markupsafe import Markup
 
-from ddco_pyro.data.controls import ControlDimension
 from ddco_pyro.drawing.figures import Interval, Panel, interval_plot, save
 from ddco_pyro.drawing.page import Block, Cell, Section, Table, Text, Warned, footnote, note
 from ddco_pyro.drawing.words import (
@@ -40,7 +39,7 @@ def section(fit: Fit) -> Section:
     if metrics.comparison:
         caption = (
             "Left: log-likelihood of each method; filled circle: held out, open circle: training. Right: the model’s "
-            "minus each baseline’s on the same held-out demonstrations; diamond: mean with one standard error, dots: "
+            "minus each baseline’s on the same held-out demonstrations; circle: mean with one standard error, dots: "
             "single demonstrations."
         )
     units = (
@@ -98,7 +97,7 @@ def draw(metrics: Metrics, baselines: Mapping[str, Mapping[str, float]], alt: st
         differences: list[Interval | None] = [None]
         for name, other in metrics.comparison.items():
             each = [(one.log_likelihood - baselines[name][one.name]) / one.steps for one in metrics.valid]
-            differences.append(Interval.of(other.difference, each, marker="D"))
+            differences.append(Interval.of(other.difference, each))
         title, axis = f"{method(metrics.model)} minus each baseline", "nats per step above that method, held out"
         panels.append(Panel(title, axis, differences, line=0))
     return interval_plot(list(map(method, metrics.methods)), panels, alt)
@@ -136,8 +135,7 @@ def dimensions(fit: Fit) -> Section:
     held_out = metrics.log_likelihood_by_dimension.valid is not None
     values = {name: found.valid or found.train for name, found in parts.items()}
     rows = []
-    for fields in metrics.control_dimensions:
-        dimension = ControlDimension(**dict(fields))
+    for dimension in metrics.control_dimensions:
         each = [number(value.by_dimension[dimension.number]) for value in values.values()]
         kind = str(metrics.measure.get(str(dimension.number), [""])[0])
         rows.append([str(dimension.number), *each, kind, dimension.note])

@@ -5,12 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
-
-from ddco_pyro.data.sources.video import frames
-from ddco_pyro.drawing.figures import Interval, Panel, data_uri, interval_plot, save
-from ddco_pyro.drawing.page import Block, Film, Films, Picture, Section, Table, Text, note
-from ddco_pyro.drawing.shown import jpeg
+from ddco_pyro.drawing.figures import data_uri
+from ddco_pyro.drawing.page import Block, Film, Films, Section, Table, Text, note
 from ddco_pyro.drawing.words import P_VALUE, interval, measure, number, p_value, rate
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Mean, Measure, Method, read_successes
@@ -18,11 +14,6 @@ from ddco_pyro.names import method
 
 MOST_BYTES = 4_000_000
 """Films are held in the page up to this size together; the page links to the others."""
-
-MOST_FRAMES = 16
-COLUMNS = 4
-MOST_PIXELS = 1920
-"""Frames in a strip, in a row of it, and pixels of a row."""
 
 
 def success(fit: Fit) -> Section | None:
@@ -37,15 +28,6 @@ def success(fit: Fit) -> Section | None:
     )
     text = f"{record.episodes} episodes of each method from the same initial states (seeds from {record.seed})."
     blocks: list[Block] = [Text(text), measures_table(methods), note(explained)]
-    if rates := {name: one for name, one in record.success_rates.items() if one.interval}:
-        alt = "Success. " + "; ".join(f"{method(name)}: {rate(one)}" for name, one in rates.items())
-        rows = [
-            Interval(*(100 * value for value in (one.rate or 0.0, *(one.interval or ())))) for one in rates.values()
-        ]
-        panel = Panel("", "success rate (%), 95 % interval", rows, ends=(0, 100))
-        figure = interval_plot(list(map(method, rates)), [panel], alt)
-        caption = "Success rate of each method with its Wilson 95 % interval."
-        blocks.append(save(figure, fit.run_folder / "figures" / "success.svg", caption))
     if paired := paired_table(methods, fit.metrics.model):
         blocks += [Text("Paired comparison of success", "heading"), paired, note(P_VALUE)]
     return Section("rollouts", "Success in the task", blocks)
@@ -81,20 +63,13 @@ def paired_table(methods: Mapping[str, Method], ours: str) -> Table | None:
 
 
 def films(fit: Fit) -> Section | None:
-    """Filmed rollouts, the model's first, with a strip of frames of the first; None where nothing was filmed."""
+    """Filmed rollouts, the model's first; None where nothing was filmed."""
     folder = fit.run_folder
     paths = sorted((folder / "videos").glob("*.mp4"), key=lambda path: (_named(path)[0] != fit.name, *_named(path)))
     if not paths:
         return None
-    blocks: list[Block] = []
-    shown = films_of(folder, paths)
-    if _named(paths[0])[0] == fit.name:
-        caption = (
-            f"Frames of {shown[0].caption}. The border has the colour of the lowest level’s option; h1 is its number."
-        )
-        alt = f"Film strip of one rollout, seed {_named(paths[0])[1]}"
-        blocks.append(Picture(data_uri(strip(paths[0]), "image/jpeg"), alt, caption))
-    return Section("films", "Films", [*blocks, Films(shown)])
+    explained = "The border has the colour of the lowest level’s option; h1 is its number."
+    return Section("films", "Films", [Films(films_of(folder, paths)), note(explained)])
 
 
 def films_of(folder: Path, paths: list[Path]) -> list[Film]:
@@ -114,13 +89,3 @@ def _named(path: Path) -> tuple[str, int]:
     """The method and the seed of a film."""
     name, _, seed = path.stem.rpartition("-")
     return name, int(seed)
-
-
-def strip(path: Path) -> bytes:
-    """Frames of a film, evenly over time, in rows, as JPEG."""
-    film = np.stack(list(frames(path)))
-    chosen = film[np.unique(np.linspace(0, len(film) - 1, min(len(film), MOST_FRAMES)).round().astype(int))]
-    every = -(-COLUMNS * chosen.shape[2] // MOST_PIXELS)  # larger frames are thinned out
-    cells = np.pad(chosen[:, ::every, ::every], ((0, -len(chosen) % COLUMNS), *((0, 0),) * 3), constant_values=255)
-    rows = cells.reshape(-1, COLUMNS, *cells.shape[1:])
-    return jpeg(np.vstack([np.hstack(list(row)) for row in rows]))

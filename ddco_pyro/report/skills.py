@@ -11,8 +11,7 @@ import numpy as np
 from ddco_pyro.data.arrays import Observed
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.drawing.colours import option_colour, option_rgb
-from ddco_pyro.drawing.diagrams import curves, transition_graph, typical_paths
-from ddco_pyro.drawing.figures import data_uri
+from ddco_pyro.drawing.figures import curves, data_uri, picture, transition_graph, typical_paths
 from ddco_pyro.drawing.page import (
     Block,
     Card,
@@ -22,12 +21,11 @@ from ddco_pyro.drawing.page import (
     Facts,
     Film,
     Films,
-    Picture,
     Section,
     Text,
     note,
 )
-from ddco_pyro.drawing.shown import frames, in_words, jpeg, positions, projection
+from ddco_pyro.drawing.shown import frames, in_words, positions, projection
 from ddco_pyro.drawing.words import duration, number, percent
 from ddco_pyro.evaluation.options import diagnose
 from ddco_pyro.fitting.fitted import Fit
@@ -310,7 +308,7 @@ class Shown:
         if self.pictures:
             where = f"Middle picture of {self._places([one])}"
             middle = frames(self.pictures[one.row], [(one.start + one.end - 1) // 2], SHEET_HEIGHT)[0]
-            return [Picture(data_uri(jpeg(middle), "image/jpeg"), where, "")]
+            return [picture(middle, where)]
         return [self._drawing(found[:1] if self.drawn else found, choice, "", 1)]
 
     def blocks(self, found: Sequence[Instance], choice: int) -> list[Block]:
@@ -341,12 +339,12 @@ class Shown:
         return Drawing(curves(values, [{"stroke": option_colour(choice)}]), caption)
 
 
-def sheet_of(pictures: Sequence[Observed], chosen: Sequence[Instance], where: str) -> Picture:
+def sheet_of(pictures: Sequence[Observed], chosen: Sequence[Instance], where: str) -> Drawing:
     """First, middle and last picture of each instance, a row each."""
     steps = [(one.start, (one.start + one.end - 1) // 2, one.end - 1) for one in chosen]
     strips = [frames(pictures[one.row], three, SHEET_HEIGHT) for one, three in zip(chosen, steps, strict=True)]
     rows = [np.hstack(list(strip)) for strip in strips]
-    return Picture(data_uri(jpeg(np.vstack(rows)), "image/jpeg"), f"First, middle and last pictures of {where}", where)
+    return picture(np.vstack(rows), f"First, middle and last pictures of {where}", where)
 
 
 def film_of(pictures: Sequence[Observed], chosen: Sequence[Instance], choice: int) -> Film:

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ddco_pyro.data.likeness import reasons_told
-from ddco_pyro.drawing.diagrams import WIDTH, curves
-from ddco_pyro.drawing.page import Code, Columns, Drawing, Facts, Folded, Section, note
+from ddco_pyro.drawing.figures import WIDTH, curves
+from ddco_pyro.drawing.page import Columns, Drawing, Facts, Folded, Section, Text, note
 from ddco_pyro.drawing.words import number, rate
 from ddco_pyro.evaluation import verdicts
 from ddco_pyro.evaluation.options import degeneracies
@@ -129,5 +129,5 @@ def particulars(fit: Fit) -> Section:
         Facts(check, "Engine check", differences),
         Facts(fit.metrics.versions, "Versions"),
     ]
-    spec = Folded("The whole spec, with its defaults", [Code(dump_spec(fit.spec))])
+    spec = Folded("The whole spec, with its defaults", [Text(dump_spec(fit.spec), "code")])
     return Section("particulars", "How this run was made", [Facts(model), Columns(facts), spec], folded=True)

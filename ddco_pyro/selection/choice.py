@@ -11,18 +11,16 @@ import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from ddco_pyro.drawing.figures import ACCENT, FAINT, INK, Interval, Panel, interval_plot, save
 from ddco_pyro.drawing.page import Page, Table, Text
 from ddco_pyro.drawing.words import NAT, number, with_error
 from ddco_pyro.metrics import Difference, Metrics
 from ddco_pyro.selection.grid import Candidate, point_name
 from ddco_pyro.statistics import paired
-
-if TYPE_CHECKING:
-    from ddco_pyro.drawing.figures import Interval
 
 RULE = (
     "chosen: the candidate with the fewest parameters within one standard error of the best, that is, with a mean "
@@ -85,11 +83,6 @@ class Row:
     def unconverged(self) -> list[int]:
         """The folds whose training had not converged."""
         return [fold for fold, fit in self.fits.items() if not fit.training.converged]
-
-    @property
-    def status(self) -> str:
-        """``scored``, or ``failed`` where a fold failed."""
-        return "failed" if self.failed else "scored"
 
     def minus(self, best: Row | None) -> Row:
         """This row with its difference to the best."""
@@ -155,7 +148,7 @@ def choose(candidates: Sequence[Candidate], fits: Mapping[tuple[int, int], Metri
 
 def within_one_error(row: Row, best: Row | None) -> bool:
     """Whether a candidate is complete and within one standard error of the best."""
-    if row.status != "scored" or best is None or row.mean is None or best.mean is None or best.error is None:
+    if row.failed or best is None or row.mean is None or best.mean is None or best.error is None:
         return False
     return best.mean - row.mean <= best.error
 
@@ -174,7 +167,7 @@ def as_data(choice: Choice) -> dict[str, Any]:
                 "name": row.candidate.name,
                 "values": dict(row.candidate.values),
                 "parameters": row.candidate.parameters,
-                "status": row.status,
+                "status": "failed" if row.failed else "scored",
                 "log_likelihood_per_step": row.mean,
                 "standard_error": row.error,
                 "difference": row.difference.model_dump() if row.difference else none,
@@ -203,7 +196,7 @@ def _cells(row: Row, choice: Choice) -> list[str]:
     mean = "–" if row.mean is None else f"{number(row.mean, 3)} ± {number(row.error, 3)}"
     difference = with_error(None if row is choice.best else row.difference, 3)
     marks = [name for name, marked in (("best", choice.best), ("chosen", choice.chosen)) if marked is row]
-    marks += [] if row.status == "scored" else [row.status]
+    marks += ["failed"] if row.failed else []
     marks += [f"not converged in {len(row.unconverged)}"] if row.unconverged else []
     took = [number(row.gradient_steps, 0), str(len(row.folds))]
     return [row.candidate.name, str(row.candidate.parameters), mean, difference, *took, ", ".join(marks)]
@@ -232,30 +225,23 @@ def write_figure(choice: Choice, path: Path) -> None:
     """
     if all(row.mean is None for row in choice.rows):
         return
-    from ddco_pyro.drawing.figures import ACCENT, FAINT, INK, Interval, Panel, interval_plot, save
-
     best, band = choice.best, None
     if best and best.mean is not None and best.error is not None:
         band = (best.mean - best.error, best.mean)
     means: list[Interval | None] = []
     differences: list[Interval | None] = []
     for row in choice.rows:
-        looks: dict[str, Any] = {
-            "marker": "D" if row is best else "s" if row is choice.chosen else "o",
-            "colour": ACCENT if row is choice.chosen else INK if row.status == "scored" else FAINT,
-        }
+        colour = ACCENT if row is choice.chosen else FAINT if row.failed else INK
         best_folds = best.folds if best else {}
         each = [value - best_folds[fold] for fold, value in row.folds.items() if fold in best_folds]
         points = list(row.folds.values())
-        means.append(None if row.mean is None else Interval.around(row.mean, row.error, points, **looks))
-        differences.append(Interval.of(row.difference, each, **looks))
+        means.append(None if row.mean is None else Interval.around(row.mean, row.error, points, colour))
+        differences.append(None if row.difference is None else Interval.of(row.difference, each, colour))
     panels = [
         Panel("Each candidate, ± one standard error", "held-out log-likelihood (nats per step)", means, band=band),
         Panel("Minus the best, ± one standard error", "nats per step above the best, same folds", differences, line=0),
     ]
-    marks = (
-        "diamond: best; orange: chosen, the smallest within one standard error of the best (band); dots: single folds"
-    )
+    marks = "orange: chosen, the smallest within one standard error of the best (band); dots: single folds"
     notes = [line for note in choice.notes for line in textwrap.wrap(f"Note: {note}.", 150)]
     names = [
         f"{row.candidate.name} ({row.candidate.parameters} parameters){' (failed)' if row.failed else ''}"

@@ -12,7 +12,7 @@ import pytest
 
 from ddco_pyro.data.demonstrations import Demonstration
 from ddco_pyro.drawing.colours import CONTROL, OPTIONS, option_rgb
-from ddco_pyro.drawing.diagrams import transition_graph, typical_paths
+from ddco_pyro.drawing.figures import transition_graph, typical_paths
 from ddco_pyro.drawing.shown import projection
 from ddco_pyro.report.skills import Instance, film_of, instances, sheet_of, transitions
 from ddco_pyro.segmenting.segments import LevelLabels, Segmented, Segments
@@ -79,7 +79,7 @@ CHOSEN = [Instance(0, 4, 10, 1.0), Instance(1, 2, 5, 1.0)]
 
 
 def test_a_contact_sheet_has_the_first_middle_and_last_picture(shades):
-    content = sheet_of(shades, CHOSEN, "").uri.partition(",")[2]
+    (content,) = re.findall(r'src="data:image/jpeg;base64,([^"]*)"', sheet_of(shades, CHOSEN, "").content)
     sheet = cv2.imdecode(np.frombuffer(base64.b64decode(content), np.uint8), cv2.IMREAD_COLOR)
     cells = sheet.reshape(2, sheet.shape[0] // 2, 3, sheet.shape[1] // 3, 3).mean((1, 3, 4))
     np.testing.assert_allclose(cells, [[40, 60, 90], [120, 130, 140]], atol=3)
