@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -379,7 +380,7 @@ def verdict(compared: Comparison) -> str:
     told.append(models.explains(best.name, leads))
     runs = [row.model for row in compared.rows]
     alone = {row.model: each[row.name] for row in compared.rows if runs.count(row.model) == 1}
-    if models.sound() and (found := worth(HIERARCHY, alone, compared.steps)):
+    if models.sound() and (found := worth(HIERARCHY, alone, partial(paired, lengths=steps))):
         told.append(models.lasting(found.memory))
         told += [] if compared.rollouts else [verdicts.said("success", "few")]
     rising = verdicts.rising(row.name for row in compared.rows if not row.training.converged)

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 
 from ddco_pyro.metrics import Against, Difference, Mean, Rate, Worth
 from ddco_pyro.names import FLAT, MIXTURE
+
+T = TypeVar("T")
+V = TypeVar("V")
 
 CONFIDENCE = 0.95
 """Level of intervals; a difference is significant where its interval excludes 0."""
@@ -119,36 +122,21 @@ def paired(ours: np.ndarray, theirs: np.ndarray, lengths: np.ndarray) -> Differe
     return Difference(nats_per_step=mean, standard_error=error)
 
 
-def worth(ours: str, values: Mapping[str, np.ndarray], lengths: Sequence[int]) -> Worth[Difference] | None:
-    """The parts of a hierarchy's advantage in held-out log-likelihood per step, as paired differences.
+def worth(ours: str, values: Mapping[str, V], difference: Callable[[V, V], T]) -> Worth[T] | None:
+    """The parts of a hierarchy's advantage, as paired differences (:func:`paired`, :func:`paired_difference`).
 
     ``memory`` is hierarchy − mixture: both have the same policies and gate, and in the hierarchy alone options last.
     ``experts`` is mixture − flat and ``total`` is hierarchy − flat, where there is a flat baseline, named in ``flat``.
 
     :param ours: the hierarchy's name.
-    :param values: log p(ξ) of each demonstration under each model, nats, [N], by name.
-    :param lengths: steps of each demonstration, [N].
+    :param values: by name of a model: log p(ξ) of each demonstration, or success of each episode.
     :returns: None where ``values`` has no mixture, or the hierarchy is one.
     """
-    steps = np.array(lengths, dtype=float)
-    parts = _parts(ours, values, lambda one, other: paired(one, other, steps))
-    return Worth[Difference](**parts) if parts else None
-
-
-def success_worth(ours: str, successes: Mapping[str, Sequence[float]]) -> Worth[Against] | None:
-    """The same parts for success in rollouts (:func:`ddco_pyro.statistics.paired_difference`).
-
-    :param successes: success (1) or not (0) of each episode, by method.
-    """
-    parts = _parts(ours, successes, paired_difference)
-    return Worth[Against](**parts) if parts else None
-
-
-def _parts(ours: str, values: Mapping[str, Any], difference: Callable[[Any, Any], Any]) -> dict[str, Any]:
     if ours == MIXTURE or ours not in values or MIXTURE not in values:
-        return {}
+        return None
+    memory = difference(values[ours], values[MIXTURE])
     flat = next((name for name in FLAT if name in values), None)
-    pairs = {"memory": (ours, MIXTURE)}
-    if flat is not None:
-        pairs |= {"experts": (MIXTURE, flat), "total": (ours, flat)}
-    return {name: difference(values[one], values[other]) for name, (one, other) in pairs.items()} | {"flat": flat}
+    if flat is None:
+        return Worth(memory=memory)
+    experts, total = (difference(values[name], values[flat]) for name in (MIXTURE, ours))
+    return Worth(memory=memory, experts=experts, total=total, flat=flat)

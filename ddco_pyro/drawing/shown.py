@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from ddco_pyro.data.arrays import PICTURE_DIMENSIONS, Observed, in_file
+from ddco_pyro.data.arrays import Observed, is_picture
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.sources import Source
 from ddco_pyro.spec import PathSpec
@@ -84,12 +84,15 @@ def projection(points: np.ndarray) -> np.ndarray:
 # --- pictures ---------------------------------------------------------------------------------------------------------
 
 
-def pictures(demos: Sequence[Demonstration]) -> list[Observed]:
-    """The first observation of each demonstration that is a picture; empty where one has none."""
-    each = [
-        [array for array in demo.observations.values() if len(array.shape) == 1 + PICTURE_DIMENSIONS] for demo in demos
-    ]
-    return [arrays[0] for arrays in each] if all(each) else []
+def pictures(demos: Iterable[Demonstration]) -> list[Observed]:
+    """The first observation of each demonstration that is pictures; empty where one has none."""
+    found = []
+    for demo in demos:
+        first = next(filter(is_picture, demo.observations.values()), None)
+        if first is None:
+            return []
+        found.append(first)
+    return found
 
 
 def stored_pictures(source: Source, lengths: Mapping[str, int]) -> list[Observed]:
@@ -98,14 +101,8 @@ def stored_pictures(source: Source, lengths: Mapping[str, int]) -> list[Observed
     :param lengths: steps of each demonstration by name.
     :returns: pictures in this order; empty where a demonstration has none or has other steps.
     """
-    found: list[Observed] = []
-    for name, steps in lengths.items():
-        arrays = source.read(name).observations.values() if name in source.names else ()
-        first = next((array for array in arrays if in_file(array) and len(array) == steps), None)
-        if first is None:
-            return []
-        found.append(first)
-    return found
+    found = pictures(map(source.read, lengths)) if lengths.keys() <= {*source.names} else []
+    return found if [*map(len, found)] == [*lengths.values()] else []
 
 
 def frames(observed: Observed, steps: Sequence[int] | np.ndarray, height: int) -> np.ndarray:

@@ -109,10 +109,10 @@ def spread(values: Sequence[float]) -> tuple[str, str, str]:
     return number(float(np.mean(values))), interval(mean_interval(values)), interval((min(values), max(values)))
 
 
-def with_error(difference: Difference | None, digits: int = 2, unknown: str = "–") -> str:
-    """A difference in nats per step with its standard error over held-out demonstrations."""
+def with_error(difference: Difference | None, digits: int = 2) -> str:
+    """A difference in nats per step with its standard error over held-out demonstrations; a dash for None."""
     if difference is None:
-        return unknown
+        return "–"
     return f"{signed(difference.nats_per_step, digits)} ± {number(difference.standard_error, digits)}"
 
 

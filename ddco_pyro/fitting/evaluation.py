@@ -191,7 +191,7 @@ def evaluate(
             for name in contained
         },
         training=training,  # type: ignore[arg-type]  # validated
-        worth=worth(fitted.name, held_out, valid.lengths) if valid else None,
+        worth=worth(fitted.name, held_out, partial(paired, lengths=lengths)),
         branches=branch_use(fitted.hierarchy, infer(fitted.hierarchy, valid or demos)),
         options=options,
         segments=segments,

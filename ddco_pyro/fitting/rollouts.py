@@ -12,7 +12,7 @@ from ddco_pyro.metrics import Method, Rollouts, write_table
 from ddco_pyro.simulation.episodes import run_episodes, summarize
 from ddco_pyro.simulation.film import write_film
 from ddco_pyro.simulation.task import SUCCESS, Policy, find_task
-from ddco_pyro.statistics import paired_difference, success_worth
+from ddco_pyro.statistics import paired_difference, worth
 
 FIRST_SEED = 1000
 """Seed of the first episode; each following episode adds 1."""
@@ -98,7 +98,7 @@ def roll_out(
             name: Method(measures=summarize(task, outcomes), against=pairs.get(name))
             for name, outcomes in by_method.items()
         },
-        worth=success_worth(fit.name, succeeded),
+        worth=worth(fit.name, succeeded, paired_difference),
     )
     fit.metrics.write(folder)
     return fit.metrics.rollouts

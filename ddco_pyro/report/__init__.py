@@ -62,7 +62,11 @@ def write_report(fit: Fit, demos: Demonstrations) -> Path:
         learning,
         training.particulars(fit),
     ]
-    write_text(path, Page(title(fit), [*tiles, *header(fit)], sections, subtitle=subtitle(fit)).html())
+    known, folder = fit.spec.demonstrations.path, fit.run_folder.resolve()
+    title = Path(known).name if known else str(fit.spec.demonstrated_task)
+    fitted = datetime.fromtimestamp((folder / "model.safetensors").stat().st_mtime)
+    subtitle = f"{method(fit.name)}, {folder.parent.name}/{folder.name}, fitted {fitted:%Y-%m-%d %H:%M}"
+    write_text(path, Page(title, [*tiles, *header(fit)], sections, subtitle=subtitle).html())
     return path
 
 
@@ -84,19 +88,6 @@ def segments_of(fit: Fit, demos: Demonstrations) -> Segmented:
         if row.name in found and (row.part == "valid" or row.name not in held_out)  # some are in both parts
     ]
     return of_run(fit, ordered, demos.frequency, label_names(demos.attributes))
-
-
-def title(fit: Fit) -> str:
-    """The file of the demonstrations, or their task."""
-    known = fit.spec.demonstrations.path
-    return Path(known).name if known else str(fit.spec.demonstrated_task)
-
-
-def subtitle(fit: Fit) -> str:
-    """The model, its run folder and the time at which it was fitted."""
-    folder = fit.run_folder.resolve()
-    fitted = datetime.fromtimestamp((folder / "model.safetensors").stat().st_mtime)
-    return f"{method(fit.name)}, {folder.parent.name}/{folder.name}, fitted {fitted:%Y-%m-%d %H:%M}"
 
 
 def _stored(fit: Fit, demos: Demonstrations) -> list[Observed]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import torch
@@ -12,7 +12,6 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.drawing.page import Section, Table, note
 from ddco_pyro.drawing.words import number, percent
 from ddco_pyro.fitting.fitted import Fit
-from ddco_pyro.metrics import BranchUse
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.names import name_in_level
 
@@ -88,35 +87,21 @@ def _largest(values: Mapping[str, float | None], words: Callable[[float | None],
 
 
 def branches(fit: Fit) -> Section | None:
-    """The use of each branch of the networks; None where no network has branches."""
-    uses = fit.metrics.branches
-    if not uses:
+    """Activation and loss of each branch of the networks, by option; None where no network has branches."""
+    levels, rows = [*fit.names.items()], list[list[str]]()
+    for use in fit.metrics.branches:
+        for row, losses in enumerate(use.loss):
+            inner = use.level < len(levels)
+            name = name_in_level(1 + row, *levels[use.level]) if inner else "meta-policy" if levels else "policy"
+            for branch, activation, loss in zip(use.branches, use.activation[row], losses, strict=True):
+                rows.append([name, branch, number(activation, 3), number(loss, 3)])
+    if not rows:
         return None
-    levels = [*fit.names.items()]
-    names = [
-        [name_in_level(1 + option, *levels[use.level]) for option in range(len(use.loss))]
-        if use.level < len(levels)
-        else ["meta-policy" if levels else "policy"]
-        for use in uses
-    ]
     explained = (
         "Mean activation: size of a branch's output to the joint layer while the option is active. Nats lost: when the "
         "branch reads the observation of another step. Held-out demonstrations, or all where none is held out, "
         "weighted by the posterior of the options. Activations can be compared between the options of a branch, not "
         "between branches. Nats lost can be compared everywhere."
     )
-    return Section("branches", "Which inputs matter", [branch_table(uses, names), note(explained)], folded=True)
-
-
-def branch_table(uses: Sequence[BranchUse], names: Sequence[Sequence[str]]) -> Table:
-    """Activation and loss of each branch, a row for each option and branch.
-
-    :param names: the options of each level.
-    """
-    rows = [
-        [option, branch, number(use.activation[row][column], 3), number(use.loss[row][column], 3)]
-        for use, options in zip(uses, names, strict=True)
-        for row, option in enumerate(options)
-        for column, branch in enumerate(use.branches)
-    ]
-    return Table(["Option", "Branch", "Mean activation", "Nats per step lost"], rows, {0, 1})
+    table = Table(["Option", "Branch", "Mean activation", "Nats per step lost"], rows, {0, 1})
+    return Section("branches", "Which inputs matter", [table, note(explained)], folded=True)

@@ -115,13 +115,13 @@ def transitions(segmented: Segmented, level: str) -> np.ndarray:
     return counts
 
 
-def aligned(chosen: Sequence[Instance], most: int = FRAMES) -> np.ndarray:
+def aligned(chosen: Sequence[Instance]) -> np.ndarray:
     """The step of each frame of a film in each instance [F, instances]: all begin at their onset together.
 
     An instance that has ended rests at its last step.
     """
     longest = max(map(len, chosen))
-    stride = -(-longest // most)
+    stride = -(-longest // FRAMES)
     after = np.arange(0, longest, stride)[:, None]
     starts, ends = np.array([one.start for one in chosen]), np.array([one.end for one in chosen])
     steps: np.ndarray = np.minimum(starts + after, ends - 1)
@@ -206,7 +206,15 @@ def section(fit: Fit, every: Sequence[Skill], shown: Shown, segmented: Segmented
             blocks.append(Text(f"Level “{level}”", "heading"))
         counts, present = transitions(segmented, level), {one.choice: one for one in every if one.level == level}
         for choice, one in present.items():
-            facts = _facts(one.use, one.share, one.found, counts, names, segmented.frequency)
+            low, high = np.percentile([len(each) for each in one.found], [25, 75])
+            facts = {
+                "Share of steps": percent(one.share, 1),
+                "Segments": str(one.use.segments),
+                "Median length": duration(segmented.frequency, one.use.length or 0.0),
+                "Quartiles of length": duration(segmented.frequency, low, high),
+                "Comes after": _frequent(counts[:, choice], [*names, "start"]),
+                "Comes before": _frequent(counts[choice], [*names, "end"]),
+            }
             facts |= {f"Label {labels}, agreement": told for labels, told in one.labels.items()}
             if near := _nearest(choice, fit.metrics.divergences[place], names):
                 facts["Most like"] = near
@@ -232,25 +240,6 @@ def section(fit: Fit, every: Sequence[Skill], shown: Shown, segmented: Segmented
     return Section("skills", "Skills one by one", blocks)
 
 
-def _facts(
-    use: Use,
-    share: float,
-    found: Sequence[Instance],
-    counts: np.ndarray,
-    names: Sequence[str],
-    frequency: float | None,
-) -> dict[str, str]:
-    low, high = np.percentile([len(one) for one in found], [25, 75])
-    return {
-        "Share of steps": percent(share, 1),
-        "Segments": str(use.segments),
-        "Median length": duration(frequency, use.length or 0.0),
-        "Quartiles of length": duration(frequency, low, high),
-        "Comes after": _frequent(counts[:, use.choice], [*names, "start"]),
-        "Comes before": _frequent(counts[use.choice], [*names, "end"]),
-    }
-
-
 def _nearest(choice: int, pairs: Sequence[Alike], names: Sequence[str]) -> str:
     """The option from which an option's policy differs least, in words; empty for the only one, and for control."""
     known = [(one.divergence, *one.options) for one in pairs if choice in one.options and one.divergence is not None]
@@ -260,9 +249,9 @@ def _nearest(choice: int, pairs: Sequence[Alike], names: Sequence[str]) -> str:
     return f"{option_name(first if second == choice else second, names)}, {number(apart)} nats per step apart"
 
 
-def _frequent(counts: np.ndarray, names: Sequence[str], most: int = 2) -> str:
-    """The most frequent neighbours with their shares."""
-    first = np.argsort(-counts, kind="stable")[:most]
+def _frequent(counts: np.ndarray, names: Sequence[str]) -> str:
+    """The two most frequent neighbours with their shares."""
+    first = np.argsort(-counts, kind="stable")[:2]
     return ", ".join(f"{names[place]} {percent(counts[place] / counts.sum())}" for place in first if counts[place])
 
 

@@ -78,20 +78,13 @@ def test_a_baseline_that_fell_apart_comes_last_with_advice_for_itself(capsys):
     assert text in console_says(metrics, capsys)
 
 
-def test_a_model_below_its_observations_own_worth_is_told():
-    """It loses nothing on held-out demonstrations, yet a mean and a spread predict better."""
+def test_a_model_below_simpler_ones_is_doubtful():
+    """It loses nothing on held-out demonstrations, yet a mean and a spread, or a flat policy, predict better."""
     text = verdicts.verdict(scored({"ddco": -3.0}, {"ddco": around(-3.0)}, -1.0, 2))
     assert text.startswith("Options predict held-out controls worse than the mean and the spread of each control do: ")
-    assert "fell apart" not in text
-
-
-def test_options_below_flat_are_doubtful():
-    values = {"ddco": around(1.0), "flat": around(1.4, 2.0)}
-    text = verdicts.verdict(scored({"ddco": 1.1, "flat": 1.5}, values, -2.0, 2))
+    text = verdicts.verdict(scored({"ddco": 1.1, "flat": 1.5}, {"ddco": around(1), "flat": around(1.4, 2)}, -2.0, 2))
     error = np.std(TEN, ddof=1) / np.sqrt(10)
-    assert text.startswith(
-        f"Options are below flat by 0.40 ± {error:.2f} nats per step on held-out demonstrations. Take"
-    )
+    assert text.startswith(f"Options are below flat by 0.40 ± {error:.2f} nats per step on held-out demonstrations. T")
 
 
 @pytest.mark.parametrize(("nats", "controls", "told"), [(0.02, 7, False), (0.02, 1, True), (0.08, 7, True)])
@@ -156,33 +149,28 @@ def over_three(values, errors):
     return SEEDS | {"worth": {"memory": values}, "standard_error": {"memory": errors}}
 
 
+LASTING = {
+    "better": "options that last predict held-out controls better than the mixture does: ",
+    "worse": "options that last predict held-out controls worse than the mixture does: ",
+    "same": "options that last predict held-out controls as well as the mixture does: ",
+    "unclear": "it is inconclusive whether options that last predict held-out controls better than the mixture does: ",
+}
+
+
 @pytest.mark.parametrize(
-    ("mean", "error", "said"),
+    ("mean", "error", "way", "lead"),
     [
-        (
-            0.5,
-            0.1,
-            "In this fit options that last predict held-out controls better than the mixture does: +0.50 ± 0.10",
-        ),
-        (
-            0.1,
-            0.1,
-            "In this fit it is inconclusive whether options that last predict held-out controls better than the",
-        ),
-        (
-            -0.5,
-            0.1,
-            "In this fit options that last predict held-out controls worse than the mixture does: −0.50 ± 0.10",
-        ),
-        (0.001, 0.001, "In this fit options that last predict held-out controls as well as the mixture does: 0.00"),
+        (0.5, 0.1, "better", "+0.50 ± 0.10"),
+        (0.1, 0.1, "unclear", "+0.10 ± 0.10"),
+        (-0.5, 0.1, "worse", "−0.50 ± 0.10"),
+        (0.001, 0.001, "same", "0.00"),
     ],
 )
-def test_one_fit_says_what_was_measured(mean, error, said, capsys):
+def test_one_fit_says_what_was_measured(mean, error, way, lead, capsys):
     metrics = memory(mean, error)
     for text in (verdicts.tested(metrics), verdicts.verdict(metrics), console_says(metrics, capsys)):
-        assert said in text
+        assert f"In this fit {LASTING[way]}{lead}" in text
         assert "Success was not measured." in text
-        assert "worth" not in text
 
 
 @pytest.mark.parametrize("held_out", [1, 2])
@@ -196,18 +184,18 @@ def test_one_or_two_held_out_demonstrations_say_nothing_of_significance(held_out
 
 
 @pytest.mark.parametrize(
-    ("values", "said"),
+    ("values", "way"),
     [
-        ([0.3, 0.4, 0.35], "Over 3 training seeds options that last predict held-out controls better than the mixture"),
-        ([0.3, 0.4, -0.35], "Over 3 training seeds it is inconclusive whether options that last predict held-out"),
-        ([-0.3, -0.4, -0.35], "Over 3 training seeds options that last predict held-out controls worse than the"),
-        ([0.001, 0.0011, 0.0012], "Over 3 training seeds options that last predict held-out controls as well as the"),
+        ([0.3, 0.4, 0.35], "better"),
+        ([0.3, 0.4, -0.35], "unclear"),
+        ([-0.3, -0.4, -0.35], "worse"),
+        ([0.001, 0.0011, 0.0012], "same"),
     ],
 )
-def test_the_verdict_is_over_training_seeds(values, said, capsys):
+def test_the_verdict_is_over_training_seeds(values, way, capsys):
     metrics = memory(values[0], 0.0, seeds=over_three(values, [0.0, None, 0.0]))
-    assert said in verdicts.verdict(metrics)
-    assert said in console_says(metrics, capsys)
+    for text in (verdicts.verdict(metrics), console_says(metrics, capsys)):
+        assert f"Over 3 training seeds {LASTING[way]}" in text
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
@@ -17,7 +19,7 @@ from ddco_pyro.inference.engines import compare_engines
 from ddco_pyro.model.tables import always_ends
 from ddco_pyro.selection.grid import candidates
 from ddco_pyro.spec import parse_spec
-from ddco_pyro.statistics import worth
+from ddco_pyro.statistics import paired, worth
 from ddco_pyro.training.networks import (
     Dimensions,
     baseline_spec,
@@ -123,13 +125,14 @@ def test_a_fit_trains_it_beside_with_the_same_budget(run):
 def test_the_worth_of_a_hierarchy_has_two_parts():
     """Hand-made likelihoods of two demonstrations with 2 and 3 steps: the parts add up, in nats per step."""
     values = {"ddco": np.array([6.0, 9.0]), "mixture": np.array([4.0, 8.0]), "flat": np.array([-1.0, -2.0])}
-    found = worth("ddco", values, (2, 3))
+    differ = partial(paired, lengths=np.array([2.0, 3.0]))
+    found = worth("ddco", values, differ)
     means = {part: getattr(found, part).nats_per_step for part in ("memory", "experts", "total")}
     assert means == pytest.approx({"memory": 3 / 5, "experts": 15 / 5, "total": 18 / 5})
     assert found.flat == "flat"
-    assert worth("ddco", values | {"mixture": values["flat"]}, (2, 3)).experts.nats_per_step == 0
-    assert worth("mixture", values, (2, 3)) is worth("ddco", {"flat": values["flat"]}, (2, 3)) is None
-    assert worth("ddco", {name: values[name] for name in ("ddco", "mixture")}, (2, 3)).total is None
+    assert worth("ddco", values | {"mixture": values["flat"]}, differ).experts.nats_per_step == 0
+    assert worth("mixture", values, differ) is worth("ddco", {"flat": values["flat"]}, differ) is None
+    assert worth("ddco", {name: values[name] for name in ("ddco", "mixture")}, differ).total is None
 
 
 def test_a_run_says_what_lasting_is_worth(run):

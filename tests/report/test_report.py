@@ -20,7 +20,7 @@ from ddco_pyro.report import rollouts as rolling
 from ddco_pyro.report import training, write_report
 from ddco_pyro.simulation.episodes import Episode, summarize
 from ddco_pyro.simulation.film import write_film
-from ddco_pyro.spec import parse_spec
+from ddco_pyro.spec import parse_spec, with_overrides
 from ddco_pyro.statistics import paired_difference
 from ddco_pyro.training.data import demonstrations, train_and_valid
 
@@ -170,6 +170,7 @@ def test_every_option_is_shown_beside_the_one_that_it_is_most_like(deep):
         if use.segments
     ]
     assert sorted(re.findall("<dt>Most like</dt><dd>(.*?)</dd>", page)) == sorted(expected) != []
+    assert "Drawings:" not in page  # its spec names no position
 
 
 def test_the_segments_are_those_of_the_most_likely_path(labelled):
@@ -259,34 +260,38 @@ def test_names_are_escaped(tmp_path):
     assert "from clusters" not in page
 
 
+@pytest.fixture(scope="module")
+def arms(tmp_path_factory):
+    """A run of two arms: one observation with six numbers."""
+    training = {"epochs": 1, "starts": ["random"]}
+    return run(tmp_path_factory.mktemp("arms"), made(5, 6), training=training, compare_with=[])
+
+
 @pytest.mark.parametrize(
-    ("size", "drawn", "numbers", "said"),
+    ("drawn", "numbers", "said"),
     [
-        (2, None, [], "observation “place”"),
-        (2, "place", [[0, 1]], "observation “place”"),
-        (4, "place", [[0, 1, 2]], "observation “place” (the first three of its 4 numbers)"),
-        (4, ["place", "2:4"], [[2, 3]], "observation “place[2:4]”"),
+        ("place", [[0, 1, 2]], "observation “place” (the first three of its 6 numbers)"),
+        (["place", "2:4"], [[2, 3]], "observation “place[2:4]”"),
         (
-            6,
             [["place", "0:3"], ["place", "3:6"]],
             [[0, 1, 2], [3, 4, 5]],
             "observations “place[0:3]” (solid), “place[3:6]” (dashed)",
         ),
     ],
 )
-def test_what_is_drawn_is_what_the_spec_names(tmp_path, size, drawn, numbers, said):
-    found, demos = run(tmp_path, made(5, size), training={"epochs": 1}, compare_with=[], report={"trajectory": drawn})
-    page = html.unescape(write_report(found, demos).read_text())
+def test_what_is_drawn_is_what_the_spec_names(arms, drawn, numbers, said):
+    found, demos = arms
     picture = found.folder / "figures" / "trajectories.svg"
-    assert picture.exists() == (drawn is not None)
-    assert (f"Drawings: {said}." in page) == (f"by the most likely option: {said}." in page) == (drawn is not None)
+    page = write_report(replace(found, spec=with_overrides(found.spec, {"report.trajectory": drawn})), demos)
+    page = html.unescape(page.read_text())
+    assert f"Drawings: {said}." in page
+    assert f"by the most likely option: {said}." in page
     shown = embedded(page)["tracks"][0]
-    names = [[shown["n"]["names"][place] for place in path] for path in shown.get("paths", ())]
+    names = [[shown["n"]["names"][place] for place in path] for path in shown["paths"]]
     assert names == [[f"place[{number}]" for number in path] for path in numbers]
-    if drawn:
-        assert len(set(re.findall('stroke-dasharray="([^"]*)"', picture.read_text()))) == len(numbers)
-        circles = ElementTree.parse(picture).findall("{http://www.w3.org/2000/svg}circle")
-        assert len(circles) == len(demos) * len(numbers)
+    assert len(set(re.findall('stroke-dasharray="([^"]*)"', picture.read_text()))) == len(numbers)
+    circles = ElementTree.parse(picture).findall("{http://www.w3.org/2000/svg}circle")
+    assert len(circles) == len(demos) * len(numbers)
 
 
 # --- words -----------------------------------------------------------------------------------------------------------

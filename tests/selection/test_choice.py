@@ -80,7 +80,7 @@ def test_among_equal_sizes_the_better_one_is_chosen():
 
 def test_a_candidate_with_a_failed_fold_is_named_and_not_chosen():
     found = rows([[9.0, "it diverged"], [1.0, 2.0]])
-    assert [row.status for row in found.rows] == ["failed", "scored"]
+    assert [sorted(row.failed) for row in found.rows] == [[1], []]
     assert found.best is found.chosen is found.rows[1]
     data = as_data(found)
     assert data["failed"] == [{"candidate": 0, "name": "count = 1", "fold": 1, "reason": "it diverged"}]
