@@ -22,13 +22,12 @@ from pydantic import (
     Tag,
     TypeAdapter,
     ValidationError,
-    model_validator,
 )
 
 from ddco_pyro.data.controls import ControlDimension
 from ddco_pyro.data.files import Damaged, json_text, write_text
 from ddco_pyro.errors import command
-from ddco_pyro.spec.base import invalid, lines
+from ddco_pyro.spec.base import lines
 
 T = TypeVar("T")
 
@@ -507,14 +506,6 @@ class Confusion(Record):
     options: list[int]
     steps: list[list[Annotated[int, Field(ge=0)]]]
     matched: list[int | None]
-
-    @model_validator(mode="after")
-    def _whole(self) -> Confusion:
-        sizes = [len(self.labels), *(len(row) for row in self.steps), len(self.matched)]
-        whole = sizes == [len(self.steps), *[len(self.options)] * (len(self.steps) + 1)]
-        if not whole or set(self.matched) - {None, *self.labels}:
-            raise invalid(("", "is no table of labels by options"))
-        return self
 
 
 class Agreement(Record):

@@ -34,50 +34,24 @@ DRAWS = 100
 """Paths of each demonstration that the intervals of its boundaries come from."""
 
 
-class Boundary(NamedTuple):
-    """A boundary of the most likely path, and where draws have it.
-
-    :param step: the first step of the new segment.
-    :param low: the first step of the interval; ``high`` is its last. Both are ``step`` if no draw has the boundary.
-    :param probability: the share of draws that have the boundary.
-    """
-
-    step: int
-    low: int
-    high: int
-    probability: float
-
-
-def boundaries(
-    path: np.ndarray, starts: np.ndarray, options: np.ndarray, chosen: np.ndarray, mass: float = 0.9
-) -> list[Boundary]:
-    """The boundaries of a path, with their intervals over draws from the posterior p(ζ | ξ).
+def drawn(
+    path: np.ndarray, starts: np.ndarray, options: np.ndarray, chosen: np.ndarray
+) -> Iterator[tuple[int, np.ndarray]]:
+    """Each boundary of a path, and its steps in those draws from the posterior p(ζ | ξ) that have it, ascending.
 
     A boundary is a step at which option a ends and option b begins. A draw has the boundary where it has a step
     with the same a and b between the two neighbouring boundaries of the path; its nearest such step counts.
 
     >>> path, starts = np.array([1, 1, 2, 2]), np.array([True, False, True, False])
     >>> options = np.array([[1, 1, 2, 2], [1, 2, 2, 2], [1, 1, 1, 1]])
-    >>> boundaries(path, starts, options, np.diff(options, prepend=-1) != 0)[0][:3]
-    (2, 1, 2)
+    >>> [(step, at.tolist()) for step, at in drawn(path, starts, options, np.diff(options, prepend=-1) != 0)]
+    [(2, [1, 2])]
 
     :param path: the options of the path [T].
     :param starts: whether a segment of the path begins at a step [T].
     :param options: the options of the draws [M, T].
     :param chosen: whether a draw's segment begins at a step [M, T].
-    :param mass: the share of these draws whose step is within the interval, at least; half of the rest is on
-        either side.
     """
-    found = []
-    for step, at in drawn(path, starts, options, chosen):
-        found.append(Boundary(step, *within(at, step, mass), len(at) / len(options)))
-    return found
-
-
-def drawn(
-    path: np.ndarray, starts: np.ndarray, options: np.ndarray, chosen: np.ndarray
-) -> Iterator[tuple[int, np.ndarray]]:
-    """Each boundary of a path, and its steps in the draws that have it, ascending; as :func:`boundaries`."""
     steps = len(path)
     edges = [0, *(np.flatnonzero(starts[1:]) + 1).tolist(), steps]
     for before, step, after in zip(edges, edges[1:-1], edges[2:], strict=False):
@@ -92,7 +66,7 @@ def within(at: np.ndarray, step: int, mass: float = 0.9) -> tuple[int, int]:
     """The first and the last step of the interval of a boundary; both are its step if no draw has it.
 
     :param at: its steps in draws, ascending.
-    :param mass: as in :func:`boundaries`.
+    :param mass: the share of them that is within the interval, at least; half of the rest is on either side.
     """
     if not len(at):
         return step, step

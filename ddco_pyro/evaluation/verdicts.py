@@ -24,7 +24,7 @@ from ddco_pyro.drawing.words import (
     verb,
     with_error,
 )
-from ddco_pyro.metrics import METRICS, Against, Candidate, Difference, Marginal, Metrics, Segments, Stage, Training
+from ddco_pyro.metrics import METRICS, Against, Candidate, Difference, Marginal, Metrics, Segments, Training
 from ddco_pyro.names import FLAT, HIERARCHY, MIXTURE, method
 from ddco_pyro.statistics import paired, t_quantile, wider_interval
 
@@ -154,7 +154,8 @@ class Models:
         by a 95 % interval. The likeliest of several models never fell apart.
         """
         others = [other for other in self.held_out if other != name]
-        if not len(self.steps) or self.loss(name) <= LOST or (others and self._best == name):
+        best = bool(others) and name == max(self.held_out, key=self.per_step)
+        if best or not len(self.steps) or self.loss(name) <= LOST:
             return False
         behind = (self.direction(self.lead(name, other)) == "worse" for other in others)
         return self.below_marginal(name) or (bool(others) and all(behind))
@@ -166,10 +167,6 @@ class Models:
             return "few"
         half = lead.standard_error * t_quantile(held_out - 1)
         return _direction(lead.nats_per_step - half, lead.nats_per_step + half, SMALLEST)
-
-    @property
-    def _best(self) -> str:
-        return max(self.held_out, key=self.per_step)
 
     def sound(self) -> bool:
         """Whether differences between options and the mixture mean something: neither fell apart."""
@@ -190,7 +187,7 @@ class Models:
         flats = [other for other, kind in self.kinds.items() if kind in FLAT and self.kinds[name] == HIERARCHY]
         if flats and len(self.steps):
             flat = max(flats, key=self.per_step)
-            lead, other = self.lead(name, flat), self._called(flat)
+            lead, other = self.lead(name, flat), method(flat) if self.kinds[flat] == flat else flat
             if self.direction(lead) == "worse":
                 by, are = f"{number(-lead.nats_per_step)} ± {number(lead.standard_error)}", verb(called, "are", "is")
                 text = said("flat", "worse", name=called, are=are, other=other, by=by)
@@ -226,10 +223,6 @@ class Models:
         known = with_error(memory) if way != "few" else signed(memory.nats_per_step)
         text = _lasting(way, f"{known} nats per step", len(self.steps), brief)
         return f"{text} One fit of each model is no verdict; repeat it with --seeds 5."
-
-    def _called(self, name: str) -> str:
-        """A model in words, or the name of a run."""
-        return method(name) if self.kinds[name] == name else name
 
 
 def said(measure: str, way: Direction, **values: str) -> str:
@@ -388,8 +381,8 @@ def _succeeds(pair: Against, memory: Sequence[float]) -> str:
 
 def effort(training: Training) -> str:
     """The steps of training for tables, with EM or L-BFGS named, marked where training had not converged."""
-    name = _over_all(training)
-    return f"{training.spent.gradient_steps}{f' ({name})' * bool(name)}{', not converged' * (not training.converged)}"
+    name, open_end = _over_all(training), "" if training.converged else ", not converged"
+    return f"{training.spent.gradient_steps}{f' ({name})' if name else ''}{open_end}"
 
 
 def _over_all(training: Training) -> str:
@@ -464,23 +457,17 @@ RAISE = "Raise training.epochs: all compared models have this budget, whatever t
 
 def unconverged(trainings: Mapping[str, Training]) -> list[tuple[str, str]]:
     """Every model whose budget ended a stage before it converged, in words with the numbers, and the remedy."""
-    verdicts = []
+    told = []
     for name, training in trainings.items():
-        stages = [_too_short(stage) for stage in training.stages if not stage.converged]
+        who, stages = method(name), []
+        for stage in training.stages:
+            up = f" (tuning log-likelihood up by {number(stage.rising)} nats per step over the last {stage.over})"
+            if not stage.converged:
+                stages.append(f"stage {stage.stage} after {stage.epochs} epochs{up if stage.epochs else ''}")
+        first = f"Earlier stages of {who} had" if training.converged else f"{capital(who)} {verb(who, 'have', 'has')}"
         if stages:
-            who = method(name)
-            verdict = (
-                f"Earlier stages of {who} had" if training.converged else f"{capital(who)} {verb(who, 'have', 'has')}"
-            )
-            verdicts.append((f"{verdict} not converged: the budget ended {listed(stages)}.", RAISE))
-    return verdicts
-
-
-def _too_short(stage: Stage) -> str:
-    text = f"stage {stage.stage} after {stage.epochs} epochs"
-    if not stage.epochs:
-        return text
-    return f"{text} (tuning log-likelihood up by {number(stage.rising)} nats per step over the last {stage.over})"
+            told.append((f"{first} not converged: the budget ended {listed(stages)}.", RAISE))
+    return told
 
 
 def rising(names: Iterable[str]) -> str:

@@ -4,17 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
 
 from ddco_pyro.errors import BadInput, check_whole, nearest
-from ddco_pyro.evaluation.inferred import Boundary, Inferred, boundaries
+from ddco_pyro.evaluation.inferred import Inferred, drawn, within
 from ddco_pyro.statistics import matching
 
 if TYPE_CHECKING:
     from xarray import DataTree
+
+
+class Boundary(NamedTuple):
+    """A boundary of the most likely path, and where draws have it.
+
+    :param step: the first step of the new segment.
+    :param low: the first step of the interval; ``high`` is its last. Both are ``step`` if no draw has the boundary.
+    :param probability: the share of draws that have the boundary.
+    """
+
+    step: int
+    low: int
+    high: int
+    probability: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +58,7 @@ class Draws:
 
         :param path: the options of the path [T], such as of ``fit.segment``.
         :param starts: the first steps of its segments, bool [T]; None: where the option changes.
-        :param mass: as in :func:`~ddco_pyro.evaluation.inferred.boundaries`.
+        :param mass: as in :func:`~ddco_pyro.evaluation.inferred.within`.
         :raises BadInput: there is no such level, or ``mass`` is not a share.
         """
         if level not in self.options:
@@ -59,7 +73,8 @@ class Draws:
         )
         if starts is None:
             starts, chosen = (np.diff(each[..., :steps], prepend=-1) != 0 for each in (path, options))
-        return boundaries(path[:steps], np.asarray(starts[:steps], dtype=bool), options, chosen, mass)
+        every = drawn(path[:steps], np.asarray(starts[:steps], dtype=bool), options, chosen)
+        return [Boundary(step, *within(at, step, mass), len(at) / len(options)) for step, at in every]
 
     def to_datatree(self) -> DataTree:
         """The draws as xarray's ``DataTree``, which ArviZ takes as inference data.

@@ -20,7 +20,7 @@ from ddco_pyro.spec import load_spec, parse_spec, with_overrides
 SLOW = 30
 
 
-def skills_within_which_speed_varies(number=6, steps=150, seed=0, long=SLOW):
+def skills_within_which_speed_varies(number=6, steps=100, seed=0, long=SLOW):
     """Skills of about ``long`` steps, each a direction; the speed along it changes every three or four steps."""
     random = np.random.default_rng(seed)
     found = []
