@@ -14,13 +14,14 @@ from sklearn.metrics import normalized_mutual_info_score
 import ddco_pyro
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.options import segments_of
-from ddco_pyro.selection.small import heavy_tails, in_steps, lasting, moved, overrides
+from ddco_pyro.selection import small
+from ddco_pyro.selection.small import Lasting, heavy_tails, in_steps, lasting, moved, overrides
 from ddco_pyro.spec import load_spec, parse_spec, with_overrides
 
 SLOW = 30
 
 
-def skills_within_which_speed_varies(number=6, steps=100, seed=0, long=SLOW):
+def skills_within_which_speed_varies(number=5, steps=100, seed=0, long=SLOW):
     """Skills of about ``long`` steps, each a direction; the speed along it changes every three or four steps."""
     random = np.random.default_rng(seed)
     found = []
@@ -80,13 +81,21 @@ def test_what_is_no_length_is_refused(length, frequency, says):
         in_steps("--segment", length, frequency)
 
 
-def test_init_writes_what_it_found(tmp_path: Path):
+def test_init_writes_what_it_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Five segments of 100 steps are 20 each."""
     file, spec = tmp_path / "demos.hdf5", tmp_path / "spec.yaml"
     skills_within_which_speed_varies().write(file)
+    some = segments_of([np.repeat([1, 2], 21)])
+    found = {20: Lasting(0.3, True, 7, some, 0.0)}
+    monkeypatch.setattr(small, "lasting", lambda _, __, steps, ___: found[steps])
+    monkeypatch.setattr(small, "heavy_tails", lambda *_: (1, 2))
     ended = call("init", file, "--out", spec, "--segments", "5")
     assert ended.status == 0, ended.err
-    assert "asked: 30 steps" in ended.out
-    assert load_spec(spec).control.power < 1
+    assert "median segment 21 steps in small fits; asked: 20 steps" in ended.out
+    written = load_spec(spec)
+    assert (written.control.power, written.training.window) == (0.3, 7)
+    assert written.hierarchy.levels[0].termination.network == written.hierarchy.meta_policy.network == "constant"
+    assert [(part.kind, part.dims) for part in written.control.parts] == [("student", (1, 2))]
     both = call("init", file, "--out", spec, "--force", "--segments", "5", "--segment", "3s")
     assert both.status == 2
     assert "exclude each other" in both.err
