@@ -16,6 +16,7 @@ from ddco_pyro.metrics import BranchUse
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.networks.perceptrons import Branches
+from ddco_pyro.model.outputs import Outputs
 
 SEED = 0
 """The seed of the permutation of steps."""
@@ -32,75 +33,55 @@ def branch_use(hierarchy: Hierarchy, pieces: Iterable[Inferred]) -> list[BranchU
       the observation of a random other step; None where the level emits no control.
     """
     branched = _branched(hierarchy)
-    if not branched:
-        return []
-    sums: dict[tuple[int, int], Tensor] = {}
-    for piece in pieces:
+    sums: dict[int, Tensor] = {}
+    for piece in pieces if branched else ():
         for level, network in branched.items():
-            for number, branch in enumerate(network.of):
-                own = _sums(hierarchy, piece, level, branch)
-                sums[level, number] = sums.get((level, number), torch.zeros(1)) + own
-    return [
-        BranchUse(
-            level=level,
-            branches=list(network.names),
-            activation=_rows(sums, level, len(network.of), 0),
-            loss=_rows(sums, level, len(network.of), 1),
-        )
-        for level, network in branched.items()
-    ]
+            own = torch.stack([_sums(piece, level, branch) for branch in network.of], dim=1)
+            sums[level] = own + sums.get(level, 0.0)
+    found = []
+    for level, network in branched.items():
+        tables = (sums[level][..., :2] / sums[level][..., 2:]).permute(2, 0, 1).tolist()
+        activation, loss = ([[None if math.isnan(x) else x for x in row] for row in table] for table in tables)
+        found.append(BranchUse(level=level, branches=list(network.names), activation=activation, loss=loss))
+    return found
 
 
 def _branched(hierarchy: Hierarchy) -> dict[int, Branches]:
-    """The branches that each level's policies read, by level; the meta-policy is the last level."""
+    """The branches that each level's policies read, by level; the meta-policy is the last level, a trunk is of all."""
     by_level: dict[int, Branches] = {}
     for place, network in hierarchy.networks().items():
-        inside = [module for module in network.modules() if isinstance(module, Branches)]
-        if inside and not place.endswith("termination"):
-            for level in _levels(place, hierarchy.depth):
-                by_level.setdefault(level, inside[0])
+        inside = next((module for module in network.modules() if isinstance(module, Branches)), None)
+        if inside is not None and not place.endswith("termination"):
+            own = hierarchy.depth if place in ("trunk", "meta_policy") else int(place.split(".")[1])
+            for level in range(own + 1) if place == "trunk" else (own,):
+                by_level.setdefault(level, inside)
     return dict(sorted(by_level.items()))
 
 
-def _levels(place: str, depth: int) -> Iterable[int]:
-    """The levels that a network of the hierarchy belongs to; the trunk belongs to all."""
-    if place == "trunk":
-        return range(depth + 1)
-    return (depth,) if place == "meta_policy" else (int(place.split(".")[1]),)
+def _sums(piece: Inferred, level: int, branch: nn.Module) -> Tensor:
+    """Over the steps, of each caller of a level: activation and loss of a branch, weighted, and the weights, [K, 3].
 
-
-def _rows(sums: dict[tuple[int, int], Tensor], level: int, branches: int, what: int) -> list[list[float | None]]:
-    """Means by option and branch; None where an option is never active, or emits no control."""
-    columns = [sums[level, number][:, what] / sums[level, number][:, 2] for number in range(branches)]
-    values = torch.stack(columns, dim=1).tolist()
-    return [[None if math.isnan(value) else value for value in row] for row in values]
-
-
-def _sums(hierarchy: Hierarchy, piece: Inferred, level: int, branch: nn.Module) -> Tensor:
-    """Weighted sums of activation, loss and weight over the steps, [K, 3]."""
-    weight = _weight(hierarchy, piece, level)
+    A weight is the posterior probability that the caller is active.
+    """
+    hierarchy, inputs, lengths = piece.hierarchy, piece.batch.inputs, piece.batch.lengths
+    if level < hierarchy.depth:
+        weight = piece.posterior.u[level][..., 1:]
+    else:
+        weight = (torch.arange(inputs.batch[1]) < lengths[:, None]).double().unsqueeze(-1)
     seen: list[Tensor] = []  # [N, T, K, F] for each chunk of time
     with torch.no_grad():
         with branch.register_forward_hook(lambda _, __, output: seen.append(output[0].cpu())):
-            hierarchy(piece.batch.inputs)
+            hierarchy(inputs)
         activation = torch.cat(seen, dim=1).double().abs().mean(-1)
-        with branch.register_forward_pre_hook(partial(_shuffled, piece.batch.lengths)):
-            loss = _score(hierarchy, piece, level, weight) - _score(hierarchy, piece, level, weight, replaced=True)
+        with branch.register_forward_pre_hook(partial(_shuffled, lengths)):
+            replaced = hierarchy(inputs)
+        loss = _score(piece, piece.outputs, level, weight) - _score(piece, replaced, level, weight)
     return torch.stack([(weight * activation).sum((0, 1)), loss, weight.sum((0, 1))], dim=-1)
 
 
-def _weight(hierarchy: Hierarchy, piece: Inferred, level: int) -> Tensor:
-    """The posterior probability that each of a level's callers is active, [N, T, K]."""
-    if level < hierarchy.depth:
-        return piece.posterior.u[level][..., 1:]
-    alive = torch.arange(piece.batch.inputs.batch[1]) < piece.batch.lengths[:, None]
-    return alive.double().unsqueeze(-1)
-
-
-def _score(hierarchy: Hierarchy, piece: Inferred, level: int, weight: Tensor, replaced: bool = False) -> Tensor:
+def _score(piece: Inferred, outputs: Outputs, level: int, weight: Tensor) -> Tensor:
     """The weighted log-density of each caller's control; for the meta-policy the whole log-likelihood, [K]."""
-    outputs = hierarchy(piece.batch.inputs) if replaced else piece.outputs
-    if level == hierarchy.depth:
+    if level == piece.hierarchy.depth:
         return log_predictive(outputs.tables(piece.batch.actions), piece.batch.lengths).sum().reshape(1)
     emission = outputs.emissions[level]
     if emission is None:

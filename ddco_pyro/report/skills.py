@@ -115,19 +115,6 @@ def transitions(segmented: Segmented, level: str) -> np.ndarray:
     return counts
 
 
-def aligned(chosen: Sequence[Instance]) -> np.ndarray:
-    """The step of each frame of a film in each instance [F, instances]: all begin at their onset together.
-
-    An instance that has ended rests at its last step.
-    """
-    longest = max(map(len, chosen))
-    stride = -(-longest // FRAMES)
-    after = np.arange(0, longest, stride)[:, None]
-    starts, ends = np.array([one.start for one in chosen]), np.array([one.end for one in chosen])
-    steps: np.ndarray = np.minimum(starts + after, ends - 1)
-    return steps
-
-
 @dataclass(frozen=True)
 class Skill:
     """One option in the demonstrations of a fit.
@@ -337,8 +324,11 @@ def sheet_of(pictures: Sequence[Observed], chosen: Sequence[Instance], where: st
 
 
 def film_of(pictures: Sequence[Observed], chosen: Sequence[Instance], choice: int) -> Film:
-    """A grid of instances aligned at their onset, in H.264; an instance that has ended is paler."""
-    steps = aligned(chosen)
+    """A grid of instances aligned at their onset, in H.264; one that has ended rests at its last step, paler."""
+    longest = max(map(len, chosen))
+    after = np.arange(0, longest, -(-longest // FRAMES))[:, None]
+    starts, ends = np.array([(one.start, one.end) for one in chosen]).T
+    steps = np.minimum(starts + after, ends - 1)  # [F, instances]
     cells = [frames(pictures[one.row], steps[:, cell], FILM_HEIGHT) for cell, one in enumerate(chosen)]
     columns = int(np.ceil(np.sqrt(len(cells))))
     height, width = cells[0].shape[1:3]
