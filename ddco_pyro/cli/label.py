@@ -132,8 +132,8 @@ def _fitted(file: Path, count: int = 0, where: Mapping[str, Sequence[str]] = {})
         if not spec.exists():
             demos.write_spec(numbers, spec, where=where)
         changes = ["compare_with=[]", *([f"hierarchy.levels.0.count={count}"] if count else [])]
-        if load_spec(spec).demonstrations.leave_one_out:
-            changes += ["demonstrations.leave_one_out=false", "demonstrations.valid_fraction=0"]
+        if load_spec(spec).demonstrations.holds_out_each:
+            changes += ["demonstrations.hold_out_by=null", "demonstrations.valid_fraction=0"]
         with console.Progress() as progress:
             fit(load_spec(spec, changes), None, run, progress)
     return run
