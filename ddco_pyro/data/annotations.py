@@ -13,7 +13,6 @@ from urllib.parse import unquote, urlsplit
 import numpy as np
 import pandas as pd
 
-from ddco_pyro.data.controls import few
 from ddco_pyro.data.labels import UNKNOWN, label_names
 from ddco_pyro.data.sources import Source
 from ddco_pyro.errors import BadInput, nearest
@@ -124,7 +123,7 @@ def _segments(table: pd.DataFrame, said: Mapping[str, str]) -> tuple[pd.DataFram
 
     :param said: the columns by role that the user named.
     """
-    table, notes = _aggregated(table)
+    notes = list[str]()
     for name in said.values():
         if name not in table:
             raise BadInput(f"has no column {name!r}{nearest(name, table)}; there is: {', '.join(table)}")
@@ -146,29 +145,6 @@ def _segments(table: pd.DataFrame, said: Mapping[str, str]) -> tuple[pd.DataFram
     words = {word for side in ("start", "stop") for word in re.split(r"[^a-z]+", columns[side].lower())}
     units = [unit for unit, its_words in UNITS.items() if its_words & words]
     return rows, "seconds" if "ss" in words else units[0] if len(units) == 1 else None, notes
-
-
-def _aggregated(table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
-    """BORIS' tabular events as its aggregated ones: a row for each START with the STOP that is next of its behavior.
-
-    Other tables stay. Events without a partner are left out, and a line names them.
-    """
-    kinds = [name for name in ("Behavior type", "Status") if name in table and (table[name] == "START").any()]
-    if not kinds or not {"Observation id", "Subject", "Behavior", "Time"} <= set(table):
-        return table, []
-    times = _numbers(table, "Time")
-    table = table.assign(**{"Behavior type": table[kinds[0]], "Start (s)": times, "Stop (s)": times})
-    ends = table["Behavior type"].isin(["START", "STOP"])
-    events = table[ends].sort_values("Start (s)", kind="stable")
-    of_behavior = events.groupby(["Observation id", "Subject", "Behavior"], sort=False)
-    begins = events["Behavior type"] == "START"
-    paired = begins & (of_behavior["Behavior type"].shift(-1) == "STOP")
-    alone = events[~paired & (begins | (of_behavior["Behavior type"].shift(1) != "START"))]
-    states = events.assign(**{"Stop (s)": of_behavior["Stop (s)"].shift(-1), "Behavior type": "STATE"})[paired]
-    about = zip(*(alone[name] for name in ("Observation id", "Behavior", "Behavior type", "Time")), strict=True)
-    each = [f"{demo}: {behavior} {kind} at {time}" for demo, behavior, kind, time in about]
-    notes = [f"left out {len(each)} events without a partner: {few(each)}"] if each else []
-    return pd.concat([states, table[~ends]]).sort_index(), notes
 
 
 def _states(rows: pd.DataFrame, table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:

@@ -78,41 +78,22 @@ FORMATS = {
 """By name, in the order in which they are recognised; the reader of robomimic's files reports what is no HDF5 file."""
 
 
-class Layout(NamedTuple):
-    """A layout of demonstrations that a few lines of Python convert.
-
-    :param fits: gets the names at the top of an HDF5 file and its suffix; of a folder, the names and suffixes of what
-        is in it and in the folders within.
-    :param text: what it is, and where the demonstrations are in it, in words.
-    """
-
-    fits: Callable[[Collection[str]], bool]
-    text: str
-
-
-LAYOUTS = (
-    Layout(
-        lambda names: not {"zarr.json", ".zgroup"}.isdisjoint(names), "is a zarr store, as diffusion policy writes them"
+LAYOUTS = {
+    "is a zarr store, as diffusion policy writes them": ({"zarr.json"}, {".zgroup"}),
+    "is a TensorFlow dataset (RLDS)": ({"dataset_info.json", "features.json"}, {".tfrecord"}),
+    "is a recording of ROS: read it with rosbags (pip install rosbags), at each step the last message of each": (
+        {".mcap"},
+        {".db3"},
     ),
-    Layout(
-        lambda names: {"dataset_info.json", "features.json"} <= {*names} or any(".tfrecord" in name for name in names),
-        "is a TensorFlow dataset (RLDS)",
+    "has the layout of RoboMIND, with observations in puppet and controls in master": (
+        {"master", "puppet"},
+        {"trajectory.hdf5"},
     ),
-    Layout(
-        lambda names: not {".mcap", ".db3"}.isdisjoint(names),
-        "is a recording of ROS: read it with rosbags (pip install rosbags), at each step the last message of each",
+    "has the layout of AgiBot World, with observations in state and controls in action, such as joint/position": (
+        {"action", "state", "timestamp"},
+        {"proprio_stats.h5"},
     ),
-    Layout(
-        lambda names: {"master", "puppet"} <= {*names} or "trajectory.hdf5" in names,
-        "has the layout of RoboMIND, with observations in puppet and controls in master",
-    ),
-    Layout(
-        lambda names: {"action", "state", "timestamp"} <= {*names} or "proprio_stats.h5" in names,
-        "has the layout of AgiBot World, with observations in state and controls in action, such as joint/position",
-    ),
-    Layout(
-        lambda names: any(name.startswith("Trial") for name in names),
-        "has the layout of RoboSet, with an episode in each Trial",
-    ),
-)
-"""Layouts that are named with their recipe."""
+    "has the layout of RoboSet, with an episode in each Trial": ({"Trial0"}, {"Trial1"}),
+}
+"""Layouts that a few lines of Python convert, in words, and alternative sets of names that tell them: at the top of an
+HDF5 file, or in a folder and the folders within, where suffixes are names, too."""

@@ -97,10 +97,12 @@ def format_of(path: Path) -> str:
     names = _top_names(path) if path.is_file() else ()
     form = next((form for form, about in FORMATS.items() if about.fits(path, names)), "")
     inside = [path] if path.is_file() else [*path.glob("*"), *path.glob("*/*")]
-    here = {*names, *(one.suffix for one in inside), *(one.name for one in inside if one != path)}
-    if form in ("", "robomimic") and (layout := next((each for each in LAYOUTS if each.fits(here)), None)):
+    suffixes = (one.suffix.partition("-")[0] for one in inside)  # of x.tfrecord-00000-of-00001
+    here = {*names, *suffixes, *(one.name for one in inside if one != path)}
+    layout = next((text for text, signs in LAYOUTS.items() if any(each <= here for each in signs)), "")
+    if form in ("", "robomimic") and layout:
         lines = "write its episodes into an HDF5 file as data/demo_0, data/demo_1, ... with the lines in docs/own.md"
-        raise DemonstrationsError(f"{path}: {layout.text}; {lines}")
+        raise DemonstrationsError(f"{path}: {layout}; {lines}")
     if form:
         return form
     folders = ", ".join(f"{about.text} (with {about.sign})" for about in FORMATS.values() if about.sign)

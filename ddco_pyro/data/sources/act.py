@@ -16,7 +16,7 @@ from ddco_pyro.data.demonstration import Demonstration
 from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.hdf5 import dataset_at, datasets, lazy, member, natural, opened, values_of
 from ddco_pyro.data.sources import Source
-from ddco_pyro.data.sources.metadata import inside, joined
+from ddco_pyro.data.sources.metadata import joined
 
 EPISODE = re.compile(r"episode_(\d+)\.(?:hdf5|h5)")
 
@@ -31,12 +31,12 @@ def open_act(path: Path) -> Iterator[Source]:
     The ``base_action`` [T, B] of a mobile base is appended to the control. Pictures may be encoded, as bytes
     [T, longest].
 
-    :raises DemonstrationsError: there are no episodes, two have one number, or a file lies elsewhere.
+    :raises DemonstrationsError: there are no episodes, or two have one number.
     """
     files = [path]
     if path.is_dir():
         names = sorted((one.name for one in path.iterdir() if EPISODE.fullmatch(one.name)), key=natural)
-        files = [inside(path, name) for name in names]
+        files = [path / name for name in names]
     episodes: dict[str, Path] = {}
     for file in files:
         numbered = EPISODE.fullmatch(file.name)

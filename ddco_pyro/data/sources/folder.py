@@ -14,7 +14,6 @@ from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.labels import BOUNDARY, LABEL_NAMES, SOURCE, UNKNOWN, label_names
 from ddco_pyro.data.sources import Source, narrowed, open_source
-from ddco_pyro.data.sources.metadata import inside
 from ddco_pyro.data.tasks import Where, task_of
 from ddco_pyro.spec import TASK
 
@@ -23,10 +22,10 @@ from ddco_pyro.spec import TASK
 def open_folder(path: Path) -> Iterator[Source]:
     """The files ``*.hdf5`` and ``*.h5`` of a folder, each of any format, pooled.
 
-    :raises DemonstrationsError: a file cannot be read, or lies elsewhere.
+    :raises DemonstrationsError: a file cannot be read.
     """
     files = sorted((one.name for one in path.iterdir() if one.suffix in (".hdf5", ".h5")), key=natural)
-    with open_pooled([inside(path, file) for file in files]) as source:
+    with open_pooled([path / file for file in files]) as source:
         yield source
 
 

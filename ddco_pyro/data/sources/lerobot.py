@@ -25,7 +25,6 @@ from ddco_pyro.data.labels import EXCLUDE, LABEL_NAMES, SOURCE, UNKNOWN
 from ddco_pyro.data.sources import Source
 from ddco_pyro.data.sources.metadata import (
     check_count,
-    check_links,
     clock_fault,
     filled,
     inside,
@@ -79,7 +78,6 @@ class LeRobot:
 
     def __init__(self, folder: Path, actions: Sequence[str] = ()) -> None:
         self.folder = folder
-        check_links(folder)
         self.info = _info(folder / "meta" / "info.json")
         version = str(self.info.get("codebase_version", "of no version"))
         if not version.startswith(VERSION):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
@@ -58,47 +57,15 @@ def clock_fault(times: np.ndarray, longest: float = LONGEST_GAP) -> str:
     return f"{fault} row {at + 1}: {times[at]:.6g}, then {times[at + 1]:.6g}"
 
 
-def inside(folder: Path, relative: str | Path) -> Path:
-    """The path ``folder / relative``, which stays in ``folder`` with all links resolved; the path need not exist.
+def inside(folder: Path, relative: str) -> Path:
+    """The path ``folder / relative``, which need not exist; links are followed, as other programs do.
 
-    A dataset in the cache of the Hugging Face Hub may link to the cache's ``blobs``.
-
-    :raises DemonstrationsError: the path leaves the folder, or is not a path.
+    :raises DemonstrationsError: the path leaves the folder by its name, or is no path.
     """
     pure = PurePosixPath(relative)
-    try:
-        leaves = pure.is_absolute() or ".." in pure.parts
-        resolved, root = (folder / pure).resolve(), folder.resolve()
-        resolved.exists()  # raises where the name is too long
-    except (OSError, RuntimeError, ValueError) as error:  # a loop of links, a NUL
-        what = getattr(error, "strerror", None) or error
-        raise DemonstrationsError(f"{folder}: {str(relative)[:100]!r} is no path in it: {what}") from None
-    if root.parent.name == "snapshots" and (blobs := root.parent.parent / "blobs").is_dir():
-        leaves = leaves or not (resolved.is_relative_to(root) or resolved.is_relative_to(blobs))
-    else:
-        leaves = leaves or not resolved.is_relative_to(root)
-    if leaves:
-        raise DemonstrationsError(f"{folder}: {relative} leads out of the dataset; put the file itself into its folder")
+    if pure.is_absolute() or ".." in pure.parts or "\0" in relative:
+        raise DemonstrationsError(f"{folder}: {relative[:100]!r} leads out of the dataset; correct its metadata")
     return folder / pure
-
-
-def check_links(folder: Path) -> None:
-    """Refuse a dataset's folder with special files, links to folders, or links to files elsewhere.
-
-    :raises DemonstrationsError: the folder holds one of these.
-    """
-    for where, folders, files in os.walk(folder):
-        for name in (*folders, *files):
-            path = Path(where, name)
-            relative = path.relative_to(folder)
-            if path.is_symlink():
-                inside(folder, relative)
-                if path.is_dir():
-                    raise DemonstrationsError(
-                        f"{folder}: {relative} is a link to a folder; put the folder itself there"
-                    )
-            elif name in files and not path.is_file():
-                raise DemonstrationsError(f"{folder}: {relative} is no regular file; remove it")
 
 
 def filled(folder: Path, template: str, values: Mapping[str, int | str]) -> str:
@@ -149,11 +116,10 @@ def stored_keys(folder: Path, names: Sequence[str], preferred: Sequence[str]) ->
         if len(name) > 250 or "\0" in name or not {"", "."}.isdisjoint(name.split("/")):
             called = f"an observation is called {name[:100]!r}"
             raise DemonstrationsError(f"{folder}: {called}, which cannot be stored; rename it")
-    own = [name if _meets(key, preferred) else key for name, key in zip(names, preferred, strict=True)]
-    for keys in (own, [name.replace("/", "_") for name in names]):
-        if not any(_meets(key, keys) for key in keys):
-            return keys
-    raise DemonstrationsError(f"{folder}: two observations have one name, or one lies in the other; rename one")
+    keys = [name if _meets(key, preferred) else key for name, key in zip(names, preferred, strict=True)]
+    if any(_meets(key, keys) for key in keys):
+        raise DemonstrationsError(f"{folder}: two observations have one name, or one lies in the other; rename one")
+    return keys
 
 
 def _meets(key: str, keys: Sequence[str]) -> bool:

@@ -14,7 +14,7 @@ from ddco_pyro.data.demonstration import Attribute, Demonstration
 from ddco_pyro.data.errors import DemonstrationsError, damaged
 from ddco_pyro.data.hdf5 import DAMAGE, dataset_at, datasets, member, opened
 from ddco_pyro.data.sources import Source
-from ddco_pyro.data.sources.metadata import check_count, check_links, joined, stored_keys
+from ddco_pyro.data.sources.metadata import check_count, joined, stored_keys
 from ddco_pyro.errors import nearest
 
 BARE = "observation"
@@ -40,7 +40,6 @@ def open_minari(path: Path, actions: Sequence[str] = ()) -> Iterator[Source]:
             "reading Minari datasets needs minari; install it with: pip install 'ddco-pyro[minari]'"
         ) from None
     folder = path.parent if path.is_file() else path / "data" if (path / "data").is_dir() else path
-    check_links(folder)
     try:
         spaces = MinariStorage.read_raw_metadata(folder).keys() & {"observation_space", "action_space"}
         if len(spaces) < 2:  # Minari would make the environment, which runs code named by the data

@@ -94,7 +94,7 @@ def write_subtasks(asked: Asked, segmented: Segmented) -> str:
     episodes, features = dict[str, Any](), dict[str, Any]()
     with _copied(asked, segmented) as (dataset, subtasks):
         for path in dataset.data_files:
-            file = inside(dataset.folder, path)
+            file = inside(dataset.folder, path.as_posix())
             table = parquet.read_table(file)
             file.unlink()  # it may be a link
             writer = None

@@ -78,13 +78,6 @@ def act(folder: Path, encoded: bool = False, base: bool = False) -> Path:
     return dataset
 
 
-def act_linked(folder: Path) -> Path:
-    dataset = act(folder)
-    (dataset / "episode_1.hdf5").rename(folder / "elsewhere.hdf5")
-    (dataset / "episode_1.hdf5").symlink_to(folder / "elsewhere.hdf5")
-    return dataset
-
-
 def act_twice(folder: Path) -> Path:
     dataset = act(folder)
     act_file(dataset / "episode_01.hdf5", 1)
@@ -169,7 +162,6 @@ ROWS = {
     ),
     "act": Row(act, None),
     "act encoded": Row(partial(act, encoded=True), None),
-    "act link": Row(act_linked, "episode_1.hdf5 leads out of the dataset"),
     "act twice": Row(act_twice, r"episode_0?1\.hdf5: has the number of episode_0?1\.hdf5"),
     "robosuite": Row(
         partial(robosuite, attribute="env_info"),
