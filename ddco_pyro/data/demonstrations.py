@@ -16,9 +16,9 @@ from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.labels import BOUNDARY, LABEL_NAMES, SOURCE, label_names
 from ddco_pyro.data.memory import refuse_too_much
-from ddco_pyro.data.sources import open_source, refuse_foreign
+from ddco_pyro.data.sources import narrowed, open_source, refuse_foreign
 from ddco_pyro.data.sources.robomimic import frequency_of, robomimic_file, write_demonstration
-from ddco_pyro.data.tasks import NAMES, TASKS, Where, are_several, chosen, of_tasks, task_of, with_task
+from ddco_pyro.data.tasks import NAMES, TASKS, Where, are_several, of_tasks, task_of, with_task
 from ddco_pyro.errors import check_whole, path_of
 
 
@@ -205,7 +205,7 @@ def not_demonstrations(given: object) -> DemonstrationsError:
     )
 
 
-Stored = tuple[list[Demonstration], dict[str, tuple[str, ...]], Mapping[str, Attribute]]
+Stored = tuple[list[Demonstration], Mapping[str, tuple[str, ...]], Mapping[str, Attribute]]
 """Demonstrations as their file stores them, the masks, and the attributes of the file."""
 
 
@@ -231,10 +231,5 @@ def stored(
                 raise DemonstrationsError(f"demonstrations.exclude: {unknown(name, source.names)}")
         if set(exclude) == set(source.names):
             raise DemonstrationsError("demonstrations.exclude: leaves every demonstration out; keep some")
-        demos = [source.read(name, observations, labels) for name in source.names if name not in exclude]
-        left_out = {*exclude}
-        if where:
-            names = chosen({demo.name: demo.attributes for demo in demos}, where)
-            left_out, demos = {*source.names} - {*names}, [demo for demo in demos if demo.name in names]
-        masks = {mask: tuple(name for name in names if name not in left_out) for mask, names in source.masks.items()}
-        yield demos, masks, source.attributes
+        source = narrowed(source, where, exclude)
+        yield [source.read(name, observations, labels) for name in source.names], source.masks, source.attributes

@@ -1,10 +1,12 @@
-"""The error about unusable demonstrations."""
+"""The error about unusable demonstrations, and about files that cannot be read."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-from ddco_pyro.errors import BadInput
+from ddco_pyro.errors import BadInput, Failed
 
 
 class DemonstrationsError(BadInput):
@@ -26,12 +28,25 @@ def printable(text: str) -> str:
     return "".join(character if character.isprintable() else repr(character)[1:-1] for character in text)
 
 
-def damaged(path: Path, where: str, error: BaseException) -> DemonstrationsError:
-    """A library's error about an unreadable file, as one line; a :class:`DemonstrationsError` is unchanged.
+DAMAGE = (
+    OSError, RuntimeError, MemoryError, ArithmeticError, ValueError, TypeError, LookupError, AttributeError,
+    AssertionError, ImportError,
+)  # fmt: skip
+"""The errors of libraries about damaged files."""
+
+
+@contextmanager
+def reading(path: Path, where: str = "") -> Iterator[None]:
+    """Tell what a library raises about a damaged file as one line.
 
     :param where: the part of the file; may be empty.
+    :raises DemonstrationsError: the block raises one of :data:`DAMAGE`.
     """
-    if isinstance(error, DemonstrationsError):
-        return error
-    text = " ".join(str(error).split()) or type(error).__name__
-    return DemonstrationsError(f"{path}: {where + ': ' if where else ''}cannot be read, or is damaged: {text}")
+    try:
+        yield
+    except (BadInput, Failed):
+        raise
+    except DAMAGE as error:
+        text = " ".join(str(error).split()) or type(error).__name__
+        place = f"{path}: {where}" if where else path
+        raise DemonstrationsError(f"{place}: cannot be read, or is damaged: {text}", located=True) from error

@@ -18,12 +18,9 @@ import numpy as np
 
 from ddco_pyro.data.arrays import LazyArray, block_steps, channels_last, turned
 from ddco_pyro.data.demonstration import Attribute
-from ddco_pyro.data.errors import DemonstrationsError
+from ddco_pyro.data.errors import DAMAGE, DemonstrationsError, reading
 from ddco_pyro.data.memory import refuse_too_much
-from ddco_pyro.errors import BadInput, Failed, nearest
-
-DAMAGE = (OSError, RuntimeError, ValueError, TypeError, KeyError, MemoryError)
-"""The errors of h5py about damaged files."""
+from ddco_pyro.errors import nearest
 
 
 @contextmanager
@@ -32,20 +29,16 @@ def opened(path: str | Path) -> Iterator[h5py.File]:
 
     :raises DemonstrationsError: the file is missing, not HDF5, or damaged.
     """
-    if os.path.exists(path) and not os.path.isfile(path):
-        raise DemonstrationsError(f"{path}: is no regular file; name an HDF5 file", located=True)
+    if not os.path.isfile(path):
+        why = (
+            "is no regular file; name an HDF5 file" if os.path.exists(path) else "there is no such file; check the path"
+        )
+        raise DemonstrationsError(f"{path}: {why}", located=True)
     try:
-        with h5py.File(path, "r") as file:
+        with reading(Path(path)), h5py.File(path, "r") as file:
             yield file
     except DemonstrationsError as error:
         raise error if error.located else DemonstrationsError(f"{path}: {error}", located=True) from None
-    except (BadInput, Failed):
-        raise
-    except FileNotFoundError:
-        raise DemonstrationsError(f"{path}: there is no such file; check the path", located=True) from None
-    except DAMAGE as error:
-        text = " ".join(str(error).split())
-        raise DemonstrationsError(f"{path}: cannot be read as HDF5, or is damaged: {text}", located=True) from error
 
 
 class _Disk(io.FileIO):

@@ -40,9 +40,6 @@ from ddco_pyro.spec import ControlSpec
 GAP = 3.0
 """A clock among observations has a gap where a step is so many times as long as the median; computers are late."""
 
-SLOWEST = 0.2
-"""Control steps per second, Hz, below which a period may be in milliseconds: dt of 5 and more."""
-
 
 @dataclass
 class Field:
@@ -224,16 +221,15 @@ class Inspection:
         leaks = (f"{place} {why}" for place, why in self.leaks.items())
         target = f"the control is a target of obs/{self.relative_to}: what follows is of their difference"
         followed = [f"{target}, control.relative_to: {self.relative_to}"] if self.relative_to else []
-        return [*self.exclusions, *followed, *self.times, *notes(self.control), *self.coincidences, *leaks, *kinds]
-
-    @property
-    def times(self) -> list[str]:
-        """A line for each clock with a fault, and for a rate that may be a period in milliseconds."""
-        asked = []
-        if self.frequency is not None and self.frequency <= SLOWEST:
-            said = f'if its dt is in milliseconds, write file.attrs["control_frequency"] = {1000 * self.frequency:.4g}'
-            asked = [f"a step lasts {1 / self.frequency:.4g} s by the file: {said}"]
-        return [*asked, *self.clocks.values()]
+        return [
+            *self.exclusions,
+            *followed,
+            *self.clocks.values(),
+            *notes(self.control),
+            *self.coincidences,
+            *leaks,
+            *kinds,
+        ]
 
     @property
     def tasks(self) -> dict[str, list[str]]:
@@ -292,11 +288,10 @@ def inspect(
     :param where: attributes and values of the demonstrations to look at; all if empty.
     :raises DemonstrationsError: the source cannot be read, or holds no demonstrations.
     """
-    with open_source(path, form, where=where) as source:
-        masks = {mask: tuple(name for name in members if name not in exclude) for mask, members in source.masks.items()}
-        about = (Path(path), source.format, masks, source.frequency)
+    with open_source(path, form, where=where, exclude=exclude) as source:
+        about = (Path(path), source.format, source.masks, source.frequency)
         found = Inspection(*about, excluded=tuple(exclude), where=where)
-        _Inspector(source, found).read([name for name in source.names if name not in exclude])
+        _Inspector(source, found).read()
     return found
 
 
@@ -310,10 +305,10 @@ class _Inspector:
         self.digests: dict[str, bytes] = {}
         self.traits: list[Traits] = []
 
-    def read(self, names: Sequence[str]) -> None:
-        """Read these demonstrations."""
+    def read(self) -> None:
+        """Read all demonstrations."""
         found, fields, places = self.found, self.found.fields, dict[str, Collection[str]]()
-        for name in names:
+        for name in self.source.names:
             try:
                 places[name] = self._read(name)
             except DemonstrationsError as error:
@@ -331,7 +326,7 @@ class _Inspector:
             messages[0] if len(messages) == 1 else f"{messages[0]}; the first of {len(messages)} such"
             for messages in self.problems.values()
         )
-        found.problems = [*kinds, *_problems_of_division(self.source, names, found.masks), *_problems(found)]
+        found.problems = [*kinds, *_problems_of_division(self.source), *_problems(found)]
         self._coincidences(controls)
 
     def _coincidences(self, controls: Mapping[str, np.ndarray]) -> None:
@@ -438,12 +433,12 @@ def _vector(place: str, array: Observed) -> bool:
     return array.dtype.kind in NUMBERS and narrow and not is_picture(array)
 
 
-def _problems_of_division(source: Source, names: Sequence[str], masks: Mapping[str, Sequence[str]]) -> Iterator[str]:
+def _problems_of_division(source: Source) -> Iterator[str]:
     strangers = list(problems_of_masks(source.masks, source.names))
     yield from strangers
     if not strangers:
         try:
-            check_division(names, masks)
+            check_division(source.names, source.masks)
         except DemonstrationsError as error:
             yield str(error)
 

@@ -225,7 +225,7 @@ def test_files_that_are_no_hdf5(tmp_path: Path) -> None:
     with pytest.raises(DemonstrationsError, match=r"none\.hdf5: there is no such file; check the path$"):
         Demonstrations.read(tmp_path / "none.hdf5")
     (tmp_path / "text.hdf5").write_text("these are no demonstrations")
-    with pytest.raises(DemonstrationsError, match=r"text\.hdf5: cannot be read as HDF5"):
+    with pytest.raises(DemonstrationsError, match=r"text\.hdf5: cannot be read, or is damaged"):
         Demonstrations.read(tmp_path / "text.hdf5")
 
 

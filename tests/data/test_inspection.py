@@ -296,17 +296,6 @@ def test_what_many_demonstrations_do_is_not_odd(name: str, tmp_path: Path) -> No
     assert not inspect(recorded(tmp_path / "demos.hdf5", ODD[name][0], many)).odd
 
 
-def test_a_period_in_milliseconds_is_asked_about(tmp_path: Path) -> None:
-    path = write(tmp_path / "demos.hdf5")
-    with h5py.File(path, "r+") as file:
-        file.attrs["dt"] = 33
-    line = 'a step lasts 33 s by the file: if its dt is in milliseconds, write file.attrs["control_frequency"] = 30.3'
-    assert line in inspect(path).notes
-    with h5py.File(path, "r+") as file:
-        file.attrs["dt"] = 2
-    assert not [note for note in inspect(path).notes if "a step lasts" in note]
-
-
 CLOCKS = {
     "a gap": ([0.0, 0.1, 0.2, 0.6, 0.7], "obs/timestamp has a gap before row 3: 0.2, then 0.6, in demo_1"),
     "a step back": ([0.0, 0.1, 0.2, 0.1, 0.3], "obs/timestamp steps back in row 3: 0.2, then 0.1, in demo_1"),

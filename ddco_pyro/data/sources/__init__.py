@@ -46,13 +46,18 @@ class Source:
 
 @contextmanager
 def open_source(
-    path: str | Path, form: str | None = None, actions: Sequence[str] = (), where: Where = NOTHING
+    path: str | Path,
+    form: str | None = None,
+    actions: Sequence[str] = (),
+    where: Where = NOTHING,
+    exclude: Sequence[str] = (),
 ) -> Iterator[Source]:
     """Open a file or folder.
 
     :param form: its format, of :data:`~ddco_pyro.data.formats.FORMATS`; recognised if None.
     :param actions: names of the arrays that are the control together, where a LeRobot or Minari dataset has several.
     :param where: attributes and values of the demonstrations that the source has then; all if empty.
+    :param exclude: names of demonstrations that the source has not.
     :raises DemonstrationsError: the source cannot be read, or has another format.
     """
     path = path_of(path, "demonstrations")
@@ -67,19 +72,23 @@ def open_source(
     with reader(path, actions) if FORMATS[form].parts else reader(path) as source:
         if not source.names:
             raise DemonstrationsError(f"{path}: holds no demonstrations; at least one is needed", located=True)
-        yield narrowed(replace(source, format=form), where)
+        yield narrowed(replace(source, format=form), where, exclude)
 
 
-def narrowed(source: Source, where: Where) -> Source:
+def narrowed(source: Source, where: Where, exclude: Sequence[str] = ()) -> Source:
     """A source of the demonstrations with some values of attributes (:func:`~ddco_pyro.data.tasks.chosen`).
 
+    :param exclude: names of demonstrations that it has not either.
     :raises DemonstrationsError: there is none.
     """
-    if not where:
+    if not (where or exclude):
         return source
-    names = chosen({name: source.read(name).attributes for name in source.names}, where)
-    kept = {mask: tuple(name for name in members if name in names) for mask, members in source.masks.items()}
-    return replace(source, names=tuple(names), masks=kept)
+    names = [name for name in source.names if name not in exclude]
+    if where:
+        names = chosen({name: source.read(name).attributes for name in names}, where)
+    left_out = {*source.names} - {*names}
+    masks = {mask: tuple(name for name in members if name not in left_out) for mask, members in source.masks.items()}
+    return replace(source, names=tuple(names), masks=masks)
 
 
 # --- recognition ------------------------------------------------------------------------------------------------------

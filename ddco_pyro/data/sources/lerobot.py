@@ -9,7 +9,7 @@ import json
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import lru_cache, partial
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from shlex import quote
@@ -20,7 +20,7 @@ import numpy as np
 
 from ddco_pyro.data.arrays import PICTURES, LazyArray, Observed, channels_last, turned
 from ddco_pyro.data.demonstration import DIMENSION_NAMES, Attribute, Demonstration
-from ddco_pyro.data.errors import DemonstrationsError, damaged
+from ddco_pyro.data.errors import DemonstrationsError, reading
 from ddco_pyro.data.labels import EXCLUDE, LABEL_NAMES, SOURCE, UNKNOWN
 from ddco_pyro.data.sources import Source
 from ddco_pyro.data.sources.metadata import (
@@ -59,7 +59,6 @@ WHO = "subtask" + SOURCE
 IMAGES_AT_ONCE = 32
 _NO_CONTROL = {"timestamp", "frame_index", "episode_index", "index", "task_index", "image", "video", "string"}
 """Names and types of features that are never the control."""
-_DAMAGE = (pyarrow.ArrowException, OSError, KeyError, ValueError, TypeError, IndexError)
 
 
 class LeRobot:
@@ -143,7 +142,7 @@ class LeRobot:
         if not path.is_file() or self._frequency is None:
             return []
         names = dict[str, int]()
-        try:
+        with reading(path):
             for episode, noted in json.loads(path.read_text(encoding="utf-8"))["episodes"].items():
                 atoms = [atom for atom in noted.get("atoms", ()) if atom["style"] == "subtask"]
                 self._noted[int(episode)] = noted
@@ -152,8 +151,6 @@ class LeRobot:
                     number = names.setdefault(str(text), len(names)) if text else UNKNOWN
                     start = round(atom["timestamp"] * self._frequency)
                     self._annotated.setdefault(int(episode), []).append((start, number))
-        except (*_DAMAGE, AttributeError, OverflowError, RecursionError) as error:
-            raise damaged(path, "", error) from error
         return list(names)
 
     def _named(self, kind: str) -> list[str]:
@@ -161,26 +158,20 @@ class LeRobot:
         path = self.folder / "meta" / f"{kind}s.parquet"
         if not path.is_file():
             return []
-        try:
+        with reading(path):
             columns = parquet.read_table(path).to_pydict()
             numbers = columns.pop(f"{kind}_index")
             texts = next((texts for texts in columns.values() if all(isinstance(text, str) for text in texts)), ())
             names = {int(number): text for number, text in zip(numbers, texts, strict=True) if number >= 0}
             if max(names, default=0) >= MOST_NAMES:
                 raise ValueError(f"{kind}_index is {max(names)}")
-        except _DAMAGE as error:
-            raise damaged(path, "", error) from error
         return [names.get(number, f"{kind} {number}") for number in range(1 + max(names, default=-1))]
 
     def _path(self, template: str, index: int, prefix: str, **more: str) -> Path:
         """A file of an episode, in the dataset's folder, by a template of ``meta/info.json``."""
-        try:
+        with reading(self.folder, f"demo_{index}: {template}"):
             numbers = {name: int(self._episodes[index][f"{prefix}/{name}"]) for name in ("chunk_index", "file_index")}
             path = filled(self.folder, str(self.info[template]), {**numbers, "episode_index": index, **more})
-        except KeyError as error:
-            raise DemonstrationsError(f"{self.folder}: demo_{index}: its metadata has no {error.args[0]}") from None
-        except _DAMAGE as error:
-            raise damaged(self.folder, f"demo_{index}: {template}", error) from error
         return inside(self.folder, path)
 
     def _read(self, name: str) -> Demonstration:
@@ -189,7 +180,7 @@ class LeRobot:
         path = self._path("data_path", index, "data")
         if not path.is_file():
             raise DemonstrationsError(f"{name}: {path} is missing; fetch the dataset again")
-        try:
+        with reading(self.folder, name):
             rows = _Rows(path, index, name)
             self._check(rows, index)
             observations = {key: self._observation(rows, feature, index) for feature, key in self.keys.items()}
@@ -200,8 +191,6 @@ class LeRobot:
                 for start, number in self._annotated.get(index, ()):
                     labels["subtask"][max(start, 0) :] = number
             controls = {key: np.asarray(rows.numbers(key, self.features[key]["shape"])) for key in self._actions}
-        except _DAMAGE as error:
-            raise damaged(self.folder, name, error) from error
         tasks = self._episodes[index].get("tasks")
         about: dict[str, Attribute] = {"episode_index": index}
         if isinstance(tasks, Sequence) and len(tasks):
@@ -244,11 +233,9 @@ class LeRobot:
         self, rows: _Rows, key: str, index: int, size: tuple[int, int], start: int, stop: int
     ) -> Iterator[np.ndarray]:
         """Frames of a video, which is looked for when it is read."""
-        try:
+        with reading(self.folder, f"{rows.name}: {key}"):
             path = self._path("video_path", index, f"videos/{key}", video_key=key)
             begin = float(self._episodes[index][f"videos/{key}/from_timestamp"])
-        except _DAMAGE as error:
-            raise damaged(self.folder, f"{rows.name}: {key}", error) from error
         rate = self._frequency or 1.0
         shown = frames_of_steps(path, rows.name, begin + start / rate, stop - start, rate, size)
         while block := list(islice(shown, IMAGES_AT_ONCE)):
@@ -259,22 +246,20 @@ class _Rows:
     """The rows of one episode in a parquet file."""
 
     def __init__(self, path: Path, episode: int, name: str) -> None:
-        self.path, self.name = path, name
-        self.schema = _file(path, path.stat().st_mtime_ns).schema_arrow
-        rows = np.flatnonzero(self._values("episode_index").to_numpy() == episode)
-        if not len(rows) or np.ptp(rows) >= len(rows):
-            what = "are not together" if len(rows) else "are missing"
-            raise DemonstrationsError(f"{name}: its rows {what} in {path}")
-        self.first, self.steps = int(rows[0]), len(rows)
+        self.path, self.name, self.schema = path, name, parquet.read_schema(path)
+        self.only = [("episode_index", "==", episode)]
+        self.steps = len(self.column("episode_index"))
+        if not self.steps:
+            raise DemonstrationsError(f"{name}: its rows are missing in {path}")
 
     def __len__(self) -> int:
         return self.steps
 
-    def _values(self, key: str) -> Any:
-        """A column of the file."""
+    def column(self, key: str) -> Any:
+        """A column of the episode, in one piece."""
         if key not in self.schema.names:
             raise DemonstrationsError(f"{self.path}: {self.name}: has no column {key}, which meta/info.json names")
-        return _column(self.path, self.path.stat().st_mtime_ns, key)
+        return parquet.read_table(self.path, columns=[key], filters=self.only).column(key).combine_chunks()
 
     def numbers(self, key: str, shape: Sequence[int]) -> LazyArray:
         """A column of numbers or lists of numbers; ``shape`` is the shape of a step."""
@@ -288,8 +273,8 @@ class _Rows:
         return LazyArray(channels_last((len(self), *shape), dtype), dtype, read, key)
 
     def _numbers(self, key: str, shape: tuple[int, ...], start: int, stop: int) -> Iterator[np.ndarray]:
-        try:
-            values = self._values(key).slice(self.first + start, stop - start)
+        with reading(self.path, f"{self.name}: {key}"):
+            values = self.column(key).slice(start, stop - start)
             row, size = np.arange(stop - start), math.prod(shape)
             while pyarrow.types.is_nested(values.type):
                 row = np.repeat(row, compute.list_value_length(values).fill_null(0).to_numpy())
@@ -300,8 +285,6 @@ class _Rows:
                 has = f"{key} has {counts[at]} numbers in row {start + at}, and meta/info.json says {size}"
                 raise DemonstrationsError(f"{self.path}: {self.name}: {has}; correct one of them")
             yield turned(values.to_numpy(zero_copy_only=False).reshape(stop - start, *shape))
-        except _DAMAGE as error:
-            raise damaged(self.path, f"{self.name}: {key}", error) from error
 
     def images(self, key: str, size: tuple[int, int], start: int, stop: int) -> Iterator[np.ndarray]:
         """Encoded pictures of consecutive steps, uint8 [steps, H, W, 3], in blocks."""
@@ -313,32 +296,18 @@ class _Rows:
                 raise DemonstrationsError(f"{self.path}: {self.name}: {wrong}")
             return np.ascontiguousarray(image[..., ::-1])
 
-        try:
-            values = self._values(key)
+        with reading(self.path, f"{self.name}: {key}"):
+            values = self.column(key)
             for first in range(start, stop, IMAGES_AT_ONCE):
-                some = values.slice(self.first + first, min(IMAGES_AT_ONCE, stop - first))
+                some = values.slice(first, min(IMAGES_AT_ONCE, stop - first))
                 yield np.stack([decoded(picture["bytes"]) for picture in some.to_pylist()])
-        except _DAMAGE as error:
-            raise damaged(self.path, f"{self.name}: {key}", error) from error
-
-
-@lru_cache(maxsize=1)
-def _file(path: Path, changed: int) -> parquet.ParquetFile:
-    """A parquet file; ``changed`` identifies its version."""
-    return parquet.ParquetFile(path)
-
-
-@lru_cache(maxsize=8)
-def _column(path: Path, changed: int, key: str) -> Any:
-    """A column of a parquet file, in one piece: LeRobot's files have about 100 MB."""
-    return _file(path, changed).read([key]).column(key).combine_chunks()
 
 
 def _episodes(folder: Path) -> dict[int, dict[str, Any]]:
     """The rows of ``meta/episodes`` by episode, without statistics."""
     episodes: dict[int, dict[str, Any]] = {}
     for path in sorted((folder / "meta" / "episodes").rglob("*.parquet")):
-        try:
+        with reading(path):
             names = parquet.read_schema(path).names
             rows = parquet.read_table(path, columns=[key for key in names if not key.startswith("stats/")]).to_pylist()
             for row in rows:
@@ -346,8 +315,6 @@ def _episodes(folder: Path) -> dict[int, dict[str, Any]]:
                 if index in episodes:
                     raise DemonstrationsError(f"{path}: demo_{index}: is there twice; remove one of the two")
                 episodes[index] = row
-        except _DAMAGE as error:
-            raise damaged(path, "", error) from error
     if not episodes:
         raise DemonstrationsError(f"{folder}: meta/episodes holds no episodes; at least one is needed")
     return dict(sorted(episodes.items()))
@@ -362,12 +329,10 @@ def _dimensions(feature: dict[str, Any]) -> list[str]:
 
 
 def _info(path: Path) -> dict[str, Any]:
-    try:
+    with reading(path):
         info = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(info.get("features"), dict):
             raise DemonstrationsError(f"{path}: says nothing of features; is it LeRobot's?")
-    except (OSError, ValueError, AttributeError, RecursionError) as error:
-        raise damaged(path, "", error) from error
     return info
 
 
@@ -378,8 +343,4 @@ def open_lerobot(path: Path, actions: Sequence[str] = ()) -> Iterator[Source]:
     :param actions: features that are the control together; ``action`` if empty.
     :raises DemonstrationsError: the dataset has another version, or is damaged.
     """
-    try:
-        yield LeRobot(path, actions).source()
-    finally:
-        _file.cache_clear()
-        _column.cache_clear()
+    yield LeRobot(path, actions).source()

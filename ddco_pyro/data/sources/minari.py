@@ -11,8 +11,8 @@ import h5py
 import numpy as np
 
 from ddco_pyro.data.demonstration import Attribute, Demonstration
-from ddco_pyro.data.errors import DemonstrationsError, damaged
-from ddco_pyro.data.hdf5 import DAMAGE, dataset_at, datasets, member, opened
+from ddco_pyro.data.errors import DemonstrationsError, reading
+from ddco_pyro.data.hdf5 import dataset_at, datasets, member, opened
 from ddco_pyro.data.sources import Source
 from ddco_pyro.data.sources.metadata import check_count, joined, stored_keys
 from ddco_pyro.errors import nearest
@@ -40,13 +40,11 @@ def open_minari(path: Path, actions: Sequence[str] = ()) -> Iterator[Source]:
             "reading Minari datasets needs minari; install it with: pip install 'ddco-pyro[minari]'"
         ) from None
     folder = path.parent if path.is_file() else path / "data" if (path / "data").is_dir() else path
-    try:
+    with reading(folder):
         spaces = MinariStorage.read_raw_metadata(folder).keys() & {"observation_space", "action_space"}
         if len(spaces) < 2:  # Minari would make the environment, which runs code named by the data
             raise DemonstrationsError(f"{folder}: metadata.json does not say its observation and action spaces")
         storage = MinariStorage.read(folder)
-    except (*DAMAGE, AssertionError, ImportError, AttributeError, RecursionError) as error:
-        raise damaged(folder, "", error) from error
     stored = _episodes(folder)
     if stored:
         check_count(folder, storage.total_episodes, len(stored), "the dataset")
@@ -58,11 +56,9 @@ def open_minari(path: Path, actions: Sequence[str] = ()) -> Iterator[Source]:
                 group = member(file, f"episode_{index}", h5py.Group, "")
                 for key in datasets(group):
                     dataset_at(group, key, f"{name}: ")  # values that were never stored would be read as zeros
-        try:
+        with reading(folder, name):
             (episode,) = storage.get_episodes([index])
             (facts,) = storage.get_episode_metadata([index])
-        except (*DAMAGE, AssertionError) as error:
-            raise damaged(folder, name, error) from error
         control = _control(folder, episode["actions"], actions, where)
         if (total := facts.get("total_steps")) not in (None, len(control)):
             raise DemonstrationsError(f"{where}: total_steps is {total}, and there are {len(control)} actions")
