@@ -134,48 +134,35 @@ class Proposals:
         self, labels: Mapping[str, np.ndarray], count: int, before: Mapping[str, np.ndarray] = MappingProxyType({})
     ) -> None:
         """Number the options anew, as the person has other ones; arguments as of the class."""
-        self.usual = np.eye(self.size, count)
-        if before:
-            self.usual = np.sum([self._common(name, own, count) for name, own in before.items()], axis=0)
-            self.usual /= self.usual.sum(1, keepdims=True).clip(min=1)
-        self.usual *= self.half
-        self.common = dict[str, np.ndarray]()
+        self.usual = self._common(before, count) if before else np.eye(self.size, count)
+        self.usual *= self.half / self.usual.sum(1, keepdims=True).clip(min=1)
         self.number(labels)
 
     def number(self, labels: Mapping[str, np.ndarray]) -> bool:
-        """Number the options by the named steps of these demonstrations, and leave all others unchanged.
+        """Number the options by the named steps: each is another option of the person where there are enough.
 
-        Options keep their numbers unless named steps are against it by more than half a segment of each.
+        Options keep their numbers unless named steps are against it by more than half a segment of each. An option that
+        is newer than the model is none of them. An option of the model that is none of the person's is :data:`GONE`,
+        where the person has fewer.
 
         :return: whether a number changed.
         """
-        new = {name: self._common(name, own, max(own.max(), 0)) for name, own in labels.items()}
-        self.common = {**self.common, **new}
-        before, self.options = self.options, self.aligned(self.common)
-        return not np.array_equal(before, self.options)
-
-    def aligned(self, common: Mapping[str, np.ndarray]) -> np.ndarray:
-        """The person's option for each option 0 to k of the model, another one for each where there are enough.
-
-        An option that is newer than the model is none of them. An option of the model that is none of the person's is
-        :data:`GONE`, where the person has fewer.
-
-        :param common: of each demonstration, the steps that labels have in common with the model.
-        """
-        total = self.usual.copy()
-        for own in common.values():
-            known = own[:, : total.shape[1]]
-            total[:, : known.shape[1]] += known
+        count = self.usual.shape[1]
+        common = self._common(labels, max(count, *(own.max() for own in labels.values())))
+        self.told, total = common.sum(1), self.usual + common[:, :count]
         best = total.argmax(1)
         best[total.sum(1) == 0] = GONE - 1
         matched = matching(total.T)
-        return np.array([0, *(np.where(matched < 0, best, matched) + 1)])
+        before, self.options = self.options, np.array([0, *(np.where(matched < 0, best, matched) + 1)])
+        return not np.array_equal(before, self.options)
 
-    def _common(self, name: str, labels: np.ndarray, count: int) -> np.ndarray:
+    def _common(self, labels: Mapping[str, np.ndarray], count: int) -> np.ndarray:
         """The steps that the model by itself expects to have in common with labels 1 to count, [its options, count]."""
-        piece, row = self.place[name]
-        common, said = np.zeros((count, self.size)), np.flatnonzero((labels > 0) & (labels <= count))
-        np.add.at(common, labels[said] - 1, self.alone_u[piece][row, said, 1:].numpy())
+        common = np.zeros((count, self.size))
+        for name, own in labels.items():
+            piece, row = self.place[name]
+            said = np.flatnonzero((own > 0) & (own <= count))
+            np.add.at(common, own[said] - 1, self.alone_u[piece][row, said, 1:].numpy())
         return common.T
 
     def unknown(self, labels: Mapping[str, np.ndarray]) -> Tensor:
@@ -184,8 +171,7 @@ class Proposals:
         Such an option has none, and the named ones are not those that the model by itself gives to it.
         """
         named = {option for own in labels.values() for option in self._by_model(own)[1].tolist()}
-        each = np.sum([common.sum(1) for common in self.common.values()], axis=0)
-        seen = (1 + np.flatnonzero(each > self.half)).tolist()
+        seen = (1 + np.flatnonzero(self.told > self.half)).tolist()
         return torch.tensor(sorted(self.occurring - {*named, *seen}), dtype=torch.int64)
 
     def waiting(self, labels: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -250,7 +236,7 @@ class Proposals:
         found = {}
         for name in names:
             others, without = copy(self), {**labels, name: np.full_like(labels[name], FREE)}
-            others.number({name: without[name]})
+            others.number(without)
             others.learned = others.learn(without)
             (piece,) = others.infer([name], without)
             others.paths = others.found(piece)

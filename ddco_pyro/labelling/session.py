@@ -573,18 +573,15 @@ class Session:
         before, labels = {name: numbers[own] for name, own in shown.items()}, self.document.labels
         self.proposals.renumber(labels, len(now), before)
         self.proposals.learned = self.proposals.learn(labels)
-        if self.proposed is not self.proposals:
-            self.proposed.renumber(labels, len(now), before)
+        self.proposed.renumber(labels, len(now), before)
         self.untouched.clear()
         self.recent = {}
         self._show(self.demos.names)
 
     def _follow(self, touched: Sequence[str], edited: str | None) -> None:
         """Show what follows from an edit at once: the demonstration at hand, and the numbers of options everywhere."""
-        labels = {name: self.document.labels[name] for name in touched}
-        if self.proposed is not self.proposals:
-            self.proposed.number(labels)
-        renumbered = self.proposals.number(labels)
+        renumbered = self.proposals.number(self.document.labels)
+        self.proposed.number(self.document.labels)
         if edited is not None:
             self._infer(edited)
         self._show(self.demos.names if renumbered else touched, edited)
