@@ -190,17 +190,6 @@ def test_ends_that_no_signal_can_mark_are_refused(tmp_path, plan, message):
     assert not (tmp_path / "copy.hdf5").exists()
 
 
-@pytest.mark.parametrize(
-    ("kind", "first"), [("--mimicgen", "datagen_info/eef_pose"), ("--isaac", "obs/datagen_info/eef_pose")]
-)
-def test_a_file_that_is_not_prepared_is_refused(planted, kind, first):
-    with pytest.raises(BadInput) as refused:
-        planted.write(kind, "copy.hdf5")
-    said = str(refused.value)
-    assert f"demo_0: has no {PREPARED[kind][0]}/eef_pose, so the file is not prepared for" in said
-    assert said.count("\n") == 0
-
-
 # --- LeRobot ----------------------------------------------------------------------------------------------------------
 
 
