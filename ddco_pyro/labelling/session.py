@@ -95,6 +95,8 @@ class Session:
     :raises BadInput: the run has no options or no such level, ``out`` is something else, or another process labels it.
     """
 
+    proposals: Proposals
+
     def __init__(
         self,
         fit: Fit,
@@ -133,7 +135,7 @@ class Session:
             if said := said_in(there, self.level, self.document.names, self.form == "lerobot", first is None):
                 self.journal.edit(said)
                 self.journal.save()
-        self.lock = first.lock if first else threading.RLock()
+        self.lock: threading.RLock = first.lock if first else threading.RLock()
         self.revision, self.edits, self.changed = 0, 0, set[int]()
         self.behind, self.inferring, self.inferred = False, False, dict.fromkeys(self.demos.names, 0)
         self.refits, self.again = 0, False
@@ -147,7 +149,7 @@ class Session:
         self.error = ""
         self._prepare(fit)()
         self.unlike = [] if first else self._unlike()
-        self.proposed: Proposals = self.proposals
+        self.proposed = self.proposals
         """By the run."""
 
     def _check_out(self) -> None:
