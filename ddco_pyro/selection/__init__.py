@@ -71,7 +71,7 @@ def check(spec: Spec, demos: Demonstrations | None = None) -> list[Candidate]:
     demos = data.outline(wide) if demos is None and data.in_file(wide) else demos
     candidates = grid.candidates(spec, data.dimensions(wide, demos))
     if demos is None:  # they will be collected
-        assign(own.count - len(set(own.exclude)), spec.selection.folds, spec.seed)
+        assign([""] * (own.count - len(set(own.exclude))), spec.selection.folds, spec.seed)
     else:
         divide(demos, spec.selection.folds, spec.seed)
     return candidates

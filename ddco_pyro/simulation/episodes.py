@@ -13,6 +13,7 @@ from ddco_pyro.data.demonstrations import Demonstration
 from ddco_pyro.jobs import Workers, run_all
 from ddco_pyro.metrics import Measure
 from ddco_pyro.simulation.task import Policy, Task, find_task
+from ddco_pyro.spec import TASK
 from ddco_pyro.statistics import mean, rate
 
 
@@ -63,7 +64,7 @@ def run_episode(
                 frames.append(task.frame(environment))
             if step.last():
                 break
-            control = np.array(actor.act(step.observation), dtype=np.float64)
+            control = np.array(actor.act({TASK: task.name, **step.observation}), dtype=np.float64)
             keys = step.observation.keys() if keep is None else step.observation.keys() & set(keep)
             observations.append({key: np.array(step.observation[key]) for key in keys})
             controls.append(np.array(getattr(actor, "intended", control), dtype=np.float64))

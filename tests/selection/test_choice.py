@@ -197,10 +197,15 @@ def test_what_is_refused_has_a_line_each(grid, problems):
 def test_folds_are_an_even_partition(data):
     count = data.draw(st.integers(4, 60))
     folds, seed = data.draw(st.integers(2, count)), data.draw(st.integers(0, 2**32 - 1))
-    found = assign(count, folds, seed)
+    tasks = data.draw(st.lists(st.sampled_from("abc"), min_size=count, max_size=count) | st.just([""] * count))
+    found = assign(tasks, folds, seed)
     assert sorted(row for rows in found for row in rows) == list(range(count))
     assert {len(rows) for rows in found} <= {count // folds, -(-count // folds)}
-    assert found == assign(count, folds, seed)
+    assert found == assign(tasks, folds, seed)
+    if len({*tasks}) <= count / 2:
+        for task in {*tasks}:
+            shares = [sum(tasks[row] == task for row in rows) for rows in found]
+            assert max(shares) - min(shares) <= 1
 
 
 @pytest.mark.parametrize(
@@ -212,7 +217,7 @@ def test_folds_are_an_even_partition(data):
 )
 def test_too_few_demonstrations_are_refused(count, folds, message):
     with pytest.raises(FoldError, match=f"^{message}$"):
-        assign(count, folds, 0)
+        assign([""] * count, folds, 0)
 
 
 def test_what_its_author_set_apart_is_in_no_fold():

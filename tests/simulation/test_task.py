@@ -21,6 +21,20 @@ def test_a_task_is_found_by_module_and_name():
     assert find_task("toy_task:task") is toy_task.task
 
 
+def test_a_policy_sees_the_name_of_its_task():
+    class Seeing:
+        def reset(self, seed):
+            self.seen = set()
+
+        def act(self, observation):
+            self.seen.add(observation["task"])
+            return np.zeros(2)
+
+    policy = Seeing()
+    run_episode(toy_task.task, policy, 0)
+    assert policy.seen == {toy_task.task.name}
+
+
 def test_a_registered_task_whose_packages_are_missing_is_one_line(monkeypatch):
     point = EntryPoint("needs", "no_such_package.of_mine:task", TASKS)
     monkeypatch.setattr("ddco_pyro.simulation.task.entry_points", lambda group: [point])
