@@ -64,7 +64,8 @@ def run_episode(
                 frames.append(task.frame(environment))
             if step.last():
                 break
-            control = np.array(actor.act({TASK: task.name, **step.observation}), dtype=np.float64)
+            seen: dict[str, Any] = {TASK: task.name, **step.observation}
+            control = np.array(actor.act(seen), dtype=np.float64)
             keys = step.observation.keys() if keep is None else step.observation.keys() & set(keep)
             observations.append({key: np.array(step.observation[key]) for key in keys})
             controls.append(np.array(getattr(actor, "intended", control), dtype=np.float64))
