@@ -151,7 +151,7 @@ class Controller:
 
     def _chosen(self, now: Step, generators: Sequence[np.random.Generator]) -> tuple[Tensor, ...]:
         if self.options == "marginal":
-            self._log_marginal = arrive(self._log_marginal, now).message
+            self._log_marginal = arrive(self._log_marginal, now)
             sizes = self._log_marginal.shape[1:]  # C_D, ..., C_1
             if not sizes:
                 return ()

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ddco_pyro.acting.controller import ObservationError, Window, fitted, numbers, refuse_large
 from ddco_pyro.errors import BadInput, nearest
-from ddco_pyro.inference.filtering import Belief, Filter
+from ddco_pyro.inference.logspace import Filter
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs, States
 from ddco_pyro.model.outputs import Outputs
@@ -73,11 +73,11 @@ class Monitor:
 
     :param names: the names of the choices of each level, lowest first, such as ``fit.names``; by default numbers.
     :param lengths: how long choices remain active, for :meth:`progress`; ``fit.monitor(demos)`` has those of ``demos``.
-    :ivar belief: the exact belief after :meth:`step`, with the probabilities that options have just been selected.
+    :ivar belief: the exact belief after :meth:`step`, of each level [1, 1 + k], lowest first.
     :raises BadInput: ``hierarchy`` is something else.
     """
 
-    belief: Belief
+    belief: tuple[Tensor, ...]
 
     def __init__(
         self,
@@ -155,7 +155,7 @@ class Monitor:
                 tables = tables.with_evidence(recogniser.level, self._evidence(recogniser, inputs, scaled))
                 self.belief = self._filter.predict(complete(tables, ONE_STEP).steps()[0])
         probabilities = {}
-        for (level, names), choices in zip(self.names.items(), self.belief.choices, strict=True):
+        for (level, names), choices in zip(self.names.items(), self.belief, strict=True):
             probabilities[level] = dict(zip(names, choices[0].tolist(), strict=True))
             option = int(choices[0].argmax())
             before, steps = self._active.get(level, (option, 0))

@@ -17,7 +17,7 @@ from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, not_dem
 from ddco_pyro.data.memory import INFERENCE
 from ddco_pyro.data.tasks import with_task
 from ddco_pyro.inference.paths import Path, most_likely_path, sample_paths
-from ddco_pyro.inference.posteriors import Decomposition, Posterior, decompose, log_predictive, posterior
+from ddco_pyro.inference.posteriors import Posterior, log_predictive, posterior
 from ddco_pyro.model.batch import Batch, encode
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.outputs import Outputs
@@ -164,11 +164,6 @@ class Inferred:
         """
         every = self.drawn(row, lasts)
         return [np.array([(0, 0), *(within(at, step) for step, at in level.items())]) for level in every]
-
-    @cached_property
-    def decomposition(self) -> Decomposition:
-        """The contributions of each control dimension, and of the choice of options, to log p(ξ)."""
-        return decompose(self.outputs, self.batch)
 
 
 def started(options: np.ndarray, terminations: np.ndarray, lasts: bool) -> np.ndarray:

@@ -22,7 +22,7 @@ from ddco_pyro.events import OnEvent, ignore
 from ddco_pyro.fitting.draws import matched
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.inference import Posterior
-from ddco_pyro.inference.posteriors import Decomposition
+from ddco_pyro.inference.posteriors import log_predictive
 from ddco_pyro.metrics import (
     Agreement,
     Alike,
@@ -39,6 +39,7 @@ from ddco_pyro.metrics import (
     TrainedLabels,
     Use,
 )
+from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.outputs import Outputs
 from ddco_pyro.spec import LearnedStd, Spec, with_overrides
 from ddco_pyro.statistics import paired, worth
@@ -57,13 +58,15 @@ class _Part:
     """A model on a part of the demonstrations.
 
     :param values: log p(ξ) of each demonstration, nats, [N].
-    :param each: the decomposition of the same.
+    :param dimensions: the parts of the same that each control dimension in the model has, [N, A'].
+    :param options: and the part that the choice of options has, [N] (:func:`decompose`).
     :param segments: the most likely options [T] of each demonstration, for each level.
     :param recognised: the options that a recogniser alone finds, [T] of each demonstration; empty without one.
     """
 
     values: np.ndarray
-    each: Decomposition
+    dimensions: Tensor
+    options: Tensor
     segments: list[list[np.ndarray]]
     recognised: list[np.ndarray]
 
@@ -74,13 +77,41 @@ class _Part:
         choices = _as_own(fit, demos) if renumbered else lambda piece: piece.path.choices
         for piece in fit.infer(demos, held_out):
             values.append(_finite(fit, piece))
-            parts.append(piece.decomposition)
+            parts.append(decompose(piece.outputs, piece.batch))
             paths.append(choices(piece))
             if piece.recognised is not None:
                 rows = zip(piece.recognised.numpy(), piece.lengths, strict=True)
                 recognised += [row[:steps] for row, steps in rows]
         segments = [[row[row >= 0].numpy() for h in level for row in h] for level in zip(*paths, strict=True)]
-        return cls(np.concatenate(values), Decomposition.joined(parts), segments, recognised)
+        dimensions, options = (torch.cat(column) for column in zip(*parts, strict=True))
+        return cls(np.concatenate(values), dimensions, options, segments, recognised)
+
+
+def decompose(outputs: Outputs, batch: Batch) -> tuple[Tensor, Tensor]:
+    """log p(ξ) of N demonstrations in parts, float64 nats in the control's own units.
+
+    p_t is the belief over options before the control of step t, q_t the belief after it:
+
+        log p(ξ) = Σ_t log Σ_h p_t(h) π_h(a_t) = Σ_d Σ_t E_q_t[log π(a_td)] − Σ_t KL(q_t ‖ p_t).
+
+    :returns: Σ_t E_q_t[log π(a_td)] of the control dimensions in the model, [N, A'], and −Σ_t KL(q_t ‖ p_t), which is
+        at most 0, and 0 without options, [N].
+    """
+    exact, actions = outputs.map(lambda tensor: tensor.detach().double()), batch.actions.double()
+    tables = exact.tables(actions)
+    control = tuple(table.detach().requires_grad_() for table in tables.control)
+    value = log_predictive(replace(tables, control=control), batch.lengths)
+    actors = torch.autograd.grad(value.sum(), control)
+    with torch.no_grad():
+        value = value.detach()
+        alive = (batch.inputs.time < batch.lengths[:, None])[..., None, None]
+        dimensions = sum(
+            torch.where(alive, weight.unsqueeze(-1) * emission.by_dimension(actions), 0.0).sum((1, 2))
+            for emission, weight in zip(exact.emissions, actors, strict=True)
+            if emission is not None
+        )
+        assert isinstance(dimensions, Tensor)  # the lowest level emits the control
+        return dimensions, value - dimensions.sum(-1) if tables.depth else torch.zeros_like(value)
 
 
 def _as_own(fit: Fit, demos: Demonstrations) -> Callable[[Inferred], tuple[Tensor, ...]]:
@@ -161,7 +192,7 @@ def evaluate(
         }
     values, valid, depth = by_method[fitted.name], parts.get("valid"), fitted.hierarchy.depth
     per_step = {name: float(v.sum() / sum(parts[name].lengths)) for name, v in values.items()}
-    by_dimension = {name: _by_dimension(fitted, part.each, parts[name]) for name, part in ours.items()}
+    by_dimension = {name: _by_dimension(fitted, part, parts[name]) for name, part in ours.items()}
     held_out = {} if valid is None else {name: each["valid"] for name, each in by_method.items()}
     lengths = np.array([] if valid is None else valid.lengths, dtype=float)
     options, segments, alike = _options(fitted, demos, on_event) if depth else ([], [], [])
@@ -286,16 +317,16 @@ def _worst_first(
     return sorted(rows, key=lambda row: row.log_likelihood_per_step[ours])
 
 
-def _by_dimension(fit: Fit, each: Decomposition, demos: Demonstrations) -> Dimensions:
+def _by_dimension(fit: Fit, part: _Part, demos: Demonstrations) -> Dimensions:
     """The contributions of each control dimension, and of the choice of options, to the log-likelihood per step.
 
     Constant dimensions, which the model leaves out, have None.
     """
     scaling, steps = fit.hierarchy.scaling, sum(demos.lengths)
     values: list[float | None] = [None] * scaling.size
-    for dimension, value in zip(scaling.varying.tolist(), each.dimensions.sum(0).tolist(), strict=True):
+    for dimension, value in zip(scaling.varying.tolist(), part.dimensions.sum(0).tolist(), strict=True):
         values[dimension] = value / steps
-    return Dimensions(by_dimension=values, options=float(each.options.sum()) / steps)
+    return Dimensions(by_dimension=values, options=float(part.options.sum()) / steps)
 
 
 def _agreement(fit: Fit, ours: Mapping[str, _Part], parts: Mapping[str, Demonstrations]) -> Agreement | None:

@@ -44,4 +44,3 @@ def compile_all() -> None:
     tables = Tables((half,), (half,), (half[..., 0], half[..., 1]))
     log_likelihood(tables, one)
     segment(tables, one)
-    posteriors.log_predictive(tables, one)

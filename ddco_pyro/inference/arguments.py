@@ -39,20 +39,17 @@ def check(tables: Tables, lengths: Tensor) -> Tensor:
     :raises BadTables: a table is missing, has another shape or is not floating-point; a length is out of range; or a
         log-probability within the lengths is NaN or +inf.
     """
-    shapes = _shapes(tables)
-    number, steps = tables.control[-1].shape[:2]
-    for name, table in _named(tables):
-        expected = [number, steps, *shapes[name]]
-        if table is not None and (not table.is_floating_point() or list(table.shape) != expected):
-            raise BadTables(f"{name}: expected floating-point numbers {expected}; got {_described(table)}")
+    number, steps = _sizes(tables)
     lengths = check_lengths(lengths, number, steps)
     alive = torch.arange(steps, device=lengths.device) < lengths[:, None]
-    for name, table in _named(tables):
-        if table is not None:
-            bad = ~(table.detach() < torch.inf).flatten(2).all(-1) & alive  # NaN is not below either
-            if bool(bad.any()):
-                n, t = torch.nonzero(bad)[0].tolist()
-                raise BadTables(f"{name}: a log-probability of trajectory {n} at step {t} is NaN or +inf")
+    for name, table, shape in _expected(tables):
+        expected = [number, steps, *shape]
+        if not table.is_floating_point() or list(table.shape) != expected:
+            raise BadTables(f"{name}: expected floating-point numbers {expected}; got {_described(table)}")
+        bad = ~(table.detach() < torch.inf).flatten(2).all(-1) & alive  # NaN is not below either
+        if bool(bad.any()):
+            n, t = torch.nonzero(bad)[0].tolist()
+            raise BadTables(f"{name}: a log-probability of trajectory {n} at step {t} is NaN or +inf")
     return lengths
 
 
@@ -80,10 +77,10 @@ def refuse_impossible(possible: Tensor) -> None:
         raise BadTables(f"trajectory {n} has probability 0 whatever its options, so there is no posterior of its path")
 
 
-def _shapes(tables: Tables) -> dict[str, tuple[int, ...]]:
-    """The shape of each table at one step, by name; the number of choices follows from the selections.
+def _sizes(tables: Tables) -> tuple[int, int]:
+    """N and T, once there are tables of every level that say how many choices it has.
 
-    :raises BadTables: a table is missing, or has no such shape that N, T and the numbers of choices can be read.
+    :raises BadTables: a table is missing, or has another number of dimensions.
     """
     depth = tables.depth
     numbers = {"termination": depth, "control": depth + 1, "evidence": depth if tables.evidence else 0}
@@ -96,20 +93,19 @@ def _shapes(tables: Tables) -> dict[str, tuple[int, ...]]:
     last = tables.control[-1]
     if last.dim() != 3 or not len(last):
         raise BadTables(f"control[{depth}]: expected the shape [N, T, 1] with N at least 1; got {_described(last)}")
+    return last.shape[0], last.shape[1]
+
+
+def _expected(tables: Tables) -> Iterator[tuple[str, Tensor, tuple[int, ...]]]:
+    """Each table with its name and its shape at one step; numbers of choices follow from the selections."""
     options = [table.shape[-1] - 1 for table in tables.selection]
-    shapes: dict[str, tuple[int, ...]] = {f"control[{depth}]": (1,)}
     for level, (own, callers) in enumerate(zip(options, [*options[1:], 1], strict=False)):
-        shapes[f"selection[{level}]"] = (callers, 1 + own)
-        shapes[f"termination[{level}]"] = (own, 2)
-        shapes[f"control[{level}]"] = (own,)
-        shapes[f"evidence[{level}]"] = (1 + own,)
-    return shapes
-
-
-def _named(tables: Tables) -> Iterator[tuple[str, Tensor | None]]:
-    for name in ("selection", "termination", "control", "evidence"):
-        for level, table in enumerate(getattr(tables, name)):
-            yield f"{name}[{level}]", table
+        yield f"selection[{level}]", tables.selection[level], (callers, 1 + own)
+        yield f"termination[{level}]", tables.termination[level], (own, 2)
+        yield f"control[{level}]", tables.control[level], (own,)
+        if tables.evidence and (evidence := tables.evidence[level]) is not None:
+            yield f"evidence[{level}]", evidence, (1 + own,)
+    yield f"control[{tables.depth}]", tables.control[-1], (1,)
 
 
 def _described(given: Any) -> str:

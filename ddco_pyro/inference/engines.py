@@ -101,9 +101,6 @@ def _with_gradient(outputs: Outputs, engine: Callable[[Outputs], Tensor]) -> tup
 
 # --- Pyro's enumeration -----------------------------------------------------------------------------------------------
 
-BATCH_DIMENSIONS = 1
-"""Dimensions of the program's plate; enumeration takes the dimensions to their left."""
-
 
 def enumerated(
     tables: Tables, lengths: Tensor, emissions: Sequence[Steps | None] | None = None, actions: Tensor | None = None
@@ -119,7 +116,7 @@ def enumerated(
     chain = complete(tables, lengths)
     unused = ~chain.alive[..., None, None]  # may hold NaN
     chain = replace(chain, selection=tuple(table.masked_fill(unused, 0.0) for table in chain.selection))
-    with pyro.poutine.enum(first_available_dim=-1 - BATCH_DIMENSIONS), pyro.poutine.trace() as traced:
+    with pyro.poutine.enum(first_available_dim=-2), pyro.poutine.trace() as traced:  # the plate has dimension -1
         ahmm(chain, emissions, actions)
     trace = traced.trace
     trace.compute_log_prob()

@@ -49,39 +49,24 @@ class Eliminate(torch.autograd.Function):
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
         """The posteriors, weighted with ``upstream`` [N].
 
-        torch's ``once_differentiable`` refuses a second derivative only where ``upstream`` requires a gradient.
-        With respect to the tables it would silently be 0, so each gradient passes through :class:`_Refuse`.
+        :raises RuntimeError: a graph of the gradient is asked for, to differentiate again: it would silently be 0.
         """
-        leaves, needed = ctx.saved_tensors, ctx.needs_input_grad[4:]
-        with torch.no_grad():
-            tables = Tables.of(ctx.depth, leaves)
-            widest = reduce(torch.promote_types, (leaf.dtype for leaf in leaves if leaf is not None))
-            rows = ctx.rows.to(widest) * upstream.reshape(-1, 1, 1).to(widest)
-            parts, marginals = _split(tables, rows, any(needed[3 * ctx.depth + 1 :]))
-            each = *parts.leaves(), *(marginals or tables.evidence)
-            gradients = [
-                part.to(leaf.dtype) if want and part is not None else None
-                for part, leaf, want in zip(each, leaves, needed, strict=True)
-            ]
         if torch.is_grad_enabled():
-            inputs = [part for part in (upstream, *leaves) if part is not None and part.requires_grad]
-            gradients = [None if one is None else _Refuse.apply(one, *inputs) for one in gradients]
-        return None, None, None, None, *gradients
-
-
-class _Refuse(torch.autograd.Function):
-    """The identity, without a derivative with respect to ``inputs``."""
-
-    @staticmethod
-    def forward(ctx: Any, gradient: Tensor, *inputs: Tensor) -> Tensor:
-        return gradient.clone()
-
-    @staticmethod
-    def backward(ctx: Any, *upstream: Tensor) -> Any:
-        raise RuntimeError(
-            "the fused engine's gradient is the posterior, which it cannot differentiate again: "
-            "use engine='enumerate' where second derivatives are needed"
+            raise RuntimeError(
+                "the fused engine's gradient is the posterior, which it cannot differentiate again: "
+                "use engine='enumerate' where second derivatives are needed"
+            )
+        leaves, needed = ctx.saved_tensors, ctx.needs_input_grad[4:]
+        tables = Tables.of(ctx.depth, leaves)
+        widest = reduce(torch.promote_types, (leaf.dtype for leaf in leaves if leaf is not None))
+        rows = ctx.rows.to(widest) * upstream.reshape(-1, 1, 1).to(widest)
+        parts, marginals = _split(tables, rows, any(needed[3 * ctx.depth + 1 :]))
+        each = *parts.leaves(), *(marginals or tables.evidence)
+        gradients = (
+            part.to(leaf.dtype) if want and part is not None else None
+            for part, leaf, want in zip(each, leaves, needed, strict=True)
         )
+        return None, None, None, None, *gradients
 
 
 def log_likelihood(tables: Tables, lengths: Tensor) -> Tensor:
@@ -104,16 +89,10 @@ def _eliminated(tables: Tables, lengths: Tensor, marginals: bool, gradient: bool
     """The posteriors, or the derivatives of log p(ξ) with respect to the tables' entries."""
     with torch.no_grad():
         number, steps = len(lengths), tables.steps
-        if not tables.depth:
-            alive = torch.arange(steps) < lengths[:, None]
-            sums = logspace.log_likelihood(complete(tables, lengths))
-            acting = alive.double().unsqueeze(-1)
-            return Elimination(sums, Tables((), (), (acting,)), (), acting)
         structure = Structure.of(tables.sizes)
         gains = structure.columns + (sum(tables.sizes) if marginals else 0)
         found = torch.empty(number, steps, gains, dtype=torch.float64)
         value, exact = np.empty(number), np.empty(number, np.bool_)
-
         order = lengths.argsort(stable=True)
         blocks = torch.stack([lengths[block].sum() for block in order.split(kernel.LANES)])
 
@@ -132,41 +111,6 @@ def _eliminated(tables: Tables, lengths: Tensor, marginals: bool, gradient: bool
     for n in np.flatnonzero(~exact).tolist():
         _repeat_in_log_space(tables, n, int(lengths[n]), elimination, gradient)
     return elimination
-
-
-def predicted(tables: Tables, lengths: Tensor) -> Tensor:
-    """log p(h_t | s_0..t, a_0..t-1) of each joint choice, float64 [N, T, C_D, ..., C_1]; 0 past the lengths.
-
-    Controls before t count β times, evidence before t counts too.
-    """
-    found = torch.zeros(*tables.control[-1].shape[:2], *reversed(tables.sizes), dtype=torch.float64)
-    if not tables.depth:
-        return found
-    structure = Structure.of(tables.sizes)
-
-    def some(first: int, last: int) -> None:
-        longest, size = int(lengths[first:last].max()), structure.entries
-        rows, into = (
-            logarithms(tables.part(torch.arange(first, last), longest)).numpy(),
-            found[first:last].flatten(2).numpy(),
-        )
-        room = np.empty((longest + 1, size)), np.empty((longest, size))
-        kernel.predict(lengths[first:last].numpy(), rows, into, *room, structure.columns, *structure.tables)
-
-    kernel.on_threads(some, lengths)
-    return found
-
-
-def logarithms(tables: Tables) -> Tensor:
-    """Log-probabilities side by side, in the columns of :class:`~ddco_pyro.inference.kernel.Structure`, float64.
-
-    Densities of controls count β times.
-    """
-    rows = side_by_side(tables.normalised())
-    if tables.power != 1:
-        columns = Structure.of(tables.sizes).columns
-        rows[..., columns - 1 - sum(tables.sizes) + tables.depth : columns] *= tables.power
-    return rows
 
 
 def side_by_side(tables: Tables) -> Tensor:

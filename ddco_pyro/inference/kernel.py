@@ -1,8 +1,7 @@
 """The recursions of the AHMM over a trajectory, compiled; O(D·S) a step for S joint choices.
 
 :func:`eliminate` goes forward over probabilities and back for the gradient, with :data:`LANES` trajectories side by
-side. :func:`_predict` and :func:`_act` are the same forward recursion over logarithms of one trajectory;
-:func:`trace` goes back from there along paths.
+side. :func:`trace` is the same forward recursion over logarithms of one trajectory, and goes back along paths.
 
 :class:`Structure` numbers joint choices and messages. Row t of ``messages`` [1 + T, M] begins with the forward mass of
 the joint choices at t - 1. Above level 1 the row has the mass that terminated at every level below, at t. Row t of
@@ -192,15 +191,6 @@ largest = lanewise(lambda make, out, a, b: make.select(make.fcmp_ordered(">", a,
 smallest = lanewise(lambda make, out, a, b: make.select(make.fcmp_ordered("<", a, b), a, b))
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def as_float(typing: Any, bits: Any) -> Any:
-    """The float64 with these bits."""
-    return numba.float64(bits), lambda context, builder, _, given: builder.bitcast(given[0], ir.DoubleType())
-
-
-_as_float = cast(Callable[[Any], float], as_float)
-
-
 @inner
 def _exponentials(room: Array, first: int, last: int) -> None:
     """exp of the numbers of some rows, 0 below -708; relative error 2e-16. LLVM makes vector instructions of it."""
@@ -215,7 +205,8 @@ def _exponentials(room: Array, first: int, last: int) -> None:
         ) * r + 1 / 5040  # Taylor's series to r^11
         q = ((((q * r + 1 / 720) * r + 1 / 120) * r + 1 / 24) * r + 1 / 6) * r + 1 / 2
         q = (q * r + 1.0) * r + 1.0
-        values[i] = 0.0 if x < -708.0 else q * _as_float((np.int64(power) + 1023) << 52) + (x - x)  # NaN stays NaN
+        power_of_two = np.int64((np.int64(power) + 1023) << 52).view(np.float64)
+        values[i] = 0.0 if x < -708.0 else q * power_of_two + (x - x)  # NaN stays NaN
 
 
 @inner
@@ -441,14 +432,6 @@ def _plus(semiring: int, first: float, second: float) -> float:
 
 
 @inner
-def _begin(messages: Array) -> None:
-    """Fill ``messages[0]``: at t = 0 everything is selected."""
-    for i in range(messages.shape[1]):
-        messages[0, i] = -np.inf
-    messages[0, messages.shape[1] - 1] = 0.0
-
-
-@inner
 def _predict(
     semiring: int, t: int, n: int, rows: Array, messages: Array, spread: Array, callers: Array, actors: Array
 ) -> None:
@@ -489,25 +472,6 @@ def _act(
             total = _plus(semiring, total, mass)
         messages[t + 1, s] = mass
     return total
-
-
-@entry
-def predict(
-    lengths: Array, rows: Array, predicted: Array, messages: Array, spread: Array,
-    columns: int, callers: Array, actors: Array, choices: Array, above: Array,
-) -> None:  # fmt: skip
-    """Fill the ``predicted`` log-probabilities [N, T, S] of joint choices before the control of each step.
-
-    :param rows: log-probabilities.
-    """
-    for n in range(len(lengths)):
-        _begin(messages)
-        before = 0.0
-        for t in range(lengths[n]):
-            _predict(LOG_SUM, t, n, rows, messages, spread, callers, actors)
-            for s in range(len(actors)):
-                predicted[n, t, s] = spread[t, s] - before
-            before = _act(LOG_SUM, t, n, rows, columns, messages, spread, actors)
 
 
 @inner
@@ -561,31 +525,36 @@ def _back(
 
 @entry
 def trace(
-    semiring: int, lengths: Array, rows: Array, uniforms: Array, joint: Array, ended: Array, possible: Array,
-    messages: Array, spread: Array, columns: int, callers: Array, actors: Array,
-    choices: Array, above: Array,
+    semiring: int, lengths: Array, rows: Array, uniforms: Array, predicted: Array, joint: Array, ended: Array,
+    possible: Array, messages: Array, spread: Array, columns: int, callers: Array, actors: Array, choices: Array,
+    above: Array,
 ) -> None:  # fmt: skip
     """Fill the ``joint`` choices [N, M, T] of M paths, and how many levels ``ended`` before each. Paths are the most
     likely one (:data:`LARGEST`), or draws from p(ζ | ξ) (:data:`LOG_SUM`).
 
-    ``possible`` [N] says which trajectories have a probability above 0; nothing is filled for others.
+    ``possible`` [N] says which trajectories have a probability above 0; others have no paths.
 
     :param rows: log-probabilities.
     :param uniforms: numbers uniform in [0, 1), [N, M, 1 + T, 2·D]; zeros for the most likely path.
+    :param predicted: filled with the log-probabilities of joint choices before the control of each step, [N, T, S];
+        [N, 0, S] where they are not wanted.
     """
     for n in range(len(lengths)):
-        _begin(messages)
-        total = -np.inf
+        for i in range(messages.shape[1]):
+            messages[0, i] = -np.inf
+        messages[0, messages.shape[1] - 1] = 0.0  # at t = 0 everything is selected
+        total = 0.0
         for t in range(lengths[n]):
             _predict(semiring, t, n, rows, messages, spread, callers, actors)
+            for s in range(len(actors) if predicted.shape[1] > 0 else 0):
+                predicted[n, t, s] = spread[t, s] - total
             total = _act(semiring, t, n, rows, columns, messages, spread, actors)
         possible[n] = total > -np.inf
-        if possible[n]:
-            for m in range(joint.shape[1]):
-                _back(
-                    semiring, total, m, n, lengths[n], rows, messages, spread, uniforms, joint, ended, callers,
-                    actors, above,
-                )  # fmt: skip
+        for m in range(joint.shape[1] if possible[n] else 0):
+            _back(
+                semiring, total, m, n, lengths[n], rows, messages, spread, uniforms, joint, ended, callers, actors,
+                above,
+            )  # fmt: skip
 
 
 @entry

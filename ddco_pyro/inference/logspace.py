@@ -1,4 +1,4 @@
-"""Elimination of the latents in one structured pass in log space, O(D·S) a step for S joint choices.
+"""Elimination of the latents in log space, step by step, O(D·S) a step for S joint choices; and the online filter.
 
 The transition is a mixture over how far up the terminations reach, so a forward step never builds the S × S matrix.
 On the way up each level keeps its choice or passes its mass on. On the way down the selections spread the passed mass,
@@ -6,8 +6,6 @@ which joins the kept mass.
 """
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -29,26 +27,16 @@ def log_likelihood(chain: Chain) -> Tensor:
     message: Tensor | None = None
     for now in chain.steps():
         assert now.emission is not None  # nothing else can be scored
-        message = arrive(message, now).message + now.emission
+        message = arrive(message, now) + now.emission
     assert message is not None  # there is a step
     return log_sum(message.flatten(1))
 
 
-class Arrival(NamedTuple):
-    """Predicted log-mass at a step, before its control.
+def arrive(message: Tensor | None, now: Step) -> Tensor:
+    """The predicted log-mass of the joint choices at step t, before its control, [N, C_D, ..., C_1].
 
-    :param message: over the joint choices, [N, C_D, ..., C_1].
-    :param kept: the part that terminated below level d and kept its choice there, [N, C_D, ..., C_d] for each level.
-    :param selected: the part that selected a choice at level d, of the same shapes.
+    :param message: that at t - 1, with its control; None for t = 0.
     """
-
-    message: Tensor
-    kept: list[Tensor]
-    selected: list[Tensor]
-
-
-def arrive(message: Tensor | None, now: Step) -> Arrival:
-    """The prediction for step t from the log-mass over the joint choices at t - 1, None for t = 0."""
     kept: list[Tensor] = []
     if message is None:
         message = torch.zeros(len(now.alive), dtype=torch.float64, device=now.alive.device)  # everything is selected
@@ -57,13 +45,12 @@ def arrive(message: Tensor | None, now: Step) -> Arrival:
             keep, terminate = _along_last(table[..., 0], message), _along_last(table[..., 1], message)
             kept.append(message + keep)
             message = log_sum(message + terminate)
-    selected: list[Tensor] = []
     for level in range(len(now.selection), 0, -1):
         table = now.selection[level - 1]
         table = table.squeeze(1) if level == len(now.selection) else _along_last_two(table, message)
-        selected.insert(0, message.unsqueeze(-1) + table)
-        message = log_sum(torch.stack([selected[0], kept[level - 1]], dim=-1)) if kept else selected[0]
-    return Arrival(message, kept, selected)
+        selected = message.unsqueeze(-1) + table
+        message = log_sum(torch.stack([selected, kept[level - 1]], dim=-1)) if kept else selected
+    return message
 
 
 def _along_last(table: Tensor, message: Tensor) -> Tensor:
@@ -80,3 +67,46 @@ def marginal(joint: Tensor, level: int) -> Tensor:
     """[N, T, C_D, ..., C_1] summed to the choices of level d, [N, T, C_d]."""
     others = [dim for dim in range(2, joint.dim()) if dim != joint.dim() - level]
     return joint.sum(others) if others else joint
+
+
+class Filter:
+    """An exact online filter: call :meth:`predict` with each step's tables, then :meth:`update` with its control.
+
+    Evidence in a step's tables conditions the belief at this step and later ones; it has to be of the past alone.
+
+    :param power: β, how many times the log-density of a control counts in later beliefs.
+    :ivar log_likelihood: log p(a_0..t-1 | s) so far, [N] nats.
+    """
+
+    def __init__(self, power: float = 1.0) -> None:
+        self.power = power
+        self.log_likelihood = torch.zeros(1, dtype=torch.float64)
+        self._message: Tensor | None = None
+
+    def predict(self, now: Step) -> tuple[Tensor, ...]:
+        """p(h^d_t | s_0..t, a_0..t-1) of every level, lowest first, each float64 [N, C_d]."""
+        message = arrive(self._message, now)
+        self._message = message if now.evidence is None else _normalised(message + now.evidence)
+        joint = self._message.exp().unsqueeze(1)
+        return tuple(marginal(joint, level).squeeze(1) for level in range(1, 1 + len(now.selection)))
+
+    def update(self, density: Tensor) -> None:
+        """Condition on the applied control, given its log-density for each joint choice, [N, C_D, ..., C_1].
+
+        :raises ValueError: the control has probability 0.
+        """
+        assert self._message is not None  # predict() has been called
+        total = _log_mass(self._message + density)
+        if not bool(torch.isfinite(total).all()):
+            raise ValueError("the control has probability 0 under every choice; is it in the demonstrations' units?")
+        self.log_likelihood = self.log_likelihood + total
+        self._message = _normalised(self._message + self.power * density)
+
+
+def _log_mass(message: Tensor) -> Tensor:
+    """The logarithm of the mass of all joint choices, [N]."""
+    return log_sum(message.flatten(1)) if message.dim() > 1 else message
+
+
+def _normalised(message: Tensor) -> Tensor:
+    return message - _log_mass(message).reshape(-1, *(1,) * (message.dim() - 1))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, cast
+from typing import ClassVar, cast
 
 import pyro
 import torch
@@ -56,14 +56,6 @@ class EliminatedAHMM(TorchDistribution):
         if value.shape != expected:
             raise BadTables(f"controls: expected the shape {list(expected)}; got {list(value.shape)}")
         return log_likelihood(self.outputs.tables(value), self.lengths)
-
-    def expand(self, batch_shape: Sequence[int], _instance: Any = None) -> EliminatedAHMM:
-        """The same distribution; no other batch shape is possible."""
-        if torch.Size(batch_shape) != self.batch_shape:
-            raise ValueError(
-                f"a batch of {len(self.lengths)} demonstrations cannot be expanded to {tuple(batch_shape)}"
-            )
-        return self
 
     def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:
         """Controls [N, T, A] in scaled units along the same observations; 0 past the lengths."""

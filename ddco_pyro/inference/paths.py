@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ddco_pyro.inference import kernel
 from ddco_pyro.inference.arguments import refuse_impossible
-from ddco_pyro.inference.fused import logarithms
+from ddco_pyro.inference.fused import side_by_side
 from ddco_pyro.inference.kernel import Structure
 from ddco_pyro.model.tables import Tables
 
@@ -84,23 +84,22 @@ def segment(tables: Tables, lengths: Tensor) -> tuple[Tensor, ...]:
     return most_likely_path(tables, lengths).choices
 
 
+def predicted(tables: Tables, lengths: Tensor) -> Tensor:
+    """log p(h_t | s_0..t, a_0..t-1) of each joint choice, float64 [N, T, C_D, ..., C_1]; 0 past the lengths.
+
+    Controls before t count β times, evidence before t counts too.
+    """
+    found = torch.zeros(len(lengths), tables.steps, *reversed(tables.sizes), dtype=torch.float64)
+    no_paths = np.empty((0, len(lengths), 0, 0))
+    _recursion(tables, lengths, kernel.LOG_SUM, no_paths, found.flatten(2).numpy())
+    return found
+
+
 def _trace(tables: Tables, lengths: Tensor, semiring: int, uniforms: np.ndarray) -> Path:
     if not tables.depth:
         return Path((), ())
-    structure, uniforms = Structure.of(tables.sizes), np.ascontiguousarray(uniforms.swapaxes(0, 1))
-    joint, ended = np.full((2, *uniforms.shape[:2], tables.steps), -1, dtype=np.int64)
-    possible = np.empty(len(uniforms), dtype=np.bool_)
-
-    def some(first: int, last: int) -> None:
-        longest, size, own = int(lengths[first:last].max()), structure.entries, slice(first, last)
-        rows = logarithms(tables.part(torch.arange(first, last), longest)).numpy()
-        room = np.empty((longest + 1, size)), np.empty((longest, size))
-        kernel.trace(
-            semiring, lengths[own].numpy(), rows, uniforms[own], joint[own], ended[own], possible[own], *room,
-            structure.columns, *structure.tables,
-        )  # fmt: skip
-
-    kernel.on_threads(some, lengths)
+    structure = Structure.of(tables.sizes)
+    joint, ended, possible = _recursion(tables, lengths, semiring, uniforms, np.empty((len(lengths), 0, 0)))
     refuse_impossible(torch.from_numpy(possible))
     joint, ended = joint.swapaxes(0, 1), ended.swapaxes(0, 1)
     digits = structure.choices.T - structure.choices[0][:, None]
@@ -109,3 +108,26 @@ def _trace(tables: Tables, lengths: Tensor, semiring: int, uniforms: np.ndarray)
         tuple(torch.from_numpy(np.append(digit, -1)[joint]) for digit in digits),  # -1, past the end, is the last entry
         tuple(torch.from_numpy(np.append(end.astype(np.int64), -1)[ended]) for end in ends),
     )
+
+
+def _recursion(
+    tables: Tables, lengths: Tensor, semiring: int, uniforms: np.ndarray, into: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """:func:`ddco_pyro.inference.kernel.trace` of all trajectories: joint choices, ended levels, what is possible."""
+    structure, uniforms = Structure.of(tables.sizes), np.ascontiguousarray(uniforms.swapaxes(0, 1))
+    joint, ended = np.full((2, *uniforms.shape[:2], tables.steps), -1, dtype=np.int64)
+    possible = np.empty(len(uniforms), dtype=np.bool_)
+    controls = slice(structure.columns - 1 - sum(tables.sizes) + tables.depth, structure.columns)
+
+    def some(first: int, last: int) -> None:
+        longest, size, own = int(lengths[first:last].max()), structure.entries, slice(first, last)
+        rows = side_by_side(tables.part(torch.arange(first, last), longest).normalised())
+        rows[..., controls] *= tables.power
+        room = np.empty((longest + 1, size)), np.empty((longest, size))
+        kernel.trace(
+            semiring, lengths[own].numpy(), rows.numpy(), uniforms[own], into[own], joint[own], ended[own],
+            possible[own], *room, structure.columns, *structure.tables,
+        )  # fmt: skip
+
+    kernel.on_threads(some, lengths)
+    return joint, ended, possible

@@ -13,8 +13,8 @@ from random_demonstrations import numbered
 from scipy import stats
 
 from ddco_pyro.evaluation.options import Finding, diagnose, divergences, option_use, segments_of
+from ddco_pyro.fitting.evaluation import decompose
 from ddco_pyro.inference import Posterior, posterior
-from ddco_pyro.inference.posteriors import decompose
 from ddco_pyro.metrics import Alike, Segments, Use
 from ddco_pyro.model.batch import Batch, encode
 from ddco_pyro.model.emissions import Gaussian
@@ -173,8 +173,8 @@ def test_parts_are_those_of_every_path_so_far(counts: tuple[int, ...], emits: tu
     batch = encode(DEMOS, hierarchy.encoder, hierarchy.scaling)
     with torch.no_grad():
         outputs = hierarchy(batch.inputs).map(torch.Tensor.double)
-    found = decompose(outputs, batch)
-    assert found.dimensions.shape == (2, 2)
+    by_dimension, of_options = decompose(outputs, batch)
+    assert by_dimension.shape == (2, 2)
     tables = outputs.tables(batch.actions.double())
     for n, length in enumerate(LENGTHS):
         densities = _densities(hierarchy, outputs, batch, n)
@@ -185,9 +185,9 @@ def test_parts_are_those_of_every_path_so_far(counts: tuple[int, ...], emits: tu
                 after = before * math.exp(given.sum() - step.value)
                 dimensions += after * given
                 options += after * (math.log(before) - math.log(after))
-        np.testing.assert_allclose(found.dimensions[n], dimensions, rtol=1e-9)
-        np.testing.assert_allclose(found.options[n], options, rtol=1e-9, atol=1e-12)
-        assert found.options[n] < 0 if counts else found.options[n] == 0
+        np.testing.assert_allclose(by_dimension[n], dimensions, rtol=1e-9)
+        np.testing.assert_allclose(of_options[n], options, rtol=1e-9, atol=1e-12)
+        assert of_options[n] < 0 if counts else of_options[n] == 0
 
 
 def _actor(choices: tuple[int, ...]) -> tuple[int, int]:

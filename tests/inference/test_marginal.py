@@ -105,7 +105,5 @@ def test_log_prob_is_the_likelihood_and_other_shapes_are_refused():
     torch.testing.assert_close(
         distribution.log_prob(batch.actions), log_likelihood(hierarchy.tabulate(batch), batch.lengths)
     )
-    with pytest.raises(ValueError, match="cannot be expanded"):
-        distribution.expand((7,))
     with pytest.raises(ValueError, match="one draw at a time"):
         distribution.sample((2,))
