@@ -91,7 +91,7 @@ hierarchy:
   levels: [{{count: 3, policy: {{network: linear}}, termination: {{network: linear}}}}]
   meta_policy: {{network: linear}}
 training: {{optimizer: {{name: em}}, starts: [vq, vq, vq], tune_fraction: 0}}
-inference: {{engine: fused}}   # or enumerate, Pyro's own: the same numbers, slower
+inference: fused   # or enumerate, Pyro's own: the same numbers, slower
 compare_with: []
 """
 spec = parse_spec(yaml.safe_load(SPEC))

@@ -239,13 +239,6 @@ class ControlSpec(DistributionSpec):
                 dimensions[dimension] = part.name
 
 
-class InferenceSpec(Model):
-    """How the latent variables are eliminated."""
-
-    engine: Literal["fused", "enumerate"] = "fused"
-    """``fused``: one compiled pass; ``enumerate``: Pyro's enumeration. Both give the same numbers."""
-
-
 class SelectionSpec(Model):
     """Cross-validation over a grid."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 from pydantic import Field, ValidationError, model_validator
 
@@ -16,7 +16,6 @@ from ddco_pyro.spec.settings import (
     TASK,
     ControlSpec,
     DemonstrationsSpec,
-    InferenceSpec,
     Observation,
     ReportSpec,
     RolloutSpec,
@@ -54,8 +53,9 @@ class Spec(Model):
     """Baselines trained on the same split, for the report."""
     training: TrainingSpec = TrainingSpec()
     """How the model is trained."""
-    inference: InferenceSpec = InferenceSpec()
-    """How the latent variables are eliminated."""
+    inference: Literal["fused", "enumerate"] = "fused"
+    """How latent variables are summed out: ``fused``, one compiled pass, or ``enumerate``, Pyro's enumeration. Both give
+    the same numbers."""
     selection: SelectionSpec = SelectionSpec()
     """Cross-validation over a grid."""
     rollout: RolloutSpec = RolloutSpec()

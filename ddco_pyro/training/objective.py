@@ -135,7 +135,7 @@ class Objective:
         """
         if self.constants is not None:
             return expected(tables, lengths, self.constants)
-        likelihood = partial(log_likelihood, lengths=lengths, engine=self.data.spec.inference.engine)
+        likelihood = partial(log_likelihood, lengths=lengths, engine=self.data.spec.inference)
         if self.stage.selecting:
             levels, meta_policy = tables.apart()
             return likelihood(levels) + likelihood(meta_policy)

@@ -194,7 +194,7 @@ class Trainer:
         if not check.agrees:
             raise TrainingError(
                 f"the engines disagree (value {check.value:.1e}, gradient {check.gradient:.1e}): "
-                "this is a defect; use inference.engine=enumerate and report it"
+                "this is a defect; use inference=enumerate and report it"
             )
 
     def _prior_gap(self, library: Prior, batch: Batch) -> float:

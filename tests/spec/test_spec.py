@@ -42,7 +42,7 @@ training:
   optimizer: {name: adam, lr: 1.0e-3}
   epochs: 200
   batch_size: 16
-inference: {engine: fused}
+inference: fused
 selection: {folds: 10, grid: {hierarchy.levels.0.count: [1, 2, 3, 4, 5, 6, 7, 8]}}
 rollout: {episodes: 50}
 seed: 0

@@ -210,7 +210,7 @@ def test_both_engines_train_to_the_same_model(tmp_path):
     demos = of_states([5] * 6)
     states = []
     for engine in ("fused", "enumerate"):
-        spec = with_overrides(make_spec((2,), epochs=8, control={"std": 1.0}), {"inference.engine": engine})
+        spec = with_overrides(make_spec((2,), epochs=8, control={"std": 1.0}), {"inference": engine})
         states.append(make_trainer(spec, demos, tmp_path / engine).run().state_dict())
     for name, value in states[0].items():
         torch.testing.assert_close(states[1][name], value, rtol=1e-3, atol=1e-5)
