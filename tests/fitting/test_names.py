@@ -148,7 +148,7 @@ def test_names_are_shown_wherever_options_are(files):
     controller.act({"place": place})
     assert controller.active == {"skill": fit.names["skill"][controller.choices[0]]}
     active = monitor.step({"place": place})
-    assert active["skill"]["pick & place"] == pytest.approx(float(monitor.belief.choices[0][0, 2]))
+    assert active["skill"]["pick & place"] == pytest.approx(float(monitor.belief[0][0, 2]))
     write_numpy(fit, files)
     about = json.loads((files / "controller.json").read_text())
     assert about["names"] == {"skill": ["control", "<go>", "pick & place", "on"]}

@@ -95,7 +95,7 @@ def test_a_run_that_is_read_again_emits_and_takes_them(whole: Fit, reduced: Fit,
         observation = {"state": random.normal(size=3)}
         for monitor, columns in zip(monitors, (slice(None), FREE), strict=True):
             monitor.step(observation, None if given is None else given[columns])
-        torch.testing.assert_close(*(monitor.belief.levels for monitor in monitors), rtol=0, atol=0)
+        torch.testing.assert_close(*(monitor.belief for monitor in monitors), rtol=0, atol=0)
         given = acting.act(observation)
         assert given.shape == (4,)
         assert {d: given[d] for d in STILL} == STILL
