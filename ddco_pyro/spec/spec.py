@@ -54,8 +54,8 @@ class Spec(Model):
     training: TrainingSpec = TrainingSpec()
     """How the model is trained."""
     inference: Literal["fused", "enumerate"] = "fused"
-    """How latent variables are summed out: ``fused``, one compiled pass, or ``enumerate``, Pyro's enumeration. Both give
-    the same numbers."""
+    """How latent variables are summed out: ``fused``, one compiled pass, or ``enumerate``, Pyro's enumeration. Both
+    give the same numbers."""
     selection: SelectionSpec = SelectionSpec()
     """Cross-validation over a grid."""
     rollout: RolloutSpec = RolloutSpec()

@@ -21,7 +21,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import torch
@@ -62,13 +62,6 @@ BIAS = 1e-6
 
 Score = Callable[[Tables, Batch, Tensor], Tensor]
 """What is maximised of a piece of the demonstrations, nats: its tables, itself, and its rows."""
-
-
-def is_linear(model: Hierarchy) -> bool:
-    """Whether every network of a hierarchy is linear in the observations, or constant, so that EM applies."""
-    return model.trunk is None and all(
-        isinstance(network, Mlp) and network.is_linear for network in model.networks().values()
-    )
 
 
 class Features:
@@ -114,31 +107,24 @@ class Features:
 
 @dataclass
 class Sums:
-    """Sums over all steps for one network: the gradient of W, [K, F, n], and the information of groups of outputs.
+    """Sums over all steps for one network.
 
-    :ivar groups: by their first output and the one after their last; of the last piece.
-    :ivar information: the matrix of each group.
-    :ivar counts: how many controls each group stands for, [K].
+    :ivar gradient: in W, [K, F, n].
+    :ivar std: the gradient in σ, [K, C].
+    :ivar groups: of outputs, by the first: the group, of the last piece, its matrix of information, and how many
+        controls it stands for, [K].
     """
 
     gradient: Tensor | float = 0.0
     std: Tensor | float = 0.0
-    groups: dict[tuple[int, int], Information] = field(default_factory=dict)
-    information: dict[tuple[int, int], Tensor] = field(default_factory=dict)
-    counts: dict[tuple[int, int], Tensor] = field(default_factory=dict)
-
-    def add_gradient(self, gradient: Tensor, std: Tensor | None, power: float) -> None:
-        """Add that of a piece: of W, and of σ where densities count ``power`` times."""
-        self.gradient = self.gradient + gradient
-        self.std = self.std + (0.0 if std is None else std / power)
+    groups: dict[int, tuple[Information, Tensor, Tensor]] = field(default_factory=dict)
 
     def add_information(self, group: Information, moments: Tensor) -> None:
         """Add that of a piece from the moments of its weights."""
-        place = group.columns.start, group.columns.stop
-        self.information[place] = self.information.get(place, 0.0) + moments.unflatten(0, group.weight.shape[2:])
+        _, information, count = self.groups.get(group.columns.start, (None, 0.0, 0.0))
+        information = information + moments.unflatten(0, group.weight.shape[2:])
         number = group.weight if group.count is None else group.count
-        self.counts[place] = self.counts.get(place, 0.0) + number.sum((0, 1))
-        self.groups[place] = group
+        self.groups[group.columns.start] = group, information, count + number.sum((0, 1))
 
 
 class Linear:
@@ -149,8 +135,7 @@ class Linear:
     """
 
     def __init__(self, network: nn.Module, ridge: float, trained: bool, library: nn.Module | None = None) -> None:
-        assert isinstance(network, Mlp)  # is_linear
-        self.ridge, self.trained, self.reads = ridge, trained, tuple(network.reads)
+        self.ridge, self.trained, self.reads = ridge, trained, tuple(cast(Mlp, network).reads)
         self.layer = _layer(network)
         self.weight = _weight(self.layer)
         self._center = torch.zeros_like(self.weight) if library is None else _weight(_layer(library))
@@ -168,10 +153,8 @@ class Linear:
 
 
 def _layer(network: nn.Module) -> StackedLinear:
-    assert isinstance(network, Mlp)  # is_linear
-    (layer,) = network.layers
-    assert isinstance(layer, StackedLinear)
-    return layer
+    """The only layer of a linear network."""
+    return cast(StackedLinear, cast(Mlp, network).layers[0])
 
 
 def _weight(layer: StackedLinear) -> Tensor:
@@ -188,12 +171,9 @@ class Std:
     def __init__(self, caller: Caller, trained: bool, count: float = 0.0, library: Caller | None = None) -> None:
         assert caller.std is not None
         self.module, self.trained, self.count = caller.std, trained, count
+        self.learned = [*caller.std.own, *caller.std.shared]
         self.value = _stds(caller)
         self._known = None if library is None else _stds(library)
-
-    @property
-    def learned(self) -> list[int]:
-        return [*self.module.own, *self.module.shared]
 
     @property
     def penalty(self) -> float:
@@ -289,12 +269,11 @@ class Expectation:
 
     def objective(self, batch: Batch) -> float:
         """The penalised log-likelihood of all demonstrations, nats."""
-        value, sums = self._expect(batch)
-        return value + self._penalty(sums)
+        return self._expect(batch)[1]
 
     def log_prior(self, batch: Batch) -> float:
         """The log-density of the prior of what is trained, up to a constant, nats."""
-        return self._penalty(self._expect(batch)[1])
+        return self._penalty(self._expect(batch)[2])
 
     def step(self, batch: Batch) -> float:
         """One EM step over the demonstrations; their log-likelihood before the step, nats.
@@ -302,21 +281,15 @@ class Expectation:
         All steps are over the same demonstrations, whose features are kept.
         Where the last step lowered the penalised log-likelihood, that step is halved first.
         """
-        value, sums = self._expect(batch)
-        penalised = value + self._penalty(sums)
+        value, penalised, sums = self._expect(batch)
         stretch = min(GROWTH * self.stretch, FARTHEST)
-        for _ in range(HALVINGS):
+        for halvings in range(1 + HALVINGS):
             if self._before is None or penalised >= self.value - 1e-9 * abs(self.value):
                 break
             now, stretch = self._state(), 1.0
-            self._restore({name: 0.5 * (old + now[name]) for name, old in self._before.items()})
-            value, sums = self._expect(batch)
-            penalised = value + self._penalty(sums)
-        else:
-            assert self._before is not None
-            self._restore(self._before)
-            value, sums = self._expect(batch)
-            penalised = value + self._penalty(sums)
+            half = {name: 0.5 * (old + now[name]) for name, old in self._before.items()}
+            self._restore(half if halvings < HALVINGS else self._before)
+            value, penalised, sums = self._expect(batch)
         gain = (penalised - self.value) / self.steps
         self.gain, self._last = max(gain, self._last), gain
         self.value, self._before = penalised, self._state()
@@ -362,7 +335,7 @@ class Expectation:
             caller = self._callers.get(name)
             choices = each.shape[1] if caller is None else caller.sizes[0]
             each[:, choices:] = self._penalties(away[..., choices:], self._ridge.policy)
-            for group in sums[name].groups.values():
+            for group, *_ in sums[name].groups.values():
                 if group.std:
                     std, places = self._stds[name], list(group.std)
                     squares = self._penalties(away[..., group.columns], self._ridge.policy)
@@ -382,8 +355,8 @@ class Expectation:
         """Σ_f ρ_f W_f² of each copy and output, [K, n]."""
         return (_ridges(away.shape[1], ridge, self._bias).unsqueeze(-1) * away.square()).sum(1)
 
-    def _expect(self, batch: Batch) -> tuple[float, dict[str, Sums]]:
-        """The E-step: the score, and the sums that the M-step solves for each network that is trained."""
+    def _expect(self, batch: Batch) -> tuple[float, float, dict[str, Sums]]:
+        """The E-step: the score, also penalised, and the sums that the M-step solves for each trained network."""
         total, sums = 0.0, {name: Sums() for name, network in self._networks.items() if network.trained}
         if not self._pieces:
             order = batch.by_length[:: math.ceil(batch.steps / MOST) if self._roughly else 1]
@@ -392,7 +365,7 @@ class Expectation:
             self.steps = chosen.steps
         for piece in self._pieces:
             total += self._expect_piece(*piece, sums)
-        return total, sums
+        return total, total + self._penalty(sums), sums
 
     def _expect_piece(
         self, rows: Tensor, piece: Batch, xs: dict[tuple[str, ...], Features], sums: dict[str, Sums]
@@ -466,7 +439,9 @@ class Expectation:
                 pairs = [(name, group) for name in its for group in learned.get(name, ())]
                 each = [group.weight.flatten(0, 1).flatten(1) for _, group in pairs]
                 for name, gradient in zip(its, gradients, strict=True):
-                    sums[name].add_gradient(gradient, of_std.get(name), power)
+                    sums[name].gradient = sums[name].gradient + gradient
+                    if (of_sigma := of_std.get(name)) is not None:
+                        sums[name].std = sums[name].std + of_sigma / power  # densities count that many times
                 for (name, group), part in zip(pairs, x.moments(each), strict=True):
                     sums[name].add_information(group, part)
         return float(value.detach())
@@ -480,20 +455,23 @@ class Expectation:
             change = torch.zeros_like(network.weight)
             std = self._stds.get(name)
             value = None if std is None else std.value
-            for place, information in own.information.items():
-                group, columns = own.groups[place], own.groups[place].columns
+            for group, information, count in own.groups.values():
+                columns = group.columns
                 gradient, away = own.gradient[..., columns], network.away[..., columns]
                 if group.std:
                     assert std is not None
-                    scale = std.value[:, list(group.std)].unsqueeze(1)  # [K, 1, n]
-                    ridge = _ridges(away.shape[1], self._ridge.policy, self._bias)
-                    solved = torch.linalg.solve(
-                        information + ridge.diag(), scale.square() * gradient - ridge.unsqueeze(-1) * away
-                    )
-                    count = own.counts[place]
-                    square = self._squares(std, own.std, group, information, count, gradient, away, solved)
-                    square, count = square + std.squares(group.std), count + self._prior_count(away) + std.count
                     assert value is not None
+                    assert isinstance(own.std, Tensor)
+                    sigma = std.value[:, list(group.std)]
+                    variance = sigma.square()
+                    ridge = _ridges(away.shape[1], self._ridge.policy, self._bias)
+                    right = variance.unsqueeze(1) * gradient - ridge.unsqueeze(-1) * away
+                    solved = torch.linalg.solve(information + ridge.diag(), right)
+                    # Σ w E[(a - W^T x)²] from the gradient in σ (Fisher's identity), then that of W'
+                    square = variance * (count.unsqueeze(1) + sigma * own.std[:, list(group.std)])
+                    moved = (solved * (information @ solved)).sum(1) - 2 * variance * (solved * gradient).sum(1)
+                    square = square + moved + self._penalties(away + solved, self._ridge.policy)
+                    square, count = square + std.squares(group.std), count + self._prior_count(away) + std.count
                     value = std.updated(value, square, count, group.std)
                 else:
                     emitted = name in self._callers and columns.start >= self._callers[name].sizes[0]
@@ -503,19 +481,6 @@ class Expectation:
             network.weight = network.weight + change
             if std is not None and std.trained and value is not None:
                 std.value = value
-
-    def _squares(
-        self, std: Std, of_std: Tensor | float, group: Information, information: Tensor, count: Tensor,
-        gradient: Tensor, away: Tensor, change: Tensor,
-    ) -> Tensor:  # fmt: skip
-        """Σ w E[(a - W'^T x)²] + Σ_f ρ_f (W' - W0)_f² of each copy and dimension, [K, n], from the gradient in σ
-        (Fisher's identity).
-        """
-        assert isinstance(of_std, Tensor)
-        sigma = std.value[:, list(group.std)]
-        before = sigma.square() * (count.unsqueeze(1) + sigma * of_std[:, list(group.std)])
-        moved = (change * (information @ change)).sum(1) - 2 * sigma.square() * (change * gradient).sum(1)
-        return before + moved + self._penalties(away + change, self._ridge.policy)
 
 
 @cache

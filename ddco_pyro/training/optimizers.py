@@ -13,7 +13,7 @@ from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks.perceptrons import Mlp, PerTimestep
 from ddco_pyro.spec import OptimizerSpec
-from ddco_pyro.training.em import TOLERANCE, is_linear
+from ddco_pyro.training.em import TOLERANCE
 
 
 def optimizer_of(spec: OptimizerSpec, model: Hierarchy) -> str:
@@ -30,6 +30,13 @@ def optimizer_of(spec: OptimizerSpec, model: Hierarchy) -> str:
     exact = all(isinstance(network, Mlp | PerTimestep) for network in networks)
     random = any(isinstance(module, nn.Dropout) and module.p > 0 for module in model.modules())
     return "lbfgs" if model.depth == 0 and exact and not random else "adam"
+
+
+def is_linear(model: Hierarchy) -> bool:
+    """Whether every network of a hierarchy is linear in the observations, or constant, so that EM applies."""
+    return model.trunk is None and all(
+        isinstance(network, Mlp) and network.is_linear for network in model.networks().values()
+    )
 
 
 # --- gradient steps on minibatches ------------------------------------------------------------------------------------

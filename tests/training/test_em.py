@@ -42,8 +42,9 @@ from ddco_pyro.model.emissions import KINDS
 from ddco_pyro.model.outputs import bounded
 from ddco_pyro.spec import RidgeSpec, parse_spec, with_overrides
 from ddco_pyro.training import em
-from ddco_pyro.training.em import Expectation, is_linear
+from ddco_pyro.training.em import Expectation
 from ddco_pyro.training.networks import Dimensions
+from ddco_pyro.training.optimizers import is_linear
 from ddco_pyro.training.restarts import Trainer
 from ddco_pyro.training.ridge import cross_validated
 
