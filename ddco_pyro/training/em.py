@@ -284,7 +284,7 @@ class Expectation:
         value, penalised, sums = self._expect(batch)
         stretch = min(GROWTH * self.stretch, FARTHEST)
         for halvings in range(1 + HALVINGS):
-            if self._before is None or penalised >= self.value - 1e-9 * abs(self.value):
+            if self._before is None or (halvings < HALVINGS and penalised >= self.value - 1e-9 * abs(self.value)):
                 break
             now, stretch = self._state(), 1.0
             half = {name: 0.5 * (old + now[name]) for name, old in self._before.items()}
