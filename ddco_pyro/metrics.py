@@ -292,6 +292,12 @@ class Worth(Record, Generic[T]):
     total: LeftOut[T | None] = None
     flat: LeftOut[str | None] = None
 
+    @property
+    def parts(self) -> dict[str, T]:
+        """The parts that there are, by name."""
+        each = {"memory": self.memory, "experts": self.experts, "total": self.total}
+        return {name: part for name, part in each.items() if part}
+
 
 class Seeds(Record):
     """Results of a fit and its repetitions, in the order of their training seeds.

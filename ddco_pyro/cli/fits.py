@@ -138,10 +138,10 @@ def fit_and_report(
     """Do what ``fit`` does with a spec that is read from ``spec``."""
     from ddco_pyro.cli import console
     from ddco_pyro.fitting.fit import fit as fitted_to
-    from ddco_pyro.fitting.seeds import check_seeds, repeat
+    from ddco_pyro.fitting.fit import repeat, training_seeds
 
     if seeds is not None:
-        check_seeds(loaded, seeds)
+        training_seeds(loaded, seeds)  # or they are refused
     repeated = () if seeds is None else ("--seeds", str(seeds))
     more = [word for name in logs for word in ("--log", name)]
     logged = [Log(name, folder, loaded.model_dump(mode="json"), console.say) for name in logs]

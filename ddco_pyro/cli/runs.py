@@ -71,8 +71,7 @@ def rollout(
     """
     from ddco_pyro.cli import console
     from ddco_pyro.fitting.fitted import load
-    from ddco_pyro.fitting.rollouts import roll_out
-    from ddco_pyro.fitting.seeds import roll_out_repetitions
+    from ddco_pyro.fitting.rollouts import roll_out, roll_out_repetitions
     from ddco_pyro.report import write_report
 
     fitted = load(run, allow_code)

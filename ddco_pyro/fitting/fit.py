@@ -16,10 +16,11 @@ import numpy as np
 
 from ddco_pyro.data.controls import measure
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.files import only_one
 from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.labels import label_names
-from ddco_pyro.errors import path_of
-from ddco_pyro.events import OnEvent, ignore
+from ddco_pyro.errors import BadInput, path_of
+from ddco_pyro.events import OnEvent, SeedFitted, ignore
 from ddco_pyro.fitting.digest import record, recorded
 from ddco_pyro.fitting.evaluation import evaluate, marginal
 from ddco_pyro.fitting.fitted import Fit, left_out, load
@@ -28,7 +29,7 @@ from ddco_pyro.fitting.names import accepted, matched, read_names, write_names
 from ddco_pyro.fitting.run import Clock, claim, claimed, is_finished, write_model
 from ddco_pyro.inference import compile_all
 from ddco_pyro.jobs import BackendError, Workers, run_all
-from ddco_pyro.metrics import write_table
+from ddco_pyro.metrics import Metrics, Seeds, write_table
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec, load_spec, with_overrides
 from ddco_pyro.training.data import demonstrations as read_demonstrations
@@ -299,6 +300,56 @@ def fit_beside(
             return load(folder, allow_code=True)
     models = {name: (spec, check_networks(spec, dimensions_for(spec, demos)))}
     return replace(_fit_models(models, demos, folder, on_event, workers, name=name), given=None)
+
+
+# --- other training seeds ---------------------------------------------------------------------------------------------
+
+
+def training_seeds(spec: Spec, seeds: int) -> list[int]:
+    """The training seeds of a fit and its repetitions: the spec's own, and the numbers after it.
+
+    :raises BadInput: no demonstrations are held out, or the last seed is too large.
+    """
+    if not spec.demonstrations.validates:
+        raise BadInput("--seeds compares on held-out demonstrations; raise demonstrations.valid_fraction")
+    first = spec.seed if spec.training.seed is None else spec.training.seed
+    with_overrides(spec, {"training.seed": first + seeds - 1})
+    return list(range(first, first + seeds))
+
+
+def repeat(first: Fit, seeds: int, on_event: OnEvent = ignore, jobs: int = 1) -> Fit:
+    """Repeat a fit and its baselines with other training seeds, ``seeds`` in all.
+
+    Each repetition is a run in ``seeds/SEED`` of the run folder; a finished one is not done again.
+
+    :param jobs: processes that fit side by side; -1 is one for each core. The result is the same for any number.
+    :returns: the fit, with the results of all repetitions in ``metrics.seeds`` and ``metrics.json``.
+    :raises Failed: a process died.
+    """
+    folder, (own, *others) = first.run_folder, training_seeds(first.spec, seeds)
+    found = {own: first.metrics}
+    with only_one(folder):
+        calls = {seed: partial(_again, first.spec, seed, folder / "seeds" / str(seed)) for seed in others}
+        with run_all(calls, Workers(jobs), "repeated the fit") as repeated:
+            for seed, metrics in repeated:
+                found[seed] = metrics
+                on_event(SeedFitted(len(calls)))
+        each = [found[seed] for seed in (own, *others)]
+        worth = [metrics.worth.parts if metrics.worth else {} for metrics in each]
+        models = {first.metrics.model: each} | {
+            name: [metrics.comparison[name] for metrics in each] for name in first.metrics.comparison
+        }
+        held_out = {name: [one.log_likelihood_per_step.valid for one in them] for name, them in models.items()}
+        nats = {part: [parts[part].nats_per_step for parts in worth] for part in worth[0]}
+        errors = {part: [parts[part].standard_error for parts in worth] for part in worth[0]}
+        about = {"training_seeds": [own, *others], "held_out": held_out, "worth": nats, "standard_error": errors}
+        first.metrics.seeds = Seeds.model_validate(about)
+        first.metrics.write(folder)
+    return first
+
+
+def _again(spec: Spec, seed: int, folder: Path) -> Metrics:
+    return fit(with_overrides(spec, {"training.seed": seed}), None, folder).metrics
 
 
 # --- in other processes -----------------------------------------------------------------------------------------------

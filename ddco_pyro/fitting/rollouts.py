@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.events import EpisodeEnded, OnEvent, ignore
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.fitting.run import RunError
-from ddco_pyro.metrics import Method, Rollouts, write_table
+from ddco_pyro.metrics import Method, Rollouts, Seeds, write_table
 from ddco_pyro.simulation.episodes import run_episodes, summarize
 from ddco_pyro.simulation.film import write_film
 from ddco_pyro.simulation.task import SUCCESS, Policy, find_task
+from ddco_pyro.spec import with_overrides
 from ddco_pyro.statistics import paired_difference, worth
 
 FIRST_SEED = 1000
@@ -102,6 +104,29 @@ def roll_out(
     )
     fit.metrics.write(folder)
     return fit.metrics.rollouts
+
+
+def roll_out_repetitions(first: Fit, on_event: OnEvent = ignore, jobs: int = -1) -> None:
+    """Roll out the repetitions of a fit from the initial states of its own rollouts.
+
+    Adds ``rollouts.seeds`` to the fit's metrics: success rates by method, and the parts of the worth. A fit without
+    repetitions stays as it is.
+    """
+    rollouts, seeds = first.metrics.rollouts, first.metrics.seeds
+    if seeds is None or rollouts is None:
+        return
+    each = [rollouts]
+    for again in first.repetitions:
+        alone = replace(again, spec=with_overrides(again.spec, {"rollout.policies": []}))  # scripts have no seeds
+        each.append(roll_out(alone, rollouts.episodes, 0, on_event, jobs, resume=True))
+    rates = {name: [one.success_rates[name].rate for one in each] for name in each[-1].success_rates}
+    parts = [one.worth.parts if one.worth else {} for one in each]
+    points = {
+        part: [(own[part].only_ours - own[part].only_theirs) / rollouts.episodes for own in parts] for part in parts[0]
+    }
+    found = Seeds.model_validate({"training_seeds": seeds.training_seeds, "success": rates, "worth": points})
+    first.metrics.rollouts = rollouts.model_copy(update={"seeds": found})
+    first.metrics.write(first.run_folder)
 
 
 def _film(fit: Fit, name: str, seed: int) -> Path:
