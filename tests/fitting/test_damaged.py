@@ -1,4 +1,4 @@
-"""A damaged file of a run or a selection: one line with the file and what to do, from every command that reads it."""
+"""A damaged file of a run: one line with the file and what to do, from every command that reads it."""
 
 from __future__ import annotations
 
@@ -7,16 +7,12 @@ import shutil
 from pathlib import Path
 
 import pytest
-import yaml
 from command_line import call
-from selecting import data_at
 
 import ddco_pyro
 from ddco_pyro.data.tensors import read_tensors, write_tensors
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.fitting.rollouts import roll_out
-from ddco_pyro.selection import select
-from ddco_pyro.spec import load_spec
 from ddco_pyro.training.data import demonstrations
 
 
@@ -150,23 +146,3 @@ def test_a_damaged_table(run: Path, monkeypatch: pytest.MonkeyPatch, name: str, 
     (run / name).write_bytes(content)
     refused(run, COMMANDS[command], run / name, "")
     assert call("report", run).err.startswith(f"ddco-pyro: {run / name}: is damaged: ")
-
-
-# --- selections -------------------------------------------------------------------------------------------------------
-
-
-def test_a_damaged_fold(tmp_path: Path) -> None:
-    """A fold is a run: its file is removed, and this fold alone is made again."""
-    spec = tmp_path / "spec.yaml"
-    spec.write_text(yaml.safe_dump(data_at(tmp_path) | {"selection": {"folds": 2, "grid": {"seed": [1, 2]}}}))
-    select(load_spec(spec), tmp_path / "run")
-    path, chosen = tmp_path / "run" / "folds" / "001-01" / "metrics.json", tmp_path / "run" / "selection.json"
-    before = chosen.read_bytes()
-    path.write_text(path.read_text()[:40])
-    again = ("select", spec, "--out", tmp_path / "run", "--jobs", "1", "--resume")
-    ended = call(*again)
-    assert (ended.status, ended.err.count("\n")) == (2, 1)
-    assert ended.err.startswith(f"ddco-pyro: {path}: is damaged: is no JSON: ")
-    path.unlink()
-    assert call(*again).status == 0
-    assert chosen.read_bytes() == before

@@ -14,7 +14,7 @@ import ddco_pyro
 from ddco_pyro import OptionSegmenter
 from ddco_pyro.errors import BadInput
 
-QUICK = {"training.epochs": 12}
+QUICK = {"training.epochs": 6, "training.starts": ["vq_controls"]}
 
 
 def two_options(number: int = 5, steps: int = 16, seed: int = 0) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -120,21 +120,9 @@ def listed(values: Any, make: Any) -> list[Any]:
     return [make(each) for each in values]
 
 
-def objects(values: Any) -> np.ndarray:
-    found = np.empty(len(values), object)
-    found[:] = values
-    return found
-
-
 KINDS = {
     "a 3-D array": lambda _, X, U: (np.array(X), np.array(U)),
-    "an array of arrays": lambda _, X, U: (objects(X), objects(U)),
     "pandas": lambda pd, X, U: (listed(X, lambda x: pd.DataFrame(x, index=range(9, 25))), listed(U, pd.DataFrame)),
-    "a frame, lengths in a series": lambda pd, X, U: (
-        pd.DataFrame(np.concatenate(X), index=[f"row {n}" for n in range(80)], columns=["a", "b"]),
-        pd.DataFrame(np.concatenate(U))[::-1][::-1],
-        pd.Series([16] * 5, index=[*"edcba"]),
-    ),
     "a polars frame, lengths in a series": lambda pl, X, U: (
         pl.DataFrame(np.concatenate(X)),
         pl.DataFrame(np.concatenate(U)),
@@ -152,12 +140,6 @@ def test_the_data_that_people_hold_are_taken(kind: str, fitted: OptionSegmenter)
     given = KINDS[kind](pytest.importorskip(package), *two_options())
     again = OptionSegmenter(np.int64(2), random_state=np.int64(3)).fit(*given)
     np.testing.assert_array_equal(again.predict(*two_options()), fitted.predict(*two_options()))
-
-
-def test_one_control_may_be_a_list_of_columns(fitted: OptionSegmenter) -> None:
-    X, U = two_options()
-    model = OptionSegmenter(2, settings=QUICK).fit(X, [u[:, 0] for u in U])
-    assert model.score(X, [u[:, 0] for u in U]) == model.score(X, [u[:, :1] for u in U])
 
 
 def test_the_columns_of_a_frame_have_to_be_those_of_the_fit() -> None:

@@ -184,7 +184,6 @@ def test_a_measure_that_never_applies_is_unknown_and_of_its_own_kind():
 
 
 SEEDS = (3, 4, 5, 6)
-MEAN = RolloutSpec(control="mean", options="most_likely")
 MARGINAL = RolloutSpec(control="mean", options="marginal")
 SAMPLED = RolloutSpec(control="sample", options="sample")
 SHAPES = {"offsets": (4,), "visited": (1,)}
@@ -222,7 +221,7 @@ def at(record, step):
     return {key: values[min(step, len(record) - 1)] for key, values in record.observations.items()}
 
 
-@pytest.mark.parametrize("spec", [MEAN, MARGINAL, SAMPLED], ids=["most likely", "marginal", "sampled"])
+@pytest.mark.parametrize("spec", [MARGINAL, SAMPLED], ids=["marginal", "sampled"])
 @pytest.mark.parametrize(
     ("name", "weights", "actors"),
     [

@@ -75,35 +75,6 @@ def test_engines_have_the_same_gradient(counts, hybrid, steps):
         np.testing.assert_allclose(ours[possible], pyros[possible], atol=1e-10)
 
 
-def test_the_gradient_with_respect_to_the_tables_is_the_posterior():
-    """Choices without a caller's choice 0 above them: the tables' own gradient is u, v and w of §4.1."""
-    tables = random_tables((3,), (True,), trajectories=2, steps=4, seed=5)
-    leaves = Tables.of(1, [leaf.requires_grad_() for leaf in tables.leaves()])
-    lengths = torch.tensor([4, 3])
-    log_likelihood(leaves, lengths).sum().backward()
-    for n, length in enumerate(lengths.tolist()):
-        truth = brute_force(tables, n, length)
-        np.testing.assert_allclose(leaves.selection[0].grad[n, :length, 0], truth.v[0], atol=1e-9)
-        np.testing.assert_allclose(leaves.control[0].grad[n, :length], truth.u[0][:, 1:], atol=1e-9)
-        ended = truth.u[0][:-1, 1:] - truth.w[0][:-1, 1:]
-        np.testing.assert_allclose(leaves.termination[0].grad[n, 1:length, :, 0], truth.w[0][:-1, 1:], atol=1e-9)
-        np.testing.assert_allclose(leaves.termination[0].grad[n, 1:length, :, 1], ended, atol=1e-9)
-
-
-def test_permuting_options_changes_nothing():
-    tables = random_tables((4,), (True,), trajectories=2, steps=6, seed=7)
-    order = torch.tensor([2, 0, 3, 1])
-    permuted = Tables(
-        (tables.selection[0][..., torch.cat([torch.tensor([0]), order + 1])],),
-        (tables.termination[0][:, :, order],),
-        (tables.control[0][..., order], tables.control[1]),
-    )
-    lengths = torch.tensor([6, 5])
-    torch.testing.assert_close(log_likelihood(tables, lengths), log_likelihood(permuted, lengths), atol=1e-12, rtol=0)
-    found, again = posterior(tables, lengths).u[0], posterior(permuted, lengths).u[0]
-    torch.testing.assert_close(found[..., 1 + order], again[..., 1:], atol=1e-12, rtol=0)
-
-
 @pytest.mark.parametrize(("counts", "hybrid"), [((2,), (True,)), ((2, 1), (False, True))])
 def test_threads_change_no_bit(counts, hybrid):
     tables = random_tables(counts, hybrid, trajectories=5, steps=STEPS_A_THREAD // 2, seed=3)

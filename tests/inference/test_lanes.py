@@ -10,8 +10,8 @@ import torch
 from oracle import brute_force, random_tables
 
 from ddco_pyro.inference import log_likelihood, logspace, posterior
-from ddco_pyro.inference.kernel import LANES, STEPS_A_THREAD
-from ddco_pyro.model.tables import NEVER, Tables, complete
+from ddco_pyro.inference.kernel import LANES
+from ddco_pyro.model.tables import NEVER, complete
 
 SHAPES = [((1,), (True,)), ((3,), (False,)), ((2, 2), (True, False)), ((2, 1, 2), (True, True, True))]
 
@@ -68,20 +68,3 @@ def test_the_gradient_of_logits_is_that_of_the_recursion_in_logarithms(counts, h
     for leaf, own, their in zip(leaves, ours, theirs, strict=True):
         entries = leaf > NEVER  # an impossible entry has no logarithm to differentiate by
         torch.testing.assert_close(own[entries], their[entries], rtol=1e-6, atol=1e-9)
-
-
-def test_any_number_of_threads_gives_the_same_bits():
-    steps = STEPS_A_THREAD // LANES
-    tables = as_logits(random_tables((4,), (True,), trajectories=5 * LANES + 1, steps=steps, seed=3))
-    lengths = torch.randint(1, steps + 1, (5 * LANES + 1,), generator=torch.Generator().manual_seed(3))
-    before, found = torch.get_num_threads(), []
-    try:
-        for threads in (1, 2, 3):
-            torch.set_num_threads(threads)
-            leaves = [leaf.detach().clone().requires_grad_() for leaf in tables.leaves()]
-            value = log_likelihood(Tables.of(1, leaves, logits=True), lengths)
-            found.append([value.detach(), *torch.autograd.grad(value.sum(), leaves)])
-    finally:
-        torch.set_num_threads(before)
-    for other in found[1:]:
-        assert all(torch.equal(*pair) for pair in zip(found[0], other, strict=True))

@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
-import pyro
 import pytest
 import torch
 from oracle import paths, random_tables
-from pyro.infer import TraceEnum_ELBO, infer_discrete
 
-from ddco_pyro.inference import most_likely_path, posterior, sample_paths, segment
-from ddco_pyro.inference.engines import known_controls
-from ddco_pyro.model.ahmm import ahmm
-from ddco_pyro.model.tables import NEVER, Tables, complete
+from ddco_pyro.inference import most_likely_path, sample_paths, segment
+from ddco_pyro.model.tables import NEVER, Tables
 
 CASES = [
     ((1,), (True,), 4),
@@ -61,35 +55,6 @@ def test_of_equally_likely_paths_the_one_that_keeps_the_lowest_choices():
     assert as_tuples(most_likely_path(tables, torch.tensor([4])), 0, 4) == (((1,),) * 4, ((1,), (0,), (0,), (0,)))
     never_kept = Tables(tables.selection, (termination * 0 + torch.tensor([NEVER, 0.0]),), tables.control)
     assert as_tuples(most_likely_path(never_kept, torch.tensor([4])), 0, 4) == (((1,),) * 4, ((1,),) * 4)
-
-
-@pytest.mark.parametrize(("counts", "hybrid"), [((3,), (True,)), ((2, 2), (False, True))])
-def test_pyros_own_marginals_are_the_posterior(counts, hybrid):
-    tables = random_tables(counts, hybrid, trajectories=2, steps=4, seed=14)
-    lengths = torch.tensor([4, 3])
-    elbo = TraceEnum_ELBO(max_plate_nesting=1, strict_enumeration_warning=False)
-    marginals = elbo.compute_marginals(ahmm, lambda *_: None, complete(tables, lengths), *known_controls(tables))
-    ours = posterior(tables, lengths)
-    for t, d in itertools.product(range(4), range(len(counts))):
-        alive = lengths > t
-        theirs = marginals[f"h_{d + 1}_{t}"].logits.softmax(-1)  # what Pyro gives is not normalised
-        torch.testing.assert_close(theirs[alive], ours.u[d][alive, t], atol=1e-9, rtol=0)
-        if t > 0:
-            ended = marginals[f"b_{d + 1}_{t}"].logits.softmax(-1)[..., 1]
-            torch.testing.assert_close(ended[alive], ours.v[d][alive, t].sum(-1), atol=1e-9, rtol=0)
-
-
-@pytest.mark.parametrize(("counts", "hybrid"), [((3,), (True,)), ((2, 2), (False, True))])
-def test_pyros_own_most_likely_path_is_ours(counts, hybrid):
-    tables = random_tables(counts, hybrid, trajectories=2, steps=4, seed=15)
-    lengths = torch.tensor([4, 4])
-    inferred = infer_discrete(ahmm, first_available_dim=-2, temperature=0)
-    sites = pyro.poutine.trace(inferred).get_trace(complete(tables, lengths), *known_controls(tables)).nodes
-    found = most_likely_path(tables, lengths)
-    for t, d in itertools.product(range(4), range(len(counts))):
-        assert torch.equal(sites[f"h_{d + 1}_{t}"]["value"], found.choices[d][:, t])
-        if t > 0:
-            assert torch.equal(sites[f"b_{d + 1}_{t}"]["value"], found.terminations[d][:, t])
 
 
 def test_a_flat_policy_has_no_path():

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-
 import numpy as np
 import pytest
 import torch
@@ -41,7 +39,6 @@ from ddco_pyro.model.batch import Batch, encode
 from ddco_pyro.model.emissions import KINDS
 from ddco_pyro.model.outputs import bounded
 from ddco_pyro.spec import RidgeSpec, parse_spec, with_overrides
-from ddco_pyro.training import em
 from ddco_pyro.training.em import Expectation
 from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.optimizers import is_linear
@@ -99,24 +96,15 @@ CASES = {
     "sigma of all options": ((3,), None, {"std": LEARNED}),
     "sigma of each option": ((2,), None, {"std": {**LEARNED, "per_option": True}}),
     "sigma of the state": ((2,), None, {"std": {**LEARNED, "per_state": True}}),
-    "clipped": ((3,), CLIPPED, {"std": {**LEARNED, "per_option": True}}),
-    "a switch beside": ((2,), MIXED, {"std": LEARNED}),
     "discrete actions": ((2,), ACTIONS, {"std": LEARNED}),
     "a hurdle": ((2,), HURDLE, {"std": {**LEARNED, "per_option": True}}),
     "heavy tails": ((2,), STUDENT, {"std": {**LEARNED, "per_option": True}, "kind": "student"}),
-    "heavy tails, sigma of all options": ((2,), STUDENT, {"std": LEARNED, "kind": "student"}),
     "two levels": ((3, 2), CLIPPED, {"std": LEARNED}),
     "hybrid, two levels": ((2, 2), None, {"std": LEARNED, "emits": ("options", "control")}),
     "mixture": ((3,), None, {"std": {**LEARNED, "per_option": True}, "memoryless": (1,)}),
     "a power": ((3,), CLIPPED, {"std": {**LEARNED, "per_option": True}, "power": 0.3}),
     "a power, two levels": ((2, 2), MIXED, {"std": LEARNED, "power": 0.5}),
     "a hidden Markov model": ((3,), None, {"std": LEARNED, "above": CONSTANT}),
-    "two levels of constants, hybrid": (
-        (2, 2),
-        None,
-        {"std": LEARNED, "emits": ("options", "control"), "above": CONSTANT},
-    ),
-    "constant controls": ((3,), None, {"std": LEARNED, "lowest": CONSTANT}),
     "one constant control": ((), None, {"std": LEARNED, "lowest": CONSTANT}),
 }
 
@@ -190,26 +178,6 @@ def test_constant_gates_and_terminations_are_the_hidden_markov_model_that_baum_w
     assert ends.min() < 0.7  # options last
 
 
-@pytest.mark.parametrize("case", ["sigma of each option", "clipped", "hybrid, two levels"])
-def test_overrelaxed_steps_end_no_lower_after_fewer(case, monkeypatch):
-    """From where EM's own steps have chosen one of several optima."""
-    counts, parts, others = CASES[case]
-    both = em.GROWTH, 1.0
-    monkeypatch.setattr(em, "GROWTH", 1.0)
-    chosen, batch, runs = linear(counts, parts, **others).double(), batch_for(parts), []
-    made = Expectation(chosen, EVERYTHING, score, RidgeSpec(policy=2.0))
-    for _ in range(20):
-        made.step(batch)
-    for growth in both:
-        monkeypatch.setattr(em, "GROWTH", growth)
-        made, values = expectation(copy.deepcopy(chosen), RidgeSpec(policy=2.0), batch)
-        assert made.gain * batch.steps == pytest.approx(max(np.diff(values[-3:])))
-        runs.append(np.array(values))
-    stretched, own = (int(np.argmax(values > runs[1][-1] - 0.02)) for values in runs)
-    assert runs[0][-1] > runs[1][-1] - 0.02
-    assert stretched < 0.7 * own
-
-
 @pytest.mark.parametrize("discovering", [1, 2])
 def test_levels_are_discovered_under_a_uniform_meta_policy(discovering):
     """All weights of the levels end where the gradient is zero, those that select among options too."""
@@ -233,19 +201,6 @@ def rows_of(batch):
     return batch.inputs.vectors["state"][alive].double().numpy(), batch.actions[alive].double().numpy()
 
 
-def test_a_flat_policy_is_least_squares():
-    """Without a ridge: numpy's least squares and the residuals' standard deviation."""
-    model, batch = linear((), std=LEARNED), batch_for(None)
-    expectation(model, RidgeSpec(policy=0, gate=0), batch)
-    x, a = rows_of(batch)
-    with_one = np.hstack([x, np.ones((len(x), 1))])
-    solved, *_ = np.linalg.lstsq(with_one, a, rcond=None)
-    layer = model.meta_policy.network.layers[0]
-    np.testing.assert_allclose(layer.weight[0].detach(), solved[:-1], atol=1e-5)
-    np.testing.assert_allclose(layer.bias[0, 0].detach(), solved[-1], atol=1e-5)
-    np.testing.assert_allclose(model.meta_policy.std().detach(), (a - with_one @ solved).std(0), rtol=1e-5)
-
-
 def heavy(freedom, size, random):
     """Demonstrations of three linear skills whose errors have heavy tails, with the skill of each step."""
     gains, demos, skills = random.normal(size=(3, 4, 3)), [], []
@@ -258,10 +213,9 @@ def heavy(freedom, size, random):
     return Demonstrations(tuple(demos)), np.concatenate(skills)
 
 
-@pytest.mark.parametrize("freedom", [1.5, 3.0])
-def test_options_under_heavy_tails_are_recovered(freedom):
+def test_options_under_heavy_tails_are_recovered():
     """A Gaussian spends options on outliers."""
-    demos, skills = heavy(freedom, 12, np.random.default_rng(0))
+    demos, skills = heavy(1.5, 12, np.random.default_rng(0))
     agreement = {}
     for kind in ("gaussian", "student"):
         control = {"kind": kind, "std": {**LEARNED, "per_option": True}}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 from dataclasses import replace
@@ -130,7 +129,7 @@ def test_labels_that_cannot_be_used_are_one_line(labels, message):
 # --- clusters ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1)])
 def test_the_clusters_of_labelled_options_start_from_their_steps(order):
     """Three places far apart; a step of each has a label, or of two of them: then the third cluster is the third."""
     places = np.array([[0.0, 9.0], [9.0, 0.0], [0.0, 0.0]])

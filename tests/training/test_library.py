@@ -91,8 +91,9 @@ KINDS = {"gaussian": None, "clipped": CLIPPED, "mixed": MIXED, "actions": ACTION
 
 
 @pytest.mark.parametrize("parts", KINDS.values(), ids=KINDS)
-@pytest.mark.parametrize("std", [0.7, LEARNED, LEARNED | {"per_option": True}, LEARNED | {"per_state": True}])
-@pytest.mark.parametrize("counts", [(), (2,), (2, 3)])
+@pytest.mark.parametrize(
+    ("counts", "std"), [((2, 3), LEARNED), ((2,), LEARNED | {"per_option": True}), ((), LEARNED | {"per_state": True})]
+)
 def test_em_has_the_prior_of_the_program(parts, std, counts):
     """Differences between two models: densities have constants of their own."""
     model = linear(counts, parts, emits=("options", "control"), std=std, power=0.5)

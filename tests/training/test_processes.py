@@ -53,8 +53,7 @@ def demos():
 # --- a gradient from shards -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("rows", [8, 3, 1])
-@pytest.mark.parametrize(("dtype", "close"), [(torch.float32, 1e-6), (torch.float64, 1e-12)])
+@pytest.mark.parametrize(("rows", "dtype", "close"), [(8, torch.float32, 1e-6), (3, torch.float64, 1e-12)])
 def test_the_gradient_of_four_shards_is_that_of_one(demos, rows, dtype, close):
     minibatch, results = torch.randperm(8, generator=torch.Generator().manual_seed(rows))[:rows], []
     for count in (1, 4):

@@ -18,7 +18,6 @@ from ddco_pyro.evaluation.verdicts import verdict
 from ddco_pyro.events import RestartDiverged, RestartStopped
 from ddco_pyro.inference import log_likelihood, segment
 from ddco_pyro.metrics import Training
-from ddco_pyro.spec import with_overrides
 from ddco_pyro.training import loop as training
 from ddco_pyro.training import restarts as restarting
 from ddco_pyro.training.checkpoint import Progress, Restart
@@ -88,9 +87,9 @@ def interrupted(trainer):
 
 
 def test_em_that_is_interrupted_begins_its_restart_again_and_gives_the_same_bits(demos, tmp_path):
-    spec = make_spec((2,), starts=EVERY, control={"std": 1.0}, optimizer={"name": "em"}, epochs=40)
+    spec = make_spec((2,), starts=["vq", "mixture"], control={"std": 1.0}, optimizer={"name": "em"}, epochs=20)
     whole = trained(spec, demos, tmp_path / "whole")
-    for epochs in (3, 30, 70):
+    for epochs in (3, 30):
         folder = tmp_path / str(epochs)
         interrupted(make_trainer(spec, demos, folder, Interrupting(epochs)))
         again = make_trainer(spec, demos, folder)
@@ -121,7 +120,7 @@ class Scripted:
 ENDED = {"stage": "joint", "epochs": 20, "cap": None, "rising": 0.0, "over": 1, "converged": True}
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(4))
 def test_those_far_behind_are_stopped_and_the_likeliest_of_the_others_is_kept(demos, tmp_path, monkeypatch, seed):
     random = np.random.default_rng(seed)
     number, margin = int(random.integers(2, 7)), float(random.choice([0.0, 0.02]))
@@ -144,28 +143,6 @@ def test_those_far_behind_are_stopped_and_the_likeliest_of_the_others_is_kept(de
     assert [each["objective"] for each in restarts["each"]] == [None if n in behind else ends[n] for n in range(number)]
     kept = trainer.data.hierarchy(expected).state_dict()
     assert all(torch.equal(model[name], value) for name, value in kept.items())
-
-
-def test_a_restart_is_as_the_same_start_alone(demos, tmp_path):
-    """Ways to begin that are listed beside it change nothing."""
-    spec = make_spec((2,), starts=EVERY, control={"std": 1.0}, optimizer={"name": "em"}, epochs=60)
-    together = make_trainer(spec, demos, tmp_path / "together")
-    model, batch = together.run(), together.data.train
-
-    def nats(model):
-        with torch.no_grad():
-            return float(log_likelihood(model.tabulate(batch), batch.lengths).sum()) / batch.steps
-
-    each = together.summary["restarts"]["each"]
-    alone = []
-    for number, start in enumerate(EVERY):
-        trainer = make_trainer(with_overrides(spec, {"training.starts": [start]}), demos, tmp_path / start)
-        alone.append(trainer.run())
-        if each[number]["stopped"] is None:
-            assert each[number]["objective"] == pytest.approx(trainer.objective, abs=1e-5)
-    best = together.summary["restarts"]["best"]
-    assert each[best]["objective"] == max(one["objective"] for one in each if one["stopped"] is None)
-    assert nats(model) == pytest.approx(nats(alone[best]), abs=1e-4)
 
 
 def test_the_objective_has_the_ridges_log_prior(demos, tmp_path):
@@ -295,7 +272,7 @@ def contains(starts, **training):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_hierarchy_is_no_less_likely_in_training_than_its_mixture(seed, monkeypatch):
     """Where its own start is worse, training goes on from the mixture; without that the bound is broken, and told."""
     demos, spec = memoryless(seed), contains(["equal_parts"])

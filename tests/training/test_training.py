@@ -117,16 +117,6 @@ def test_stages_share_the_budget_and_what_one_leaves_goes_to_the_later_ones(tmp_
     assert trainer.summary["spent"]["epochs"] == 62 - left
 
 
-def test_without_a_budget_every_stage_trains_until_its_patience(tmp_path):
-    trainer = make_trainer(make_spec((2,), epochs=None, patience=2, **QUICK), of_states([8] * 10), tmp_path)
-    trainer.run()
-    for stage in trainer.summary["stages"]:
-        tune = [row["tune"] for row in trainer.history if row["stage"] == stage["stage"]]
-        assert out_of_patience(tune, 2)
-        assert (stage["cap"], stage["rising"], stage["converged"]) == (None, 0.0, True)
-    assert trainer.summary["budget"] == {"epochs": None, "gradient_steps": None}
-
-
 @pytest.mark.parametrize(("name", "apart"), [("adamw", True), ("adam", False)])
 def test_weight_decay_of_adamw_is_apart_from_the_gradient(name, apart, tmp_path):
     """In the first step it takes as much more of every weight as it is larger; a penalty is lost in Adam's scaling."""
