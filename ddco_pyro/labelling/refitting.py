@@ -17,7 +17,7 @@ from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.labelling.proposals import RIDGE, weight
 from ddco_pyro.model.batch import encode
 from ddco_pyro.spec import Spec, with_overrides
-from ddco_pyro.training.checkpoint import TrainingData
+from ddco_pyro.training.checkpoint import TrainingData, fitted_of
 from ddco_pyro.training.labels import Labels
 from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.optimizers import optimizer_of
@@ -57,17 +57,12 @@ def refit(
         if before.depth > 1 or not _by_em(trained):
             return fit(spec, _tuned(spec, demos), on_event=on_event)
         on_event(TrainingBegan(trained.name, EM_STEPS + STEPS))
-        scaling, names = before.scaling, demos.names
-        others = sorted({*range(scaling.size)} - {*scaling.varying.tolist()})
-        constant = dict(zip(others, scaling.constant.tolist(), strict=True))
-        shapes, steps, tasks = before.encoder.shapes, max(demos.lengths), before.encoder.tasks
-        size = Dimensions(shapes, scaling.size, steps, constant, parts=scaling.parts, tasks=tasks)
-        batch = encode(demos, before.encoder, scaling, fitted=True)
+        names, size = demos.names, replace(Dimensions.of_model(before), steps=max(demos.lengths))
+        batch = encode(demos, before.encoder, before.scaling, fitted=True)
         known = _padded([demo.labels[SAID] for demo in demos])
         known = torch.where(known > 0, known, -1)
-        fitted = before.encoder.state_dict(), scaling.state_dict()
         named = Labels(1, tuple(range(1, count + 1)), names, known, known)
-        data = TrainingData(spec, size, batch, batch, names, *fitted, named)
+        data = TrainingData(spec, size, batch, batch, names, fitted_of(before), named)
         model = data.hierarchy(0)
         data, _ = recognise(model, data, demos)
         taught = data.labels

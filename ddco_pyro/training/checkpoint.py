@@ -29,10 +29,9 @@ class TrainingData:
     """What all restarts of a model share: demonstrations to train and to tune on, as they are encoded and scaled.
 
     :param names: of the training demonstrations.
-    :param encoder: the state of the fitted observation encoder.
-    :param scaling: the state of the fitted scaling of the control.
+    :param fitted: the state of the fitted encoder and scaling, and of a recogniser that labels train, by the names that
+        they have in a hierarchy (:func:`fitted_of`).
     :param labels: the labels that say which options are active; None where there are none.
-    :param recogniser: the state of the recogniser that the labels train.
     :param library: the prior that a library is (``training.library``).
     """
 
@@ -41,10 +40,8 @@ class TrainingData:
     train: Batch
     tune: Batch
     names: Sequence[str]
-    encoder: State
-    scaling: State
+    fitted: State
     labels: Labels | None = None
-    recogniser: State | None = None
     library: Prior | None = None
 
     def hierarchy(self, restart: int, state: State | None = None) -> Hierarchy:
@@ -53,10 +50,7 @@ class TrainingData:
         :param state: of the hierarchy; None for the restart's first weights, which may be those of a library.
         """
         hierarchy = build_hierarchy(self.spec, self.dimensions, self.seed(restart))
-        hierarchy.encoder.load_state_dict(self.encoder)
-        hierarchy.scaling.load_state_dict(self.scaling)
-        if hierarchy.recogniser is not None and self.recogniser is not None:
-            hierarchy.recogniser.load_state_dict(self.recogniser)
+        hierarchy.load_state_dict(self.fitted, strict=False)
         if state is None and self.library is not None and self.library.ridge:
             hierarchy.load_state_dict(dict(self.library.model.named_parameters()), strict=False)
         if state is not None:
@@ -163,6 +157,11 @@ class Restart:
             part, _, rest = name.partition("/")
             states.setdefault(part, {})[rest] = value
         return cls(Progress(**json.loads(metadata["progress"])), states)
+
+
+def fitted_of(model: Hierarchy) -> State:
+    """What of a hierarchy is fitted before it is trained: its encoder and its scaling."""
+    return {name: value for name, value in model.state_dict().items() if name.startswith(("encoder.", "scaling."))}
 
 
 def copy_of(model: nn.Module) -> State:

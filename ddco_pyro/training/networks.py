@@ -66,25 +66,30 @@ class Dimensions:
         tasks = known_tasks(demonstrations.attributes)
         return cls(shapes, size, max(demonstrations.lengths), constant, control, tasks=tasks)
 
+    @classmethod
+    def of_model(cls, model: Hierarchy) -> Dimensions:
+        """The dimensions that a fitted model is of."""
+        scaling, encoder = model.scaling, model.encoder
+        others = sorted({*range(scaling.size)} - {*scaling.varying.tolist()})
+        constant = dict(zip(others, scaling.constant.tolist(), strict=True))
+        return cls(encoder.shapes, scaling.size, model.steps, constant, parts=scaling.parts, tasks=encoder.tasks)
+
     def like(self, model: Hierarchy, name: str) -> Dimensions:
         """With the kinds of control of a fitted model, which is to be the prior of another one.
 
         :param name: of the model, for errors.
         :raises DemonstrationsError: observations or the control have other shapes, or a dimension varies here alone.
         """
-        scaling, shapes = model.scaling, model.encoder.shapes
-        wrong = [key for key, shape in shapes.items() if tuple(self.shapes[key]) != shape]
-        if wrong or self.control_size != scaling.size:
-            place = f"obs/{wrong[0]}" if wrong else "actions"
-            here, there = (self.shapes[wrong[0]], shapes[wrong[0]]) if wrong else (self.control_size, scaling.size)
-            raise DemonstrationsError(f"{place}: has shape {here} at each step, and in {name} {there}")
-        others = sorted({*range(scaling.size)} - {*scaling.varying.tolist()})
-        constant = dict(zip(others, scaling.constant.tolist(), strict=True))
-        for dimension, value in constant.items():
+        there = Dimensions.of_model(model)
+        sizes = {f"obs/{key}": (tuple(self.shapes[key]), shape) for key, shape in there.shapes.items()}
+        for place, (ours, theirs) in (sizes | {"actions": (self.control_size, there.control_size)}).items():
+            if ours != theirs:
+                raise DemonstrationsError(f"{place}: has shape {ours} at each step, and in {name} {theirs}")
+        for dimension, value in there.constant.items():
             if not same(np.array(self.constant.get(dimension, np.nan)), np.array(value)):
                 text = f"control dimension {dimension} is not always {value:g}, as in {name}"
                 raise DemonstrationsError(f"{text}; the library's tasks have to vary it")
-        return replace(self, steps=model.steps, constant=constant, parts=scaling.parts)
+        return replace(self, steps=there.steps, constant=there.constant, parts=there.parts)
 
 
 def build_hierarchy(spec: Spec, dimensions: Dimensions, seed: int | None = None) -> Hierarchy:

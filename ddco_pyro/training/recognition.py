@@ -82,10 +82,10 @@ def recognise(model: Hierarchy, data: TrainingData, demos: Demonstrations) -> tu
     )
     starts = recogniser.options(data.train), recogniser.options(data.tune)
     taught = replace(labels, evidence=(evidence, tuning), starts=starts)
-    state = {name: value.clone() for name, value in recogniser.state_dict().items()}
+    learned = {f"recogniser.{name}": value.clone() for name, value in recogniser.state_dict().items()}
     spec = with_overrides(data.spec, {"control.power": power})
     found = Recogniser(power=power, weight=weight, ridge=ridge, widths=list(widths), tried=tried)
-    return replace(data, spec=spec, labels=taught, recogniser=state), found
+    return replace(data, spec=spec, labels=taught, fitted=data.fitted | learned), found
 
 
 def chosen(tried: Sequence[Candidate]) -> tuple[float, float, float]:

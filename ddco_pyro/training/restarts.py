@@ -35,7 +35,7 @@ from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.seeding import seeded
 from ddco_pyro.model.tables import Tables
 from ddco_pyro.spec import Spec, with_overrides
-from ddco_pyro.training.checkpoint import Progress, Restart, TrainingData, copy_of
+from ddco_pyro.training.checkpoint import Progress, Restart, TrainingData, copy_of, fitted_of
 from ddco_pyro.training.data import tuning_split
 from ddco_pyro.training.em import Expectation
 from ddco_pyro.training.labels import Labels
@@ -150,9 +150,8 @@ class Trainer:
             scaling.load_state_dict(library.model.scaling.state_dict())
         known = library is not None
         encoded = encode(train, encoder, scaling, known), encode(tune, encoder, scaling, known)
-        fitted = encoder.state_dict(), scaling.state_dict()
-        labels = Labels.of(spec, train, tune)
-        self.data = TrainingData(spec, dimensions, *encoded, train.names, *fitted, labels, library=library)
+        labels, fitted = Labels.of(spec, train, tune), fitted_of(self.hierarchy)
+        self.data = TrainingData(spec, dimensions, *encoded, train.names, fitted, labels, library)
         self.ridge = ridge = spec.training.optimizer.ridge.policy
         if library is not None and library.ridge:
             self.ridge = library.ridge
