@@ -254,7 +254,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ),
     ({"hierarchy.levels.0.count": "5"}, "hierarchy.levels.0.count: must be a whole number, got '5'"),
     ({"hierarchy.levels.0.cuont": 5}, "hierarchy.levels.0.cuont: unknown key; did you mean hierarchy.levels.0.count?"),
-    ({"inference.xyz": 3}, "inference.xyz: unknown key; valid here: engine"),
+    ({"inference": "exact"}, "inference: must be fused or enumerate"),
     ({"hierarchy.levels": [{"count": 1}, {"count": 2}]}, "hierarchy.levels.1.name: 'option' is also the name of"),
     ({"hierarchy.levels.0.name": "a b"}, "hierarchy.levels.0.name: must be letters, digits, '_' or '-'"),
     ({"hierarchy.levels.0.policy.emits": ["options", "control"]}, "hierarchy.levels.0.policy.emits: the lowest level"),
