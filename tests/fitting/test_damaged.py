@@ -62,12 +62,9 @@ def test_damaged_metrics(run: Path) -> None:
     many = whole.replace('"parameters": ', '"parameters": "many", "was": ')
     for content, what in (
         (whole[: len(whole) // 2], "is no JSON: EOF while parsing"),
-        ("", "is no JSON: EOF while parsing a value at line 1 column 0"),
         ("[]", "must be a mapping (key: value), got []"),
         (many, "comparison.flat.parameters: must be a whole number, got 'many'"),
-        (whole.replace('"comparison"', '"comparisons"'), "comparison: missing"),
         (json.dumps(data | {"options": [[*data["options"][0], data["options"][0][-1]]]}), "is not about levels with 2"),
-        ("[" * 100_000, ""),
         ('{"model": NaN}', ""),
     ):
         path.write_text(content)
@@ -132,11 +129,8 @@ def test_what_is_removed_is_made_again(run: Path) -> None:
     ("name", "content", "command"),
     [
         ("rollouts.csv", b"method,seed,success\nddco,x,1\n", "compare"),
-        ("rollouts.csv", b"a\n1\n", "compare"),
         ("rollouts.csv", b"\xff\xfe", "compare"),
-        ("history.csv", b"restart,stage,epoch,train,tune\n0,joint,1,x,1\n", "report"),
         ("history.csv", b"a\n1\n", "report"),
-        ("history.csv", b"\xff\xfe\n1", "report"),
     ],
 )
 def test_a_damaged_table(run: Path, monkeypatch: pytest.MonkeyPatch, name: str, content: bytes, command: str) -> None:

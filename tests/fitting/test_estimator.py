@@ -222,7 +222,8 @@ NOT_OF_SEQUENCES = {
 
 
 @parametrize_with_checks(
-    [RowsAlone(2, settings={"training.epochs": 2})], expected_failed_checks=lambda _: NOT_OF_SEQUENCES
+    [RowsAlone(2, settings={"training.epochs": 2, "training.starts": ["vq_controls"]})],
+    expected_failed_checks=lambda _: NOT_OF_SEQUENCES,
 )
 def test_the_checks_of_scikit_learn(estimator: Any, check: Any) -> None:
     check(estimator)

@@ -24,12 +24,9 @@ from ddco_pyro.model.tables import NEVER, Tables, complete, joint_density
 
 CASES = [
     ((), (), 5),
-    ((1,), (False,), 5),
     ((1,), (True,), 5),
-    ((3,), (False,), 4),
     ((3,), (True,), 4),
     ((2, 2), (False, False), 3),
-    ((2, 2), (True, False), 3),
     ((2, 2), (False, True), 3),
     ((2, 2), (True, True), 3),
     ((1, 2, 1), (False, True, False), 2),

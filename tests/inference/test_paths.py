@@ -16,11 +16,8 @@ CASES = [
     ((2, 2), (True, False), 3),
     ((2, 1), (False, True), 3),
     ((2, 1, 2), (True, True, True), 2),
-    ((3,), (True,), 4),
-    ((2, 2), (False, False), 3),
     ((2, 2), (True, True), 3),
     ((1, 2, 1), (False, True, False), 2),
-    ((2, 1, 2), (False, False, False), 2),
 ]
 
 
