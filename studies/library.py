@@ -8,10 +8,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.files import only_one
+from ddco_pyro.data.inspection import inspect
+from ddco_pyro.data.starting import starting_spec
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.fitting.library import dimensions_for, prior_of
-from ddco_pyro.spec import load_spec, with_overrides
+from ddco_pyro.spec import load_spec, parse_spec, with_overrides
+from ddco_pyro.spec.yaml import read_yaml
 from ddco_pyro.training.checkpoint import Progress, Restart
 from ddco_pyro.training.loop import StageTraining
 from ddco_pyro.training.restarts import Trainer
@@ -51,7 +55,7 @@ class NewTasks(MetaWorld):
 
     def __init__(self) -> None:
         super().__init__(SIMULATOR)
-        self.methods["frozen"] = self._frozen
+        self.methods |= {"frozen": self._frozen, "pooled": self._pooled}
 
     def _frozen(self, job: Job) -> dict[str, float]:
         """Options stay as in the library; terminations and the meta-policy are drawn towards it."""
@@ -65,18 +69,37 @@ class NewTasks(MetaWorld):
         training.end(None)
         return means(self.play(job.cell.task, Fit(spec, model), job.starts, job.folder))
 
+    def _pooled(self, job: Job) -> dict[str, float]:
+        """Agreement in the cell's task of a fit of its demonstrations and those of the library's other tasks."""
+        others = [demo for task, each in recorded().items() if task != job.cell.task for demo in each]
+        own = [_named(demo, job.cell.task) for demo in job.demos]
+        held_out = tuple(f"{job.cell.task}_{name}" for name in job.demos.masks["valid"])
+        path = job.folder / "pooled.hdf5"
+        Demonstrations((*own, *others), {"valid": held_out}).write(path)
+        spec = parse_spec(read_yaml(starting_spec(inspect(path), path).text))
+        found = fit(with_overrides(spec, job.settings), path, out=job.folder / "fit").metrics.agreement
+        scores = found and found.valid and found.valid[0]
+        return {"nmi": scores.nmi} if scores else {}
+
 
 WORLD = NewTasks()
 
 
+def recorded() -> dict[str, list[Demonstration]]:
+    """The library's demonstrations of each task, recorded where they are not there."""
+    found = {}
+    for task in TASKS:
+        path = RUNS / "library_demonstrations" / f"{task}.hdf5"
+        with only_one(path.parent, wait=True):
+            if not path.exists():
+                WORLD.collect(task, SEEDS, EACH, path)
+        found[task] = [_named(demo, task) for demo in Demonstrations.read(path)]
+    return found
+
+
 def make() -> None:
-    """Record the demonstrations, and fit options and baselines of each library to all of its tasks together."""
-    files = {task: RUNS / "library_demonstrations" / f"{task}.hdf5" for task in TASKS}
-    for task, path in files.items():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if not path.exists():
-            WORLD.collect(task, SEEDS, EACH, path)
-    demos = [_named(demo, task) for task, path in files.items() for demo in Demonstrations.read(path)]
+    """Fit options and baselines of each library to all of its tasks together."""
+    demos = [demo for each in recorded().values() for demo in each]
     for name, changes in LIBRARIES.items():
         fit(load_spec(SPEC, changes), Demonstrations(tuple(demos)), RUNS / name)
 
