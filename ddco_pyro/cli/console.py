@@ -168,9 +168,11 @@ def show(table: Table) -> None:
 # --- check ------------------------------------------------------------------------------------------------------------
 
 
-def dimensions(spec: Spec, size: Dimensions, hierarchy: Hierarchy, baselines: Sequence[tuple[Spec, Hierarchy]]) -> None:
-    """Shapes of observations and control, and the parameters of each network and of each baseline."""
+def model(spec: Spec, size: Dimensions, hierarchy: Hierarchy, baselines: Sequence[tuple[Spec, Hierarchy]]) -> None:
+    """Shapes, the parameters of each network and baseline, the kinds of the control, and a device that is no CPU."""
     from ddco_pyro.training.networks import parameters
+    from ddco_pyro.training.processes import described as device_in_words
+    from ddco_pyro.training.processes import device_of
 
     rows = [[f"observation {key}", str(list(size.shapes[key]))] for key in spec.observed]
     rows += [["features", str(len(hierarchy.encoder.mean))], ["control", str([size.control_size])]]
@@ -179,6 +181,11 @@ def dimensions(spec: Spec, size: Dimensions, hierarchy: Hierarchy, baselines: Se
     for number, (other, policy) in enumerate(baselines):
         rows.append([f"compare_with.{number}: {_baseline(other)}", str(parameters(policy))])
     show(Table(["", "shape or parameters"], rows))
+    unknown = ["control: its kinds are decided once demonstrations have been collected (ddco-pyro collect)"]
+    for note in (*notes(size.control), *(described(hierarchy.scaling.parts) if size.control else unknown)):
+        say(note)
+    if spec.training.device != "cpu":
+        say(f"networks: on {device_in_words(device_of(spec.training))}")
 
 
 def _baseline(spec: Spec) -> str:
@@ -189,21 +196,6 @@ def _baseline(spec: Spec) -> str:
         return model_name(spec)
     hidden = list(spec.baseline.policy.hidden_sizes)
     return f"{spec.baseline.kind}, {f'hidden: {hidden}' if hidden else spec.baseline.policy.network}"
-
-
-def control(size: Dimensions, hierarchy: Hierarchy) -> None:
-    """Unusual dimensions of the control, and the kind of each, a line each."""
-    unknown = ["control: its kinds are decided once demonstrations have been collected (ddco-pyro collect)"]
-    for note in (*notes(size.control), *(described(hierarchy.scaling.parts) if size.control else unknown)):
-        say(note)
-
-
-def device(spec: Spec) -> None:
-    """The device of the networks, unless the spec says ``cpu``."""
-    from ddco_pyro.training.processes import described, device_of
-
-    if spec.training.device != "cpu":
-        say(f"networks: on {described(device_of(spec.training))}")
 
 
 def labels(spec: Spec, used: Labels | None, known: Mapping[str, Sequence[str]]) -> None:

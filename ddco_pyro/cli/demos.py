@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from ddco_pyro.data.starting import Decided
     from ddco_pyro.data.tasks import Where
 
-NOTHING: Where = {}
-
 SourcePath = Annotated[
     Path, typer.Argument(metavar="FILE", help=f"Demonstrations: {', '.join(about.text for about in FORMATS.values())}.")
 ]
@@ -136,7 +134,7 @@ def write_spec(
     segment: str | None = None,
     segments: int | None = None,
     force: bool = False,
-    where: Where = NOTHING,
+    where: Where = {},  # noqa: B006 (it is not changed)
 ) -> None:
     """Write the spec of ``init``, and print what was decided."""
     from ddco_pyro.data.inspection import inspect as look

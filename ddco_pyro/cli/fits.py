@@ -53,9 +53,7 @@ def check(
         refuse_unfit(loaded, demos)
     labels, known = (used(loaded, demos), label_names(demos.attributes)) if demos else (None, {})
     print(dump_spec(loaded), end="")
-    console.dimensions(loaded, size, hierarchy, baselines)
-    console.control(size, hierarchy)
-    console.device(loaded)
+    console.model(loaded, size, hierarchy, baselines)
     console.labels(loaded, labels, known)
 
 

@@ -300,14 +300,9 @@ def labels_shown(document: Document, name: str, shown: Shown) -> LevelLabels:
     """What is shown of a demonstration, -1 where a person left it open."""
     left = document.labels[name] == OPEN
     options = np.where(left, UNKNOWN, shown.options)
-    return LevelLabels(options, _starts(document, name, options), np.where(left, 0.0, shown.probability))
-
-
-def _starts(document: Document, name: str, options: np.ndarray) -> np.ndarray:
-    """Whether a segment begins at each step, [T]."""
     starts = np.diff(options, prepend=-9) != 0
-    starts[[cut for cut in document.cuts[name] if document.labels[name][cut] != OPEN]] = True
-    return starts
+    starts[[cut for cut in document.cuts[name] if not left[cut]]] = True
+    return LevelLabels(options, starts, np.where(left, 0.0, shown.probability))
 
 
 def sources_shown(document: Document, name: str) -> np.ndarray:
@@ -333,7 +328,7 @@ def said_segments(
         levels, said = dict[str, LevelLabels](), dict[str, np.ndarray]()
         for level, document in documents.items():
             labels = document.in_file(name)
-            levels[level] = LevelLabels(labels, _starts(document, name, labels), np.ones(len(labels)))
+            levels[level] = labels_shown(document, name, Shown(labels, np.ones(len(labels))))
             said[level + SOURCE] = sources_shown(document, name)
         each.append(Segments(name, levels, 0.0, False, sources=said))
     counts = {level: len(document.names) for level, document in documents.items()}

@@ -145,37 +145,30 @@ def application(sessions: Sequence[Session], token: str) -> Starlette:
 def _answers(session: Session) -> list[Route]:
     """The routes of the session's methods, each of which runs in a thread."""
 
-    def view(request: Request) -> dict[str, Any]:
+    def view(index: int) -> dict[str, Any]:
         with session.lock:  # both are of one revision
-            demo = session.demo(request.path_params["index"])
+            demo = session.demo(index)
             return {"state": session.state(), "demo": demo}
 
-    def nearest(request: Request) -> list[dict[str, Any]]:
-        return session.nearest(request.path_params["index"], request.path_params["step"])
+    def picture(**of: int) -> Response:
+        return Response(session.picture(**of), media_type="image/jpeg")
 
-    def picture(request: Request) -> Response:
-        content = session.picture(*(request.path_params[key] for key in ("index", "camera", "step")))
-        return Response(content, media_type="image/jpeg")
-
-    def exported(request: Request) -> Response:
+    def exported(form: str) -> Response:
         folder = Path(tempfile.mkdtemp(prefix="ddco-pyro-"))
-
-        def remove() -> None:
-            shutil.rmtree(folder)
-
         try:
-            path = session.export(request.path_params["format"], folder)
+            path = session.export(form, folder)
             if path.is_dir():
                 path = Path(shutil.make_archive(str(path), "zip", path))
-            return FileResponse(path, filename=path.name, background=BackgroundTask(remove))
+            return FileResponse(path, filename=path.name, background=BackgroundTask(shutil.rmtree, folder))
         except BaseException:
-            remove()
+            shutil.rmtree(folder)
             raise
 
     def route(path: str, call: Callable[..., Any], method: str) -> Route:
         async def answer(request: Request) -> Response:
             try:
-                found = await run_in_threadpool(call, request if method == "GET" else await request.json())
+                body = [await request.json()] if method == "POST" else []
+                found = await run_in_threadpool(call, *body, **request.path_params)
             except (BadInput, JSONDecodeError) as error:
                 raise HTTPException(400, reason(error)) from error
             except Exception as error:
@@ -184,15 +177,15 @@ def _answers(session: Session) -> list[Route]:
 
         return Route(f"/{path}", answer, methods=[method])
 
-    gets = {
-        "poll": lambda asked: session.progress(),
-        "state": lambda asked: session.state(),
+    gets: dict[str, Callable[..., Any]] = {
+        "poll": session.progress,
+        "state": session.state,
         "view/{index:int}": view,
-        "demo/{index:int}/nearest/{step:int}": nearest,
+        "demo/{index:int}/nearest/{step:int}": session.nearest,
         "demo/{index:int}/picture/{camera:int}/{step:int}": picture,
-        "export/{format}": exported,
+        "export/{form}": exported,
     }
-    posts = {
+    posts: dict[str, Callable[..., Any]] = {
         "edit": session.edit,
         "refit": lambda asked: session.refit(),
         "cancel": lambda asked: session.cancel(),

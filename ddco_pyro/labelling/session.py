@@ -48,7 +48,7 @@ from ddco_pyro.labelling.refitting import refit
 from ddco_pyro.labelling.team import Others, Team, agreement, taken
 from ddco_pyro.names import option_name
 from ddco_pyro.segmenting.formats import FORMATS, Asked, check_format, write_format
-from ddco_pyro.segmenting.formats.labels import check_copy, check_labels, write_labels
+from ddco_pyro.segmenting.formats.labels import check_copy, check_labels
 from ddco_pyro.segmenting.segments import Segmented
 
 NEAREST = 5
@@ -140,8 +140,7 @@ class Session:
         self.behind, self.inferring, self.inferred = False, False, dict.fromkeys(self.demos.names, 0)
         self.refits, self.again = 0, False
         self.background = Background(self.lock, self._ended, "ddco_pyro.labelling.refitting", "sklearn.linear_model")
-        self.shown, self.wrong, self.sure = dict[str, Shown](), dict[str, float](), 0.0
-        self.untouched = dict[str, Shown]()
+        self.shown, self.untouched, self.sure = dict[str, Shown](), dict[str, Shown](), 0.0
         self.view = View(self.document, self.shown, self.untouched, lambda name: self.proposals.change_points(name))
         self.segments, self.recent = dict[str, list[Segment]](), dict[str, Inferred]()
         trajectory = fit.spec.report.trajectory
@@ -223,16 +222,17 @@ class Session:
                 self.untouched[name] = shown
             if before is not None and name != edited and not np.array_equal(before.options, shown.options):
                 self.changed.add(self.demos.names.index(name))
-            self.wrong[name] = expected_wrong(shown, labels, self.sure)
 
     def _weigh(self) -> None:
-        """Expect wrong steps anew, by what accepted demonstrations tell."""
+        """Expect wrong steps anew (ε), by what accepted demonstrations tell."""
         lengths, accepted = self.document.lengths, self.document.accepted
         first = [(wrong - expected) / lengths[name] for name, (expected, wrong) in accepted.items()]
         self.sure = unforeseen(first, [own for name, own in self.excess.items() if name in accepted])
-        self.wrong = {
-            name: expected_wrong(own, self.document.labels[name], self.sure) for name, own in self.shown.items()
-        }
+
+    def _wrong(self) -> dict[str, float]:
+        """The expected number of wrong steps of each demonstration."""
+        labels = self.document.labels
+        return {name: expected_wrong(self.shown[name], labels[name], self.sure) for name in self.demos.names}
 
     def _infer(self, name: str) -> None:
         """Infer one demonstration at once, by what is learned so far."""
@@ -293,7 +293,7 @@ class Session:
     def _rank(self) -> None:
         """Rank demonstrations by the worth of labelling them, and boundaries by how uncertain they are."""
         lengths, accepted = self.document.lengths, self.document.accepted
-        wrong, steps = np.array([self.wrong[name] for name in lengths]), np.array([*lengths.values()])
+        wrong, steps = np.array([*self._wrong().values()]), np.array([*lengths.values()])
         edits = 1 + np.array([len(self.segments[name]) for name in lengths]) * wrong / steps
         self.order, self.farthest = ranking(
             wrong, edits, self.proposals.whole, np.array([name in accepted for name in lengths])
@@ -315,17 +315,17 @@ class Session:
     def state(self) -> dict[str, Any]:
         """Everything but the demonstrations themselves."""
         with self.lock:
-            document, names, others = self.document, self.demos.names, self.others.documents()
+            document, names, others, wrong = self.document, self.demos.names, self.others.documents(), self._wrong()
             demos = [
                 {
                     "name": name,
                     "steps": document.lengths[name],
                     "accepted": name in document.accepted,
                     "labelled": int(document.said(name).sum()),
-                    "expected_wrong": round(self.wrong[name], 2),
+                    "expected_wrong": round(wrong[name], 2),
                     "changed": place in self.changed,
                     "held_out": name in self.run.held_out,
-                    "reason": f"{self.wrong[name]:.0f} of {document.lengths[name]} steps expected wrong"
+                    "reason": f"{wrong[name]:.0f} of {document.lengths[name]} steps expected wrong"
                     + "; the least like those you labelled" * (place == self.farthest),
                     "marks": self.first.document.marks[name],
                     "people": [*self.shares[name]],
@@ -411,11 +411,11 @@ class Session:
         Both shares are None before anything is accepted.
         """
         names = [name for name in self.demos.names if name not in self.excluded]
-        steps = max(1, sum(self.document.lengths[name] for name in names))
+        steps, wrong = max(1, sum(self.document.lengths[name] for name in names)), self._wrong()
         labelled, following = len(self.document.accepted), self.demos.names[self.order[0]]
         return {
-            "expected_wrong": sum(self.wrong[name] for name in names) / steps if labelled else None,
-            "one_more": self.wrong[following] / steps if labelled else None,
+            "expected_wrong": sum(wrong[name] for name in names) / steps if labelled else None,
+            "one_more": wrong[following] / steps if labelled else None,
             "labelled": labelled,
         }
 
@@ -679,10 +679,8 @@ class Session:
             documents = {own.level: own.document for own in every}
             with open_source(self.path, where=self.where) as source:
                 labels = said_segments(documents, source, self.frequency, self.first.document.marks)
-                if self.form == "robomimic":
-                    write_labels(self.path, self.out, labels)
-                else:
-                    self._write("--lerobot", self.out, source, labels, self.first.level)
+                option = "--out" if self.form == "robomimic" else "--lerobot"
+                self._write(option, self.out, source, labels, self.first.level)
             if self.in_place:
                 for own in every:
                     own.version = version(self.files)

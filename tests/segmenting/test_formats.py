@@ -6,7 +6,6 @@ import json
 import os
 import shutil
 import subprocess
-from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,10 +19,8 @@ from command_line import call
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.importing import import_demonstrations
-from ddco_pyro.data.planted import pick_and_place
 from ddco_pyro.data.sources import open_source
 from ddco_pyro.errors import BadInput
-from ddco_pyro.exporting.runner import Runner
 from ddco_pyro.segmenting.formats import Asked, check_format, write_format
 from ddco_pyro.segmenting.segments import LevelLabels, Segmented, Segments
 
@@ -336,50 +333,6 @@ def test_lerobot_acts_as_the_run_does(toy_run, tmp_path):
     ended = call("export", toy_run.folder, "--lerobot", tmp_path / "policy", "--out", tmp_path / "export")
     assert ended.status == 0
     in_tools("act_lerobot.py", tmp_path / "policy", tmp_path / "export")
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not TOOLS.exists(), reason="the tools are not installed: make tools")
-def test_lerobot_eval_runs_a_fit_in_an_environment(tmp_path, monkeypatch):
-    """Successes and largest rewards are those of the exported controller in the same environment.
-
-    LeRobot's sums of rewards have a step of the next episode, too.
-    """
-    pytest.importorskip("gymnasium")
-    monkeypatch.syspath_prepend(HERE / "fixtures")
-    gym_planted = import_module("gym_planted")
-    pick_and_place(30).write(tmp_path / "demos.hdf5")
-    assert call("init", tmp_path / "demos.hdf5", "--out", tmp_path / "spec.yaml").status == 0
-    quick = ["--set", "compare_with=[]", "--set", "training.epochs=80"]
-    assert call("fit", tmp_path / "spec.yaml", "--out", tmp_path / "run", *quick).status == 0
-    places = ["--lerobot", tmp_path / "policy", "--out", tmp_path / "export"]
-    assert call("export", tmp_path / "run", *places).status == 0
-    command = [
-        TOOLS.parent / "lerobot-eval",
-        f"--policy.path={tmp_path / 'policy'}",
-        f"--output_dir={tmp_path / 'out'}",
-    ]
-    command += ["--env.discover_packages_path=gym_planted", "--env.type=planted", "--seed=1000"]
-    known = {**os.environ, "PYTHONPATH": str(HERE / "fixtures"), "HF_HUB_OFFLINE": "1"}
-    command += ["--eval.n_episodes=6", "--eval.batch_size=3"]
-    ended = subprocess.run(list(map(str, command)), capture_output=True, text=True, env=known)
-    assert ended.returncode == 0, ended.stderr
-    (group,) = json.loads((tmp_path / "out" / "eval_info.json").read_text())["per_task"]
-    environment, controller = gym_planted.PickAndPlace(), Runner(tmp_path / "export")
-    largest, successes = [], []
-    for episode in range(6):
-        seen, _ = environment.reset(seed=1000 + episode)
-        controller.reset(episode)
-        rewards, success = [], False
-        while not success and len(rewards) < 120:
-            seen, reward, success, _, _ = environment.step(controller.act(seen).astype(np.float32))
-            rewards.append(reward)
-        largest.append(max(rewards))
-        successes.append(success)
-    assert group["metrics"]["successes"] == successes
-    np.testing.assert_allclose(group["metrics"]["max_rewards"], largest, rtol=1e-3)
-    assert sum(successes) >= 4  # a controller of zeros never succeeds
-    print(f"{sum(successes)} of {len(successes)} episodes succeed")
 
 
 def test_a_policy_for_lerobot_is_an_export_with_lerobots_files(toy_run, tmp_path):

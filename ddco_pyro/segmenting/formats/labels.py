@@ -55,12 +55,6 @@ def check(asked: Asked) -> None:
     check_labels(asked.demos, asked.fit.names, chosen_names(asked.source, asked.fit))
 
 
-def write(asked: Asked, segmented: Segmented) -> str:
-    """``labels/<level>`` and ``labels/<level>_boundary`` of every level, in a copy or in the file itself."""
-    write_labels(asked.demos, asked.out, segmented)
-    return f"{asked.out}: labels/{', labels/'.join(segmented.counts)}"
-
-
 def check_labels(path: Path, given: Iterable[str], names: Iterable[str]) -> None:
     """Check that demonstrations in ``path`` can be given these labels and their boundaries.
 
@@ -88,14 +82,13 @@ def check_copy(path: Path, out: Path) -> None:
         raise BadInput(f"--out {out}: exists and is not a labelled copy of {path}; choose another --out, or remove it")
 
 
-def write_labels(path: Path, out: Path, segmented: Segmented) -> None:
-    """Write the labels into ``out``, which is ``path`` itself or becomes a copy of it, whole or not at all.
+def write(asked: Asked, segmented: Segmented) -> str:
+    """``labels/<level>`` and ``labels/<level>_boundary`` of every level, in a copy or in the file itself.
 
     Labels of the same name are replaced. The names of options become names of their labels.
     """
-    in_place = _same(out, path)
-    with whole_file(out) as temporary:
-        shutil.copyfile(path, temporary)
+    with whole_file(asked.out) as temporary:
+        shutil.copyfile(asked.demos, temporary)
         with written(temporary, "r+") as file:
             for demo in segmented.segments:
                 group = file["data"][demo.name].require_group("labels")
@@ -116,8 +109,9 @@ def write_labels(path: Path, out: Path, segmented: Segmented) -> None:
             if (names := _names(segmented)) != label_names(attributes_of(file["data"]) | attributes_of(file)):
                 holder = file if LABEL_NAMES in file.attrs else file["data"]
                 holder.attrs[LABEL_NAMES] = json.dumps(names)
-            if not in_place:
-                file.attrs[COPIED] = _digest(path)
+            if not _same(asked.out, asked.demos):
+                file.attrs[COPIED] = _digest(asked.demos)
+    return f"{asked.out}: labels/{', labels/'.join(segmented.counts)}"
 
 
 def _write_mask(file: h5py.File, left_out: list[str]) -> None:
