@@ -61,9 +61,7 @@ def demo_of(made: dict[str, np.ndarray], **labels: np.ndarray) -> Demonstration:
         ((9, 12, 10), "u1", (9, 12, 10, 1)),
         ((9, 12, 10), "u2", (9, 12, 10, 1)),
         ((9, 12, 10), "f4", (9, 12, 10)),  # versions of a vector
-        ((9, 3, 12, 10), "f4", (9, 3, 12, 10)),
         ((9, 12, 3), "u1", (9, 12, 3)),
-        ((9, 12), "u1", (9, 12)),
         ((9,), "u1", (9,)),
     ],
 )
@@ -116,12 +114,9 @@ def an_array(shape: tuple[int, ...], dtype: str, random: np.random.Generator) ->
     ("shape", "dtype", "alone"),
     [
         ((4, 6, 8, 3), "u1", True),
-        ((6, 8, 3), "u1", True),
         ((6, 8, 3), "u1", False),
         ((6, 8, 3), "f4", False),
-        ((5, 6), ">f8", True),
         ((), "O", False),
-        ((2,), "f4,i2", False),
         ((2,), "c8", False),
         ((0,), "f4", True),
     ],
@@ -129,7 +124,7 @@ def an_array(shape: tuple[int, ...], dtype: str, random: np.random.Generator) ->
 def test_networks_read_an_observation_or_every_command_says_why_not(
     shape: tuple[int, ...], dtype: str, alone: bool, tmp_path: Path
 ) -> None:
-    """Of any shape and type: alone or beside a vector, from a file and from memory."""
+    """Of any shape and type, alone or beside a vector."""
     path, random = tmp_path / "demos.hdf5", np.random.default_rng(0)
     made = [{**arrays(n), "obs/odd": None} for n in range(NUMBER)]
     for each in made:
@@ -164,13 +159,6 @@ def test_networks_read_an_observation_or_every_command_says_why_not(
         assert not why or ("odd" in said and (why in said or ended.status == 2)), (command, said)
         assert ended.status == 0 or why, (command, ended)
 
-    def demonstration(n: int, each: dict[str, np.ndarray]) -> Demonstration:
-        observations = {key: each[f"obs/{key}"] for key in keys}
-        return Demonstration(f"demo_{n}", observations, each["actions"])
-
-    for given_demos in (None, lambda: Demonstrations(tuple(demonstration(n, each) for n, each in enumerate(made)))):
-        with pytest.raises(BadInput, match="odd") if why else contextlib.nullcontext():
-            fitted = ddco_pyro.fit(spec, given_demos and given_demos())
-            assert [*fitted.hierarchy.encoder.shapes] == keys
-            read = {**fitted.hierarchy.encoder.images, **dict.fromkeys(fitted.hierarchy.encoder.keys)}
-            assert {*read} == {*keys}
+    with pytest.raises(BadInput, match="odd") if why else contextlib.nullcontext():
+        fitted = ddco_pyro.fit(spec)
+        assert [*fitted.hierarchy.encoder.shapes] == keys

@@ -76,22 +76,6 @@ def test_a_value_inside_the_range_is_counted_and_with_whom_it_is_taken(cuts: lis
     assert fourth.note == ""
 
 
-def test_five_in_a_hundred_are_a_value_and_four_are_none() -> None:
-    controls = np.random.default_rng(0).normal(size=(100, 1))
-    controls[10:14] = 0.1
-    assert control_dimensions({"demo": controls})[0].note == ""
-    controls[14] = 0.1
-    assert control_dimensions({"demo": controls})[0].note == "exactly 0.1 in 5.0 % of the steps"
-
-
-def test_every_step_counts_of_a_value_that_becomes_common_late() -> None:
-    controls = resting(9000)
-    controls[5000:][np.arange(4000) % 4 != 0, 3] = 0.5
-    found = control_dimensions({"demo": controls})
-    assert [each.at_inside for each in found] == [4500, 4050, 900, int((controls[:, 3] == 0.5).sum())]
-    assert found[3].inside == 0.5
-
-
 def rounded(dtype: type) -> np.ndarray:
     """[200, 4]: a limit that is often reached, a switch, a rest and a constant, at times missed by rounding."""
     random = np.random.default_rng(0)

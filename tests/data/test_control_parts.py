@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import h5py
 import numpy as np
 import pytest
 import torch
 from command_line import call
-from odd_files.atoms import ROWS, at_bounds, no_ops
 from planted import make_spec
 
 import ddco_pyro
@@ -18,7 +14,7 @@ from ddco_pyro.data.controls import control_dimensions, control_parts, described
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
 from ddco_pyro.exporting import TOLERANCE, export, runner
 from ddco_pyro.model.emissions import Hurdle
-from ddco_pyro.spec import ControlSpec, SpecError, dump_spec, load_spec, with_overrides
+from ddco_pyro.spec import ControlSpec, SpecError, dump_spec, with_overrides
 
 STEPS = 30
 
@@ -190,10 +186,9 @@ def rested(tmp_path_factory):
     return ddco_pyro.fit(resting_spec(2, epochs=40), resting(), out=tmp_path_factory.mktemp("runs") / "rested")
 
 
-@pytest.mark.parametrize("control", ["mean", "sample"])
-def test_switches_and_bounds_are_emitted_exactly(fitted, control):
+def test_switches_and_bounds_are_emitted_exactly(fitted):
     """In states far beyond the demonstrations, where means lie beyond every bound."""
-    controller = Controller(fitted.hierarchy, control)
+    controller = Controller(fitted.hierarchy, "sample")
     controls = []
     for seed in range(8):
         controller.reset(seed)
@@ -249,27 +244,6 @@ def test_exports_act_as_the_run_does(run, tmp_path, control):
         assert (np.abs(ours[:, 0]) <= 1).all()
 
 
-def test_discrete_actions_from_file_to_controller(tmp_path: Path):
-    """Integers [T] in the file."""
-    random = np.random.default_rng(0)
-    with h5py.File(tmp_path / "demos.hdf5", "w") as file:
-        for n in range(6):
-            index = random.integers(0, 3, 20)
-            group = file.create_group(f"data/demo_{n}")
-            group.attrs["num_samples"] = 20
-            group["actions"] = index
-            group["obs/state"] = np.eye(3)[index] + random.normal(0, 0.05, (20, 3))
-    spec = in_file(spec_of(), tmp_path / "demos.hdf5", training={"optimizer": {"name": "em"}})
-    fit = ddco_pyro.fit(spec, out=tmp_path / "run")
-    assert fit.hierarchy.scaling.parts[0].kind == "categorical"
-    controller = Controller(fit.hierarchy)
-    for action in range(3):
-        controller.reset()
-        np.testing.assert_array_equal(controller.act({"state": np.eye(3)[action]}), [float(action)])
-    assert fit.metrics.log_likelihood_per_step.valid > -0.3
-    assert export(fit, tmp_path / "out")["numpy"][0] < TOLERANCE
-
-
 def in_file(spec, path, **changes):
     """The spec with the demonstrations of a file."""
     return with_overrides(spec, {"demonstrations.path": str(path), **changes})
@@ -298,6 +272,29 @@ def test_different_measures_are_not_ranked(fitted, tmp_path):
 
 
 # --- values that are taken often, and not at an end -------------------------------------------------------------------
+
+
+def no_ops(number=8, steps=30, dimensions=3, at_once=True):
+    """A teleoperator who rests, without any skill: in half of the steps the control is exactly 0, else it is normal.
+
+    :param at_once: in all dimensions at once; else in each by itself.
+    """
+    random, made = np.random.default_rng(0), []
+    for index in range(number):
+        still = random.random((steps, 1 if at_once else dimensions)) < 0.5
+        controls = np.where(still, 0.0, random.normal(size=(steps, dimensions)))
+        made.append(Demonstration(f"demo_{index}", {"state": random.normal(size=(steps, 2))}, controls))
+    return Demonstrations(tuple(made))
+
+
+def at_bounds(number=8):
+    """The same, cut off at ±1."""
+    return Demonstrations(
+        tuple(
+            Demonstration(demo.name, demo.observations, demo.actions.clip(-1, 1))
+            for demo in no_ops(number, at_once=False)
+        )
+    )
 
 
 @pytest.mark.parametrize("at_once", [True, pytest.param(False, marks=pytest.mark.slow)])
@@ -343,11 +340,3 @@ def test_scaling_keeps_exactly_the_value_apart(rested):
     assert ((scaled[:, 1] == 0) == [True, True, True, False, False]).all()
     assert (scaled[:, [0, 2]] == 0).all()
     np.testing.assert_array_equal(scaling.emitted(torch.from_numpy(scaled))[0], rows[0])
-
-
-@pytest.mark.parametrize("row", ROWS)
-@pytest.mark.usefixtures("undecided")
-def test_files_with_such_values_are_begun_and_fitted(row, tmp_path):
-    path = ROWS[row].make(tmp_path)
-    assert call("init", path, "--out", tmp_path / "spec.yaml").status == 0
-    ddco_pyro.fit(load_spec(tmp_path / "spec.yaml", ["training.epochs=2", "compare_with=[]"]))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -127,24 +126,6 @@ def test_a_split_is_a_partition(number: int, fraction: float, seed: int) -> None
 def test_masks_decide_a_split(masks: dict[str, tuple[str, ...]], train: list[str], valid: list[str]) -> None:
     parts = demonstrations(4, masks).split(0.5, seed=0)
     assert [list(part.names) for part in parts] == [train, valid]
-
-
-@pytest.mark.parametrize(
-    ("number", "masks", "message"),
-    [
-        (1, {}, "no demonstration is left to validate with; add some or change the masks"),
-        (2, {"valid": ("demo_0", "demo_1")}, "no demonstration is left to train with; add some or change the masks"),
-        (2, {"valid": ()}, "no demonstration is left to validate with; add some or change the masks"),
-        (
-            2,
-            {"train": ("demo_1",), "valid": ("demo_1",)},
-            "demo_1 is in mask/train and in mask/valid; remove it from one",
-        ),
-    ],
-)
-def test_splits_that_cannot_be(number: int, masks: dict[str, tuple[str, ...]], message: str) -> None:
-    with pytest.raises(DemonstrationsError, match=f"^{re.escape(message)}$"):
-        demonstrations(number, masks).split(0.5, seed=0)
 
 
 # --- what cannot be used ----------------------------------------------------------------------------------------------

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from odd_files.hdf5 import instead
 from odd_files.kinds import ROWS, twins, write
 from random_demonstrations import demonstrations
 
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.inspection import inspect
 from ddco_pyro.spec import load_spec
 
@@ -115,33 +114,6 @@ def test_values_that_cannot_be_used_have_a_place(path: Path) -> None:
     ]
     assert "1 NaN, 0 infinite; 4 beyond ±1e+30" in call("inspect", path).out
     assert inspect(path, exclude=["demo_3", "demo_4"]).problems == []
-
-
-def test_what_reading_refuses_is_a_problem_and_is_not_imported(path: Path, tmp_path: Path) -> None:
-    with h5py.File(path, "r+") as file:
-        file["data/demo_1"].attrs["num_samples"] = 9
-        instead(file, "data/demo_2/obs/goal", np.ones((5, 7)))
-    short = "demo_1: actions has 4 steps, but num_samples is 9"
-    other = "demo_2: obs/goal has shape (7,) at each step, but (2,) in"
-    first, second, *_ = inspect(path).problems
-    assert (first, second[: len(other)]) == (short, other)
-    for exclude, message in (((), short), (("demo_1",), other)):
-        with pytest.raises(DemonstrationsError, match=re.escape(message)):
-            Demonstrations.read(path, exclude=exclude)
-    ended = call("import", path, "--out", tmp_path / "out.hdf5", "--skip-broken")
-    assert (ended.out, ended.err.count("left out")) == (f"{tmp_path / 'out.hdf5'}: 3 demonstrations\n", 2)
-
-
-def test_demonstrations_that_are_left_out_do_not_count(path: Path) -> None:
-    with h5py.File(path, "r+") as file:
-        file["data/demo_1/actions"][:, 1] = 7
-    found, rest = inspect(path), inspect(path, exclude=["demo_1"])
-    assert found.notes[0] == "control dimension 1: takes two values, 0.5 and 7"
-    assert rest.notes[0] == "control dimension 1: constant (0.5): no part of the model, emitted as it is"
-    assert found.notes[-1] == "control dimension 1: binary (takes two values, 0.5 and 7), by control.kind: auto"
-    assert not any("dimension 1: binary" in note for note in rest.notes)
-    assert list(rest.lengths) == ["demo_0", "demo_2", "demo_3", "demo_4"]
-    assert rest.masks == {"valid": (), "20_percent": ("demo_0",)}
 
 
 def test_the_command_shows_it_and_a_spec(path: Path) -> None:

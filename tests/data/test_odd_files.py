@@ -61,7 +61,7 @@ def warm(toy_run, tmp_path_factory) -> Path:
     return toy_run.folder
 
 
-ELSEWHERE = ("atoms", "kinds", "layouts")
+ELSEWHERE = ("kinds", "layouts")
 """Tables whose rows have tests of their own, beside the reader that they are about."""
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from command_line import call
 from odd_files import Row
-from odd_files.hdf5 import ROWS, last_not_whole
+from odd_files.hdf5 import ROWS
 
 from ddco_pyro.data import memory
 from ddco_pyro.data.demonstrations import Demonstrations
@@ -47,13 +47,6 @@ def test_skip_broken_leaves_out_what_is_not_there(row: str, tmp_path: Path) -> N
     assert ended.status == 0
     assert "left out demo_1: demo_1" in ended.err
     assert Demonstrations.read(tmp_path / "out.hdf5").names == ("demo_0", "demo_2", "demo_3", "demo_4", "demo_5")
-
-
-def test_nothing_is_written_before_all_headers_are_known(tmp_path: Path) -> None:
-    (tmp_path / "in").mkdir()
-    path = last_not_whole(tmp_path / "in")
-    assert call("import", path, "--out", tmp_path / "out.hdf5").status == 2
-    assert list(tmp_path.iterdir()) == [tmp_path / "in"]
 
 
 # --- memory -----------------------------------------------------------------------------------------------------------

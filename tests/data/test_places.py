@@ -36,9 +36,7 @@ def fails_on_a_full_disk(size: int, *command: object) -> None:
     assert "there is no room to write it; free some space, then do the same again" in ended.err.splitlines()[-1]
 
 
-@pytest.mark.parametrize(
-    "size", [5000, 60_000, *(pytest.param(size, marks=pytest.mark.slow) for size in (0, 100, 20_000))]
-)
+@pytest.mark.parametrize("size", [5000, *(pytest.param(size, marks=pytest.mark.slow) for size in (0, 60_000))])
 def test_a_full_disk_while_importing(tmp_path: Path, size: int) -> None:
     source, out = tmp_path / "source.hdf5", tmp_path / "out.hdf5"
     demonstrations(20).write(source)
@@ -50,13 +48,12 @@ def test_a_full_disk_while_importing(tmp_path: Path, size: int) -> None:
     assert out.read_bytes() == (tmp_path / "again.hdf5").read_bytes()
 
 
-@pytest.mark.parametrize("size", [0, 3000])
-def test_a_full_disk_while_segmenting(toy_run, toy_spec, tmp_path: Path, size: int) -> None:
+def test_a_full_disk_while_segmenting(toy_run, toy_spec, tmp_path: Path) -> None:
     path = tmp_path / "demos.hdf5"
     of(toy_spec).write(path)
     before = path.read_bytes()
     for more in (["--csv", tmp_path / "a.csv"], ["--html", tmp_path / "a.html"]):
-        fails_on_a_full_disk(size, "segment", toy_run.folder, path, "--in-place", *more)
+        fails_on_a_full_disk(3000, "segment", toy_run.folder, path, "--in-place", *more)
     assert path.read_bytes() == before
     assert {one.name for one in tmp_path.iterdir()} <= {"demos.hdf5", "a.csv"}  # whole, or not there
 
@@ -143,17 +140,16 @@ def test_what_the_dead_have_left_is_removed(tmp_path: Path) -> None:
 # --- files appear whole or not at all ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
-def test_a_write_that_is_cut_off_leaves_what_was_there(tmp_path, error):
+def test_a_write_that_is_cut_off_leaves_what_was_there(tmp_path):
     path = tmp_path / "file.txt"
     write_text(path, "old")
 
     def write():
         with whole_file(path) as temporary:
             temporary.write_text("half of")
-            raise error
+            raise KeyboardInterrupt
 
-    with pytest.raises(error):
+    with pytest.raises(KeyboardInterrupt):
         write()
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
@@ -172,14 +168,13 @@ def write_folder(path, text, error=None):
             raise error
 
 
-@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
-def test_a_folder_that_is_cut_off_leaves_what_was_there(tmp_path, error):
-    with pytest.raises(error):
-        write_folder(tmp_path / "a" / "folder", "half", error)
+def test_a_folder_that_is_cut_off_leaves_what_was_there(tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        write_folder(tmp_path / "a" / "folder", "half", KeyboardInterrupt)
     assert contents(tmp_path) == {"a": False}
     write_folder(tmp_path / "folder", "old")
-    with pytest.raises(error):
-        write_folder(tmp_path / "folder", "half", error)
+    with pytest.raises(KeyboardInterrupt):
+        write_folder(tmp_path / "folder", "half", KeyboardInterrupt)
     assert contents(tmp_path / "folder") == {"deeper": False, "deeper/file": "old"}
     write_folder(tmp_path / "folder", "new")
     assert contents(tmp_path / "folder") == {"deeper": False, "deeper/file": "new"}

@@ -295,7 +295,7 @@ def test_few_demonstrations_all_train(path: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("labels", "count"),
-    [({}, 4), ({"one": 1}, 4), ({"many": 31}, 4), ({"phase": 23}, 23), ({"coarse": 2, "fine": 6, "one": 1}, 6)],
+    [({"one": 1}, 4), ({"many": 31}, 4), ({"coarse": 2, "fine": 6, "one": 1}, 6)],
 )
 @pytest.mark.usefixtures("undecided")
 def test_there_are_as_many_options_as_labels(labels: dict[str, int], count: int, path: Path, tmp_path: Path) -> None:
@@ -326,7 +326,7 @@ def of_operators(path: Path, operators: str) -> Path:
 
 @pytest.mark.parametrize(
     ("operators", "held_out"),
-    [("ABCDEABCDE", {2}), ("AAB", {1}), ("AAAAAAAB", {1}), ("ABBBBBBBBBBB", {1}), ("ABCDEFGHIJKLMNOPQRST", {4})],
+    [("ABCDEABCDE", {2}), ("AAB", {1}), ("ABBBBBBBBBBB", {1})],
 )
 @pytest.mark.usefixtures("undecided")
 def test_no_operator_is_on_both_sides(operators: str, held_out: set[int], path: Path, tmp_path: Path) -> None:

@@ -172,18 +172,11 @@ ROWS = {
     ),
     "zarr": Row(zarr, r"is a zarr store, as diffusion policy writes them; .*docs/own\.md"),
     "tfds": Row(tfds, r"is a TensorFlow dataset \(RLDS\); .*docs/own\.md"),
-    "tfrecord": Row(
-        lambda folder: within(folder, "a-train.tfrecord-00000-of-00002"), r"is a TensorFlow dataset \(RLDS\)"
-    ),
     "mcap": Row(lambda folder: within(folder, "x.mcap") / "x.mcap", r"is a recording of ROS: .* rosbags.*docs/own\.md"),
-    "rosbag2": Row(
-        lambda folder: within(folder, "metadata.yaml", "x_0.db3"), "is a recording of ROS: read it with rosbags"
-    ),
     "RoboMIND": Row(
         lambda folder: hdf5(folder, "puppet/joint_position", "master/joint_position"),
         r"has the layout of RoboMIND, with observations in puppet and controls in master; .*docs/own\.md",
     ),
-    "RoboMIND's folder": Row(lambda folder: within(folder, "a/trajectory.hdf5"), "has the layout of RoboMIND"),
     "AgiBot": Row(
         lambda folder: hdf5(folder, "state/joint/position", "action/joint/position", "timestamp"),
         "has the layout of AgiBot World, with observations in state and controls in action",
