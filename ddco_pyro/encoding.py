@@ -20,7 +20,7 @@ from torch.nn.functional import interpolate
 
 from ddco_pyro.data.arrays import Observed, blocks, is_picture
 from ddco_pyro.data.demonstration import Demonstration, check
-from ddco_pyro.data.division import problems_of_masks
+from ddco_pyro.data.demonstrations import problems_of_masks
 from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.hdf5 import opened
 from ddco_pyro.data.sources import Source, open_source, refuse_foreign

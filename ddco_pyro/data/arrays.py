@@ -1,16 +1,19 @@
-"""Arrays [T, ...] of demonstrations, in memory or lazy, and what networks read of them."""
+"""Arrays [T, ...] of demonstrations, in memory or lazy: what networks read of them, and whether there is room."""
 
 from __future__ import annotations
 
 import math
+import os
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import h5py
 import numpy as np
 
-from ddco_pyro.data.memory import refuse_too_much
+from ddco_pyro.data.errors import DemonstrationsError
 
 NUMBERS = "fiub"
 """Kinds of numpy types that are real numbers."""
@@ -188,3 +191,44 @@ def no_numbers(dtype: np.dtype[Any]) -> str:
     """The problem with an array of something else than numbers, in words."""
     text = dtype.kind in "STU" or h5py.check_string_dtype(dtype)
     return f"holds {'text' if text else 'text or other objects' if dtype.kind == 'O' else dtype}, not numbers"
+
+
+# --- memory: no number of a result depends on it ----------------------------------------------------------------------
+
+PROGRAM = 680e6
+"""Bytes of a fit to next to nothing: mostly torch, Pyro and compiled code."""
+
+INFERENCE = 5e3
+"""Bytes of inference per step of trajectories that are processed together."""
+
+SMALL = 1e6
+"""Bytes that are taken without asking how many are free."""
+
+
+def free(root: Path = Path("/")) -> float:
+    """Free bytes of the machine, at most the limits of this process's control groups.
+
+    :param root: the folder that holds ``proc`` and ``sys``.
+    """
+    found = [float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))]
+    try:
+        available = re.search(r"^MemAvailable:\s+(\d+) kB$", (root / "proc/meminfo").read_text(), re.MULTILINE)
+        found += [float(available[1]) * 1024] if available else []
+        group, top = (root / "proc/self/cgroup").read_text().strip().rpartition("::")[2], root / "sys/fs/cgroup"
+        own = top / group.strip("/")
+        limits = [part / "memory.max" for part in (own, *own.parents) if part.is_relative_to(top)]
+        found += [float(file.read_text()) for file in limits if file.exists() and file.read_text() != "max\n"]
+    except (OSError, ValueError):
+        pass  # not Linux
+    return min(found)
+
+
+def refuse_too_much(needed: float, what: str, remedy: str) -> None:
+    """Refuse work that needs more memory than is :func:`free`.
+
+    :param what: subject of the error's sentence.
+    :raises DemonstrationsError: it does.
+    """
+    if needed >= SMALL and needed > (there := free()):
+        size = math.ceil(needed / 1e8) / 10
+        raise DemonstrationsError(f"{what} takes about {size:g} GB of memory, and {there / 1e9:.4g} are free; {remedy}")

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from ddco_pyro.data.controls import listed
-from ddco_pyro.data.division import split_by_masks
+from ddco_pyro.data.demonstrations import split_by_masks
 from ddco_pyro.data.errors import DemonstrationsError
 
 # --- copies -----------------------------------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ import numpy as np
 from ddco_pyro.data.arrays import (
     LARGEST,
     NUMBERS,
+    PROGRAM,
     LazyArray,
     Observed,
     blocks,
@@ -24,7 +25,6 @@ from ddco_pyro.data.arrays import (
     usable,
 )
 from ddco_pyro.data.errors import DemonstrationsError
-from ddco_pyro.data.memory import PROGRAM
 from ddco_pyro.errors import nearest
 
 Attribute = float | int | str | bool

@@ -16,10 +16,9 @@ from typing import Any, Literal
 import h5py
 import numpy as np
 
-from ddco_pyro.data.arrays import LazyArray, block_steps, channels_last, turned
+from ddco_pyro.data.arrays import LazyArray, block_steps, channels_last, refuse_too_much, turned
 from ddco_pyro.data.demonstration import Attribute
 from ddco_pyro.data.errors import DAMAGE, DemonstrationsError, reading
-from ddco_pyro.data.memory import refuse_too_much
 from ddco_pyro.errors import nearest
 
 

@@ -27,7 +27,7 @@ from ddco_pyro.data.controls import (
     same,
 )
 from ddco_pyro.data.demonstration import NOTHING, Attribute, different, problem_of
-from ddco_pyro.data.division import check_division, problems_of_masks
+from ddco_pyro.data.demonstrations import check_division, problems_of_masks
 from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.labels import UNKNOWN, label_names

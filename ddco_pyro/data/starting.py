@@ -12,7 +12,7 @@ import jinja2
 import numpy as np
 
 from ddco_pyro.data.controls import all_constant
-from ddco_pyro.data.division import FEW, LEAST, check_division, with_values
+from ddco_pyro.data.demonstrations import FEW, LEAST, check_division, with_values
 from ddco_pyro.data.errors import DemonstrationsError, printable
 from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.inspection import Field, Inspection, inspect

@@ -12,9 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ddco_pyro.data.arrays import INFERENCE
 from ddco_pyro.data.demonstration import check_fitted
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, not_demonstrations
-from ddco_pyro.data.memory import INFERENCE
 from ddco_pyro.data.tasks import with_task
 from ddco_pyro.inference.paths import Path, most_likely_path, sample_paths
 from ddco_pyro.inference.posteriors import Posterior, log_predictive, posterior

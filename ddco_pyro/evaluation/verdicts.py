@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from ddco_pyro.data.division import FEW
+from ddco_pyro.data.demonstrations import FEW
 from ddco_pyro.drawing.words import (
     capital,
     duration,

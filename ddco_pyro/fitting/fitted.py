@@ -14,8 +14,7 @@ from torch import Tensor
 
 from ddco_pyro.acting.controller import Controller
 from ddco_pyro.acting.monitor import Monitor, run_lengths
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
-from ddco_pyro.data.division import unknown
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, unknown
 from ddco_pyro.data.likeness import Traits, Usual, reasons_told, unlike
 from ddco_pyro.errors import BadInput, path_of
 from ddco_pyro.evaluation.inferred import Inferred, Segmentation, infer

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
+from ddco_pyro.data.arrays import INFERENCE, refuse_too_much
 from ddco_pyro.data.demonstration import check_fitted, needed
 from ddco_pyro.data.demonstrations import Demonstration
 from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.labels import BOUNDARY, SOURCE, label_names
 from ddco_pyro.data.likeness import Traits, traits
-from ddco_pyro.data.memory import INFERENCE, refuse_too_much
 from ddco_pyro.data.sources import Source, open_source
 from ddco_pyro.data.tasks import are_several, of_tasks, with_task
 from ddco_pyro.drawing.colours import option_colour

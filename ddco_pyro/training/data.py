@@ -9,12 +9,17 @@ from pathlib import Path
 
 import numpy as np
 
-from ddco_pyro.data.arrays import is_picture, network_input
+from ddco_pyro.data.arrays import is_picture, network_input, refuse_too_much
 from ddco_pyro.data.demonstration import Demonstration, check, needed
-from ddco_pyro.data.demonstrations import Demonstrations, stored, with_labels_of_tasks, with_tasks
-from ddco_pyro.data.division import check_trained, with_values
+from ddco_pyro.data.demonstrations import (
+    Demonstrations,
+    check_trained,
+    stored,
+    with_labels_of_tasks,
+    with_tasks,
+    with_values,
+)
 from ddco_pyro.data.errors import DemonstrationsError
-from ddco_pyro.data.memory import refuse_too_much
 from ddco_pyro.data.tasks import chosen, known_tasks
 from ddco_pyro.data.tensors import read_tensors
 from ddco_pyro.errors import nearest

@@ -13,7 +13,7 @@ import yaml
 from command_line import call
 from large import measured, zeros
 
-from ddco_pyro.data import memory
+from ddco_pyro.data import arrays
 
 GIGABYTE = 10**9
 LIMIT = 2 * GIGABYTE
@@ -22,7 +22,7 @@ LIMIT = 2 * GIGABYTE
 @pytest.fixture(autouse=True)
 def two_gigabytes(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is free does not depend on the machine that runs the tests."""
-    monkeypatch.setattr(memory, "free", lambda: LIMIT)
+    monkeypatch.setattr(arrays, "free", lambda: LIMIT)
 
 
 def large(path: Path, number: int, steps: int, size: int = 1000) -> Path:
@@ -52,7 +52,7 @@ def spec_of(path: Path, *observations: str) -> Path:
 def test_a_fit_to_what_is_larger_than_memory_is_refused(tmp_path: Path) -> None:
     """8 GB in a file of a few megabytes: 28 bytes for each observation and control of a step, and the program."""
     eight = large(tmp_path / "eight.hdf5", 10, 100_000)
-    spec, size = spec_of(eight, "state"), f"{math.ceil((28 * 10**6 * (1000 + 2) + memory.PROGRAM) / 1e8) / 10:g}"
+    spec, size = spec_of(eight, "state"), f"{math.ceil((28 * 10**6 * (1000 + 2) + arrays.PROGRAM) / 1e8) / 10:g}"
     for command in (["check", spec], ["fit", spec, "--out", tmp_path / "run"], ["select", spec, "--out", tmp_path]):
         ended = call(*command)
         assert (ended.status, ended.err.count("\n")) == (2, 1)

@@ -14,7 +14,7 @@ from command_line import call
 from odd_files import Row
 from odd_files.hdf5 import ROWS
 
-from ddco_pyro.data import memory
+from ddco_pyro.data import arrays
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.errors import DemonstrationsError
 
@@ -66,6 +66,6 @@ def test_what_is_free(groups: str, limits: dict[str, str], free: int, tmp_path: 
     for name, text in {**files, **{f"sys/fs/cgroup/{name}": text for name, text in limits.items()}}.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
-    assert memory.free(tmp_path) == free
+    assert arrays.free(tmp_path) == free
     shutil.rmtree(tmp_path / "proc")
-    assert memory.free(tmp_path) > 1e8  # all that this machine has
+    assert arrays.free(tmp_path) > 1e8  # all that this machine has
