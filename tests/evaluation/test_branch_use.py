@@ -42,11 +42,9 @@ def spec_of(level, trunk):
     )
 
 
-@pytest.fixture(scope="module", params=["policy", "trunk", "whole"])
+@pytest.fixture(scope="module", params=["policy", "whole"])
 def fitted(request, tmp_path_factory):
-    level = {} if request.param == "whole" else {request.param: BRANCHES}
-    if request.param != "policy":
-        level |= HEADS
+    level = HEADS if request.param == "whole" else {"policy": BRANCHES}
     out = tmp_path_factory.mktemp("runs") / request.param
     return ddco_pyro.fit(spec_of(level, BRANCHES if request.param == "whole" else None), demonstrations(), out=out)
 

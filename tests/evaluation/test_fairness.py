@@ -104,6 +104,7 @@ def test_candidates_of_a_selection_have_the_same_budget(tmp_path):
     spec = spec_at(tmp_path, folds=2, grid={"hierarchy.levels": [[level], [level, upper]], "training.epochs": [13]})
     found = select(spec, tmp_path / "run", Told(), Workers(1))
     assert [row.gradient_steps for row in found.choice.rows] == [13.0, 13.0]  # five to train with are one minibatch
+    assert [len(row.unconverged) for row in found.choice.rows] == [2, 2]  # in both folds
 
 
 # --- not converged ----------------------------------------------------------------------------------------------------
@@ -132,9 +133,3 @@ def test_a_comparison_marks_them(fitted, tmp_path):
     data = json.loads((tmp_path / "comparison" / "compare.json").read_text())
     assert [row["training"]["converged"] for row in data["rows"]] == [False, False]
     assert (tmp_path / "comparison" / "compare.html").read_text().count("27, not converged") == 2
-
-
-def test_a_fold_says_whether_its_training_had_converged(tmp_path):
-    found = select(spec_at(tmp_path, folds=2), tmp_path / "run", Told(), Workers(1))
-    assert [len(row.unconverged) for row in found.choice.rows] == [2, 2]
-    assert [row.gradient_steps for row in found.choice.rows] == [8, 8]
