@@ -73,14 +73,6 @@ class TrainingEnded(Event):
 
 
 @dataclass(frozen=True)
-class OptionsCompared(Event):
-    """``done`` of ``total`` options are compared with the others of their level."""
-
-    done: int
-    total: int
-
-
-@dataclass(frozen=True)
 class LengthTried(Event):
     """A power of the control's log-density, and gates that are constant or not, gave this median segment, steps."""
 

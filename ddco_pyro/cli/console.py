@@ -27,7 +27,6 @@ from ddco_pyro.events import (
     EpochEnded,
     Event,
     LengthTried,
-    OptionsCompared,
     RestartDiverged,
     RestartStopped,
     SeedFitted,
@@ -103,8 +102,6 @@ class Progress:
                 self._say(f"restart {restart}: diverged: {why}")
             case TrainingEnded():
                 self.end()
-            case OptionsCompared(done, total):
-                self._advance("comparing options", total, done)
             case LengthTried(power, constant, median):
                 gates = ", constant gates" if constant else ""
                 self._advance("trying lengths", note=f"power {power:g}{gates}: median segment {median:g} steps")

@@ -48,34 +48,22 @@ LINES = ("solid", "dashed", "dotted")
 """Of several paths, in turn."""
 
 
-def view(points: np.ndarray, span: np.ndarray) -> tuple[float, float]:
-    """Elevation and azimuth (degrees) of a view along the direction in which positions [M, 3] spread the least.
-
-    The third axis stays upright: the elevation is between 15 and 45 degrees. No view is along an axis.
-    """
-    normal = np.linalg.eigh(np.cov((points / span).T))[1][:, 0] if len(points) > 1 else np.array([1.0, 1.0, 1.0])
-    normal = -normal if normal[2] < 0 else normal
-    elevation = float(np.clip(np.degrees(np.arcsin(normal[2])), 15, 45))
-    quarter, rest = divmod(float(np.degrees(np.arctan2(normal[1], normal[0]))), 90)
-    return elevation, 90 * quarter + float(np.clip(rest, LEAST_OBLIQUE, 90 - LEAST_OBLIQUE))
-
-
-def spans(points: np.ndarray) -> np.ndarray:
-    """The range of each coordinate of positions [M, D]; 1 where all are equal."""
-    span: np.ndarray = np.ptp(points, axis=0)
-    return np.where(span > 0, span, 1.0)
-
-
 def projection(points: np.ndarray) -> np.ndarray:
     """The map [2, D] from positions [M, D] to a plane, right and down.
 
-    Space is seen as :func:`view` says; the second axis of a plane points up, and both have one scale.
+    The second axis of a plane points up, and both have one scale. Space is seen along the direction in which positions
+    spread the least, with the third axis upright: from 15 to 45 degrees above, and along no axis.
     """
-    span = spans(points)
+    span = np.ptp(points, axis=0)
+    span = np.where(span > 0, span, 1.0)
     if len(span) == 2:
         return np.array([[1.0, 0.0], [0.0, -1.0]]) / span.max()
     scale = span if span.max() > MOST_STRETCHED * span.min() else np.full(3, span.max())
-    up, turned = np.radians(view(points, scale / scale.max()))
+    normal = np.linalg.eigh(np.cov((points / (scale / scale.max())).T))[1][:, 0] if len(points) > 1 else np.ones(3)
+    normal = -normal if normal[2] < 0 else normal
+    up = np.radians(np.clip(np.degrees(np.arcsin(normal[2])), 15, 45))
+    quarter, rest = divmod(float(np.degrees(np.arctan2(normal[1], normal[0]))), 90)
+    turned = np.radians(90 * quarter + np.clip(rest, LEAST_OBLIQUE, 90 - LEAST_OBLIQUE))
     right = [-np.sin(turned), np.cos(turned), 0.0]
     down = [np.sin(up) * np.cos(turned), np.sin(up) * np.sin(turned), -np.cos(up)]
     return np.array([right, down]) / scale

@@ -131,15 +131,16 @@ class Inferred:
         recogniser = self.hierarchy.recogniser
         return None if recogniser is None else recogniser.options(self.batch)
 
-    def segmented(self, row: int, lasts: Sequence[bool]) -> list[tuple[np.ndarray, np.ndarray]]:
-        """The most likely choices of one demonstration, and where segments begin, each [T], for each level.
+    @property
+    def _lasts(self) -> list[bool]:
+        return [level.termination is not None for level in self.hierarchy.option_levels()]
 
-        :param lasts: as in :meth:`drawn`.
-        """
+    def segmented(self, row: int) -> list[tuple[np.ndarray, np.ndarray]]:
+        """The most likely choices of one demonstration, and where segments begin, each [T], for each level."""
         steps = self.lengths[row]
         paths = ((choices[row, :steps].numpy().copy(), ends[row, :steps].numpy())
                  for choices, ends in zip(*self.path, strict=True))  # fmt: skip
-        return [(path, started(path, ends, own)) for (path, ends), own in zip(paths, lasts, strict=True)]
+        return [(path, started(path, ends, own)) for (path, ends), own in zip(paths, self._lasts, strict=True)]
 
     def draws(self, row: int, number: int, seed: Sequence[int]) -> np.ndarray:
         """Choices and terminations of draws from p(ζ | ξ) for one demonstration, [2, D, number, T]."""
@@ -147,23 +148,16 @@ class Inferred:
         path = sample_paths(self.tables.part(torch.tensor([row]), length), torch.tensor([length]), number, seed)
         return torch.stack([torch.stack(kind)[:, :, 0] for kind in path]).numpy()
 
-    def drawn(self, row: int, lasts: Sequence[bool]) -> list[dict[int, np.ndarray]]:
-        """The boundaries of one demonstration, for each level: their steps in draws, by the step of the path.
-
-        :param lasts: of each level, whether its options can be active for more than one step; see :func:`started`.
-        """
+    def drawn(self, row: int) -> list[dict[int, np.ndarray]]:
+        """The boundaries of one demonstration, for each level: their steps in draws, by the step of the path."""
         found, draws = [], self.draws(row, DRAWS, (0, self.lengths[row]))
-        for lasting, (path, starts), options, ended in zip(lasts, self.segmented(row, lasts), *draws, strict=True):
+        for lasting, (path, starts), options, ended in zip(self._lasts, self.segmented(row), *draws, strict=True):
             found.append(dict(drawn(path, starts, options, started(options, ended, lasting))))
         return found
 
-    def intervals(self, row: int, lasts: Sequence[bool]) -> list[np.ndarray]:
-        """The 90 % interval of the first step of each segment of one demonstration, for each level, [segments, 2].
-
-        :param lasts: as in :meth:`drawn`.
-        """
-        every = self.drawn(row, lasts)
-        return [np.array([(0, 0), *(within(at, step) for step, at in level.items())]) for level in every]
+    def intervals(self, row: int) -> list[np.ndarray]:
+        """The 90 % interval of the first step of each segment of one demonstration, for each level, [segments, 2]."""
+        return [np.array([(0, 0), *(within(at, step) for step, at in level.items())]) for level in self.drawn(row)]
 
 
 def started(options: np.ndarray, terminations: np.ndarray, lasts: bool) -> np.ndarray:

@@ -13,7 +13,6 @@ from torch import Tensor
 from ddco_pyro.acting.monitor import run_lengths
 from ddco_pyro.drawing.words import capital, duration, listed, number, percent
 from ddco_pyro.evaluation.verdicts import said
-from ddco_pyro.events import OnEvent, OptionsCompared, ignore
 from ddco_pyro.inference import Posterior
 from ddco_pyro.metrics import Alike, Metrics, Segments, Use
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
@@ -95,34 +94,20 @@ def segments_of(paths: Sequence[np.ndarray], frequency: float | None = None) -> 
     return Segments(median=float(np.median(every)), number=len(every), demonstrations=len(paths), twitches=twitches)
 
 
-MANY = 20
-"""From so many options of a level on, their comparison takes long enough to be told of."""
-
-
-def divergences(
-    pieces: Iterable[tuple[Outputs, Posterior]], on_event: OnEvent = ignore, total: int = 1
-) -> list[list[Alike]]:
+def divergences(pieces: Iterable[tuple[Outputs, Posterior]]) -> list[list[Alike]]:
     """The ``divergence`` of each pair of ``options`` of each level, lowest first, nats per step.
 
     The divergence is the mean of KL(π_i ‖ π_j) and KL(π_j ‖ π_i), averaged over steps with weights u_t(i) + u_t(j);
     None where neither option is ever active. Two options with divergence 0 are one skill under two numbers.
 
     :param pieces: outputs of the networks and posteriors of demonstrations.
-    :param total: the number of demonstrations.
     """
     levels: list[Tensor | float] = []
-    done = 0
     for outputs, posterior in pieces:
         levels = levels or [0.0 for _ in posterior.u]
         for place, (own, u) in enumerate(zip(outputs.callers[:-1], posterior.u, strict=True)):
-            own, rows = own.map(Tensor.double), []
-            count = u.shape[-1] - 1
-            for i in range(count):
-                rows.append(_divergence(own, i, u))
-                if count >= MANY:
-                    on_event(OptionsCompared(done * count + len(u) * (i + 1), total * count))
-            levels[place] = levels[place] + torch.stack(rows)
-        done += len(posterior.u[0])
+            own = own.map(Tensor.double)
+            levels[place] = levels[place] + torch.stack([_divergence(own, i, u) for i in range(u.shape[-1] - 1)])
     return [
         [
             Alike(options=(i + 1, j + 1), divergence=total / weight if weight > 0 else None)

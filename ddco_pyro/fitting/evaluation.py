@@ -18,7 +18,6 @@ from ddco_pyro.evaluation.agreement import agreement, confusion, of_equal_length
 from ddco_pyro.evaluation.branch_use import branch_use
 from ddco_pyro.evaluation.inferred import Inferred, infer
 from ddco_pyro.evaluation.options import divergences, option_use, segments_of
-from ddco_pyro.events import OnEvent, ignore
 from ddco_pyro.fitting.draws import matched
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.inference import Posterior
@@ -165,7 +164,6 @@ def evaluate(
     fitted: Fit,
     parts: dict[str, Demonstrations],
     demos: Demonstrations,
-    on_event: OnEvent = ignore,
     *,
     training: Mapping[str, Any],
     contained: Collection[str] = (),
@@ -195,7 +193,7 @@ def evaluate(
     by_dimension = {name: _by_dimension(fitted, part, parts[name]) for name, part in ours.items()}
     held_out = {} if valid is None else {name: each["valid"] for name, each in by_method.items()}
     lengths = np.array([] if valid is None else valid.lengths, dtype=float)
-    options, segments, alike = _options(fitted, demos, on_event) if depth else ([], [], [])
+    options, segments, alike = _options(fitted, demos) if depth else ([], [], [])
     return Metrics(
         model=fitted.name,
         log_likelihood_per_step=Parts[Finite](train=per_step["train"], valid=per_step.get("valid")),
@@ -278,9 +276,7 @@ def _unseen(demos: Demonstrations, relative_to: str | None) -> Demonstrations:
     return Demonstrations(tuple(nothing))
 
 
-def _options(
-    fit: Fit, demos: Demonstrations, on_event: OnEvent
-) -> tuple[list[list[Use]], list[Segments], list[list[Alike]]]:
+def _options(fit: Fit, demos: Demonstrations) -> tuple[list[list[Use]], list[Segments], list[list[Alike]]]:
     """The use, the segments and the divergences of options."""
     sums: list[Posterior] = []
     paths: list[list[np.ndarray]] = [[] for _ in fit.names]
@@ -292,7 +288,7 @@ def _options(
             sums.append(Posterior(*(tuple(h.sum(1, keepdim=True) for h in kind) for kind in piece.posterior)))
             yield piece.outputs, piece.posterior
 
-    alike = divergences(pieces(), on_event, len(demos))
+    alike = divergences(pieces())
     whole = Posterior(*(tuple(map(torch.cat, zip(*kind, strict=True))) for kind in zip(*sums, strict=True)))
     return option_use(whole, paths), [segments_of(level, demos.frequency) for level in paths], alike
 

@@ -207,7 +207,6 @@ def _fit_models(
             fitted,
             split,
             demos,
-            on_event,
             engine_check=trained.check._asdict(),
             demonstrations=counts | known,
             measure=measure(hierarchy.scaling.parts),

@@ -258,12 +258,11 @@ class Fit:
 
         :raises DemonstrationsError: as :meth:`infer`.
         """
-        levels = self.spec.hierarchy.levels if self.spec.hierarchy else ()
         names: list[str] = []
         found: list[list[tuple[np.ndarray, np.ndarray]]] = []
         for piece in self.infer(demos):
             names += piece.names
-            found += [piece.segmented(row, [level.lasts for level in levels]) for row in range(len(piece.names))]
+            found += map(piece.segmented, range(len(piece.names)))
         return tuple(
             Segmentation(name, tuple(names), known, *zip(*own, strict=True))
             for own, (name, known) in zip(zip(*found, strict=True), self.names.items(), strict=True)

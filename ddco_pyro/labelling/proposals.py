@@ -96,7 +96,7 @@ class Proposals:
     ) -> None:
         self.fit, self.level = fit, level
         levels = fit.spec.hierarchy.levels if fit.spec.hierarchy else ()
-        self.lasts, self.size = [own.lasts for own in levels], levels[level - 1].count
+        self.size = levels[level - 1].count
         self.pieces, model = list(fit.infer(demos)), fit.hierarchy
         self.place = {name: (piece, row) for piece, own in enumerate(self.pieces) for row, name in enumerate(own.names)}
         with torch.no_grad():
@@ -107,10 +107,7 @@ class Proposals:
         ]
         self.alone_u = [piece.posterior.u[level - 1] for piece in alone]
         every_run = [
-            run
-            for piece in alone
-            for row in range(len(piece.names))
-            for run in runs(*piece.segmented(row, self.lasts)[level - 1])
+            run for piece in alone for row in range(len(piece.names)) for run in runs(*piece.segmented(row)[level - 1])
         ]
         self.occurring = {option for option, _, _ in every_run} - {0}
         typical = float(np.median([stop - start for _, start, stop in every_run]))

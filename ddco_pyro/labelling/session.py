@@ -445,8 +445,8 @@ class Session:
                 self._show([name], name)
                 self.revision += not np.array_equal(before.options, self.shown[name].options)
             piece, number = self.recent[name], self.proposals.level
-            row, lasts = piece.names.index(name), self.proposals.lasts
-            shown, drawn, own = self.shown[name], piece.drawn(row, lasts)[number - 1], self.segments[name]
+            drawn = piece.drawn(piece.names.index(name))[number - 1]
+            shown, own = self.shown[name], self.segments[name]
             boundaries = [
                 {
                     **_band(segment.start, drawn.get(segment.start, np.array([], int))),

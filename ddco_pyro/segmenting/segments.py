@@ -267,9 +267,9 @@ def of_piece(
     """
     levels = fit.spec.hierarchy.levels if fit.spec.hierarchy else ()
     for row, (name, steps) in enumerate(zip(piece.names, piece.lengths, strict=True)):
-        lasts, steps_of = [level.lasts for level in levels], np.arange(steps)
-        known = piece.intervals(row, lasts) if intervals else [None] * len(levels)
-        every = zip(levels, piece.segmented(row, lasts), piece.posterior.u, known, strict=True)
+        steps_of = np.arange(steps)
+        known = piece.intervals(row) if intervals else [None] * len(levels)
+        every = zip(levels, piece.segmented(row), piece.posterior.u, known, strict=True)
         each = {  # rounding can exceed 1
             level.name: LevelLabels(options, starts, np.minimum(u[row].numpy()[steps_of, options], 1.0), within)
             for level, (options, starts), u, within in every
