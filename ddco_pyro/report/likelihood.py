@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 
 import numpy as np
-from markupsafe import Markup
 
 from ddco_pyro.drawing.figures import Interval, Panel, interval_plot, save
 from ddco_pyro.drawing.page import Block, Cell, Section, Table, Text, Warned, footnote, note
@@ -36,7 +35,17 @@ def section(fit: Fit) -> Section:
     valid = {method(name): number(one.log_likelihood_per_step.valid) for name, one in metrics.methods.items()}
     alt = "; ".join(f"{name}: {value} nats per step held out" for name, value in valid.items())
     caption = "Log-likelihood of the model. Filled circle: held out; open circle: training."
+    per_step = [one.log_likelihood_per_step for one in metrics.methods.values()]
+    values = [Interval(np.nan if one.valid is None else one.valid, hollow=one.train) for one in per_step]
+    panels = [Panel("Each method", "log-likelihood (nats per step)", values)]
     if metrics.comparison:
+        differences: list[Interval | None] = [None]
+        for name, other in metrics.comparison.items():
+            theirs = fit.baselines[name].held_out
+            each = [(one.log_likelihood - theirs[one.name]) / one.steps for one in metrics.valid]
+            differences.append(Interval.of(other.difference, each))
+        title, axis = f"{method(metrics.model)} minus each baseline", "nats per step above that method, held out"
+        panels.append(Panel(title, axis, differences, line=0))
         caption = (
             "Left: log-likelihood of each method; filled circle: held out, open circle: training. Right: the model’s "
             "minus each baseline’s on the same held-out demonstrations; circle: mean with one standard error, dots: "
@@ -47,7 +56,7 @@ def section(fit: Fit) -> Section:
         "log-probabilities. Another unit adds the same constant to every method. So differences in nats can be "
         "compared; percentages cannot."
     )
-    figure = draw(metrics, {name: one.held_out for name, one in fit.baselines.items()}, alt)
+    figure = interval_plot(list(map(method, metrics.methods)), panels, alt)
     blocks: list[Block] = [
         Text(verdict(metrics)),
         Text(f"Nats per step; higher is better. {about(metrics.methods)} {stds(fit)}"),
@@ -83,24 +92,6 @@ def table(metrics: Metrics, digits: int = 2, title: str | None = None) -> Table:
         rows.append([method(name), *each, size, effort(one.training)])
     ours = f"{method(metrics.model)} minus it, held out"
     return Table(["Method", "Held out", "Training", ours, "Parameters", "Gradient steps"], rows, title=title)
-
-
-def draw(metrics: Metrics, baselines: Mapping[str, Mapping[str, float]], alt: str) -> Markup:
-    """Log-likelihood of each method and, where there are several, the paired differences.
-
-    :param baselines: log p(ξ) of the held-out demonstrations by name, for each baseline.
-    """
-    per_step = [one.log_likelihood_per_step for one in metrics.methods.values()]
-    values = [Interval(np.nan if one.valid is None else one.valid, hollow=one.train) for one in per_step]
-    panels = [Panel("Each method", "log-likelihood (nats per step)", values)]
-    if metrics.comparison:
-        differences: list[Interval | None] = [None]
-        for name, other in metrics.comparison.items():
-            each = [(one.log_likelihood - baselines[name][one.name]) / one.steps for one in metrics.valid]
-            differences.append(Interval.of(other.difference, each))
-        title, axis = f"{method(metrics.model)} minus each baseline", "nats per step above that method, held out"
-        panels.append(Panel(title, axis, differences, line=0))
-    return interval_plot(list(map(method, metrics.methods)), panels, alt)
 
 
 def demonstrations(metrics: Metrics, anchors: Collection[str]) -> Section:

@@ -188,18 +188,17 @@ def as_data(choice: Choice) -> dict[str, Any]:
 
 def table(choice: Choice, title: str | None = None) -> Table:
     """A row for each candidate."""
+    rows = []
+    for row in choice.rows:
+        mean = "–" if row.mean is None else f"{number(row.mean, 3)} ± {number(row.error, 3)}"
+        difference = with_error(None if row is choice.best else row.difference, 3)
+        marks = [name for name, marked in (("best", choice.best), ("chosen", choice.chosen)) if marked is row]
+        marks += ["failed"] if row.failed else []
+        marks += [f"not converged in {len(row.unconverged)}"] if row.unconverged else []
+        first = [row.candidate.name, str(row.candidate.parameters), mean, difference]
+        rows.append([*first, number(row.gradient_steps, 0), str(len(row.folds)), ", ".join(marks)])
     head = ["Candidate", "Parameters", "Held-out nats/step", "Minus the best", "Gradient steps", "Folds", ""]
-    return Table(head, [_cells(row, choice) for row in choice.rows], {0, 6}, title)
-
-
-def _cells(row: Row, choice: Choice) -> list[str]:
-    mean = "–" if row.mean is None else f"{number(row.mean, 3)} ± {number(row.error, 3)}"
-    difference = with_error(None if row is choice.best else row.difference, 3)
-    marks = [name for name, marked in (("best", choice.best), ("chosen", choice.chosen)) if marked is row]
-    marks += ["failed"] if row.failed else []
-    marks += [f"not converged in {len(row.unconverged)}"] if row.unconverged else []
-    took = [number(row.gradient_steps, 0), str(len(row.folds))]
-    return [row.candidate.name, str(row.candidate.parameters), mean, difference, *took, ", ".join(marks)]
+    return Table(head, rows, {0, 6}, title)
 
 
 def markdown(choice: Choice, data: Mapping[str, Any]) -> str:

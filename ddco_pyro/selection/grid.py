@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
@@ -80,7 +80,8 @@ def wide(spec: Spec) -> Spec:
 def candidates(spec: Spec, dimensions: Dimensions) -> list[Candidate]:
     """The Cartesian product of the grid's values, the last key path changing fastest.
 
-    :raises SpecError: the grid is empty or touches the data, or a candidate is not valid; one line for each problem.
+    :raises SpecError: the grid is empty or touches the data, a candidate is not valid, or candidates model a control
+        dimension as different kinds; one line for each problem.
     """
     grid = spec.selection.grid
     if not grid:
@@ -103,23 +104,15 @@ def candidates(spec: Spec, dimensions: Dimensions) -> list[Candidate]:
             problems += [f"selection.grid: {where}: {problem}" for problem in error.problems]
     if problems:
         raise SpecError(*problems)
-    _refuse_other_measures(valid, dimensions)
-    return valid
-
-
-def _refuse_other_measures(candidates: Sequence[Candidate], dimensions: Dimensions) -> None:
-    """Refuse to rank densities against probabilities.
-
-    :raises SpecError: candidates model a control dimension as different kinds.
-    """
-    first, *others = candidates
+    first, *others = valid
     for candidate in others:
-        own, their = (control_parts(one.spec.control, dimensions.control) for one in (first, candidate))
-        if different := difference(own, their):
+        ours, theirs = (control_parts(one.spec.control, dimensions.control) for one in (first, candidate))
+        if different := difference(ours, theirs):
             raise SpecError(
                 f"selection.grid: {first.name} and {candidate.name} measure different things: {different}; "
                 "densities and probabilities cannot be ranked, so give all candidates the same control.kind"
             )
+    return valid
 
 
 # --- folds ------------------------------------------------------------------------------------------------------------

@@ -74,14 +74,12 @@ def overrides(spec: Spec, power: float, constant: bool, window: int) -> dict[str
         values["training.optimizer.ridge.gate"] = RIDGE
         values |= {"training.starts": ["windows"], "training.window": window} if window else {}
     if constant and spec.hierarchy is not None:
-        levels = enumerate(spec.hierarchy.levels)
-        gates = [f"levels.{n}.{part}" for n, level in levels for part in _gates(n, level.lasts)]
-        values |= {f"hierarchy.{gate}.network": "constant" for gate in (*gates, "meta_policy")}
+        levels = spec.hierarchy.levels
+        policies = [f"levels.{n}.policy" for n in range(1, len(levels))]
+        terminations = [f"levels.{n}.termination" for n, level in enumerate(levels) if level.lasts]
+        gates = (*policies, *terminations, "meta_policy")
+        values |= {f"hierarchy.{gate}.network": "constant" for gate in gates}
     return values
-
-
-def _gates(number: int, lasts: bool) -> list[str]:
-    return [*(["policy"] if number else []), *(["termination"] if lasts else [])]
 
 
 def decide(
@@ -248,14 +246,14 @@ def unasked(tried: Callable[[float, bool], Lasting]) -> Lasting:
         if not found.segments.brief:
             break
         before, found = found, tried(power, power == LADDER[-1])
-    if before is found or not _few(found):
+
+    def few(own: Segments) -> bool:
+        return own.number < FEW * own.demonstrations
+
+    if before is found or not few(found.segments):
         return found
     between = tried(float(f"{math.sqrt(before.power * found.power):.2g}"), before.constant)
-    return before if _few(between) else between
-
-
-def _few(found: Lasting) -> bool:
-    return found.segments.number < FEW * found.segments.demonstrations
+    return before if few(between.segments) else between
 
 
 def asked(tried: Callable[[float, bool], Lasting], steps: float) -> Lasting:
