@@ -16,10 +16,8 @@ from typing import Annotated, Any, ClassVar, Generic, NamedTuple, TypeVar
 from pydantic import (
     BaseModel,
     ConfigDict,
-    Discriminator,
     Field,
     PlainSerializer,
-    Tag,
     TypeAdapter,
     ValidationError,
 )
@@ -414,11 +412,7 @@ class Mean(Record):
     interval: tuple[Finite, Finite] | None
 
 
-def _kind(measure: Any) -> str:
-    return "[Rate]" if isinstance(measure, Rate) or (isinstance(measure, dict) and "rate" in measure) else "[Mean]"
-
-
-Measure = Annotated[Annotated[Rate, Tag("[Rate]")] | Annotated[Mean, Tag("[Mean]")], Discriminator(_kind)]
+Measure = Rate | Mean
 """A measure of episodes."""
 
 
