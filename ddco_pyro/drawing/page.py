@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import dataclass
 from itertools import chain
 from typing import Any, Self
 
@@ -170,7 +170,6 @@ class Page:
     title: str
     blocks: Sequence[Block]
     sections: Sequence[Section | None]
-    _: KW_ONLY
     subtitle: str = ""
 
     @property

@@ -112,7 +112,11 @@ def select(
         write_text(folder / "folds.json", json_text({"folds": held_out}))
         candidates = grid.candidates(spec, Dimensions.of(demos, spec.control.relative_to))
         choice = choosing.choose(candidates, _fit_all(folder, folds, candidates, on_event, workers))
-        _write(folder, spec, choice, folds)
+        tried = sum(map(len, held_out))
+        found = {"folds": len(folds), "demonstrations": tried, "seed": spec.seed, **choosing.as_data(choice)}
+        write_text(folder / "selection.md", choosing.markdown(choice, found))
+        choosing.write_figure(choice, folder / "figures" / "selection.svg")
+        write_text(folder / "selection.json", json_text(found))
     if choice.chosen is None:
         reasons = [reason for row in choice.rows for reason in row.failed.values()]
         raise SelectionFailed(f"every candidate has failed in some fold; the first reason: {reasons[0]}")
@@ -167,15 +171,3 @@ def final_spec(chosen: Candidate) -> Spec:
     if chosen.spec.demonstrations.hold_out_by not in (None, EACH):
         return chosen.spec
     return with_overrides(chosen.spec, {"demonstrations.hold_out_by": None, "demonstrations.valid_fraction": 0.0})
-
-
-def _write(folder: Path, spec: Spec, choice: Choice, folds: Sequence[Demonstrations]) -> None:
-    found = {
-        "folds": len(folds),
-        "demonstrations": sum(len(fold.masks["valid"]) for fold in folds),
-        "seed": spec.seed,
-        **choosing.as_data(choice),
-    }
-    write_text(folder / "selection.md", choosing.markdown(choice, found))
-    choosing.write_figure(choice, folder / "figures" / "selection.svg")
-    write_text(folder / "selection.json", json_text(found))

@@ -43,21 +43,26 @@ def test_use_of_options_by_sums_over_every_path():
     assert [(one.segments, one.steps, one.length) for one in found] == [(1, 2, 2), (2, 3, 1.5), (2, 2, 1)]
 
 
+def use(*demonstrations, size=0):
+    """The use of options under a posterior that is certain: of each demonstration, segments ``(option, steps)``."""
+    size = size or 1 + max(option for segments in demonstrations for option, _ in segments)
+    steps = max(sum(length for _, length in segments) for segments in demonstrations)
+    active, selected = (torch.zeros(len(demonstrations), steps, size, dtype=torch.float64) for _ in range(2))
+    for row, segments in enumerate(demonstrations):
+        start = 0
+        for option, length in segments:
+            active[row, start : start + length, option] = 1
+            selected[row, start, option] = 1
+            start += length
+    paths = [[np.concatenate([np.full(length, option) for option, length in segments]) for segments in demonstrations]]
+    return option_use(Posterior((active,), (selected,), (active,)), paths)
+
+
 def test_an_option_that_is_never_selected_has_no_duration():
-    """Active for the steps 1 1 2 2 2 of one trajectory, selected at 0 and 2; then padding."""
-    active = torch.tensor([[[0, 1, 0, 0]] * 2 + [[0, 0, 1, 0]] * 3 + [[0, 0, 0, 0]]], dtype=torch.float64)
-    chosen = active.clone()
-    chosen[0, [1, 3, 4]] = 0
-    (found,) = option_use(Posterior((active,), (chosen,), (active,)), [[np.array([1, 1, 2, 2, 2, -1])]])
-    never = {"share": 0.0, "selected": 0.0, "demonstrations": 0.0, "duration": None, "segments": 0, "steps": 0}
-    never |= {"length": None, "having": 0, "within": None}
-    once = {"selected": 1.0, "demonstrations": 1.0, "segments": 1, "having": 1, "within": None}
-    assert [dict(one) for one in found] == [
-        {"choice": 0, **never},
-        {"choice": 1, "share": 0.4, **once, "duration": 2.0, "steps": 2, "length": 2.0},
-        {"choice": 2, "share": 0.6, **once, "duration": 3.0, "steps": 3, "length": 3.0},
-        {"choice": 3, **never},
-    ]
+    _, first, second, never = use([(1, 2), (2, 3)], size=4)[0]
+    assert [(one.share, one.duration, one.length, one.segments) for one in (first, second, never)] == [
+        (0.4, 2, 2, 1), (0.6, 3, 3, 1), (0, None, None, 0)
+    ]  # fmt: skip
 
 
 @pytest.fixture
@@ -225,21 +230,6 @@ def level(*shares, durations=None):
         )
         for choice, (share, duration) in enumerate(zip(shares, durations, strict=True))
     ]
-
-
-def use(*demonstrations):
-    """The use of options under a posterior that is certain: of each demonstration, segments ``(option, steps)``."""
-    size = 1 + max(option for segments in demonstrations for option, _ in segments)
-    steps = max(sum(length for _, length in segments) for segments in demonstrations)
-    active, selected = (torch.zeros(len(demonstrations), steps, size, dtype=torch.float64) for _ in range(2))
-    for row, segments in enumerate(demonstrations):
-        start = 0
-        for option, length in segments:
-            active[row, start : start + length, option] = 1
-            selected[row, start, option] = 1
-            start += length
-    paths = [[np.concatenate([np.full(length, option) for option, length in segments]) for segments in demonstrations]]
-    return option_use(Posterior((active,), (selected,), (active,)), paths)
 
 
 def short(option, selections, duration=1.0):
