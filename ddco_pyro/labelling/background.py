@@ -81,8 +81,8 @@ class Background:
     @property
     def progress(self) -> float | None:
         """The share of the call that is done; None where it is not known yet."""
-        told = self._told.read_text().split() if self.running and self._told.exists() else []
-        return float(told[-1]) if told else None
+        told = self._told.read_text() if self.running and self._told.exists() else ""
+        return float(told) if told else None
 
     def _finish(self, call: Future[Any], prepare: Callable[[Any], Callable[[], None]]) -> None:
         failed: Exception | None = None
@@ -118,15 +118,14 @@ class Background:
 
 
 def _telling(call: Call, file: Path) -> Any:
-    """The result of a call, which adds the share of its epochs that are done to a file, a line for each event."""
+    """The result of a call, which writes the share of its epochs that are done into a file."""
     epochs, done = 0, 0
-    with open(file, "a", buffering=1) as told:
 
-        def tell(event: Event) -> None:
-            nonlocal epochs, done
-            epochs += (event.epochs or 0) if isinstance(event, TrainingBegan) else 0
-            done += isinstance(event, EpochEnded)
-            if epochs:
-                told.write(f"{min(done / epochs, 1.0):.4f}\n")
+    def tell(event: Event) -> None:
+        nonlocal epochs, done
+        epochs += (event.epochs or 0) if isinstance(event, TrainingBegan) else 0
+        done += isinstance(event, EpochEnded)
+        if epochs:
+            file.write_text(f"{min(done / epochs, 1.0):.4f}")
 
-        return call(on_event=tell)
+    return call(on_event=tell)

@@ -218,7 +218,9 @@ class Journal:
     """
 
     def __init__(self, path: Path, document: Document, labels: str, annotator: str = "") -> None:
-        self.path, self.document, self.annotator = path, document, annotator or getpass.getuser()
+        self.path, self.document, self.labels = path, document, labels
+        self.me, self.annotator = annotator, annotator or getpass.getuser()
+        self.known = dict[Path, tuple[list[tuple[int, int]], Document | None]]()
         path.parent.mkdir(parents=True, exist_ok=True)
         self.file = open(path, "a+b", buffering=0)  # noqa: SIM115  (open as long as this object)
         try:
@@ -263,6 +265,26 @@ class Journal:
     def at(self, address: str = "") -> None:
         """Say who has the file, and where it can be edited, for processes that are refused."""
         self._lock.write_text(f"a process of {getpass.getuser()}, {os.getpid()}{address and f', at {address}'}")
+
+    def others(self) -> dict[str, Document]:
+        """What each other annotator has said by now, by name; journals of other demonstrations are passed over.
+
+        The journals of annotators lie side by side, as ``<start>_<annotator>.<end>``.
+        """
+        start, mine, end = self.path.name.partition(f"_{self.me}.")
+        found = dict[str, Document]()
+        for path in sorted(self.path.parent.glob(f"{start}_*.{end}")) if self.me and mine else ():
+            now = version([path])
+            if self.known.get(path, ([], None))[0] != now and path != self.path:
+                document = Document(self.document.lengths, ())
+                try:
+                    replay(path, path.read_bytes(), document, self.labels)
+                    self.known[path] = now, document
+                except BadInput:
+                    self.known[path] = now, None
+            if own := self.known.get(path, ([], None))[1]:
+                found[path.name.removeprefix(f"{start}_").removesuffix(f".{end}")] = own
+        return found
 
     def close(self) -> None:
         """Leave the file to other processes."""

@@ -45,7 +45,7 @@ from ddco_pyro.labelling.proposals import (
     unforeseen,
 )
 from ddco_pyro.labelling.refitting import refit
-from ddco_pyro.labelling.team import Others, Team, agreement, taken
+from ddco_pyro.labelling.team import Team, agreement, taken
 from ddco_pyro.names import option_name
 from ddco_pyro.segmenting.formats import FORMATS, Asked, check_format, write_format
 from ddco_pyro.segmenting.formats.labels import check_copy, check_labels
@@ -125,10 +125,8 @@ class Session:
         self.version, self.frequency = version(self.files), self.demos.frequency
         known = [*skills, *fit.names[self.level][1 + len(skills) :]]
         self.document = Document({demo.name: len(demo) for demo in self.demos}, tuple(known))
-        ours = digest(self.demos, self.level)
         place = out.with_name(f"{out.name}{f'.{self.level}' if first else ''}{SUFFIX}")
-        self.journal = Journal(place, self.document, ours, self.team.me)
-        self.others = Others(place, self.team.me, self.document.lengths, ours)
+        self.journal = Journal(place, self.document, digest(self.demos, self.level), self.team.me)
         self.shares = self.team.shares(self.demos.names)
         if not (self.document.done or self.document.undone):
             there = read(out, where=where) if out.exists() and not self.in_place else self.demos
@@ -315,7 +313,7 @@ class Session:
     def state(self) -> dict[str, Any]:
         """Everything but the demonstrations themselves."""
         with self.lock:
-            document, names, others, wrong = self.document, self.demos.names, self.others.documents(), self._wrong()
+            document, names, others, wrong = self.document, self.demos.names, self.journal.others(), self._wrong()
             demos = [
                 {
                     "name": name,
@@ -351,7 +349,6 @@ class Session:
                 "scratch": self._scratch(),
                 "can_undo": bool(document.done),
                 "can_redo": bool(document.undone),
-                "out": str(self.out),
                 **self.progress(),
             }
 
@@ -450,12 +447,11 @@ class Session:
             boundaries = [
                 {
                     **_band(segment.start, drawn.get(segment.start, np.array([], int))),
-                    "probability": round(float(shown.probability[segment.start]), 4),
                     "said": bool(self.document.labels[name][segment.start - 1 : segment.start + 1].min() > 0),
                 }
                 for segment in own[1:]
             ]
-            levels, others = (self.first, *self.first.beside), self.others.documents()
+            levels, others = (self.first, *self.first.beside), self.journal.others()
             upper = [
                 {
                     "level": levels.index(own),
@@ -557,7 +553,7 @@ class Session:
 
     def _taken(self, name: str | None, command: Mapping[str, Any]) -> list[Change]:
         """The changes by which another annotator's labels of a demonstration become one's own."""
-        others = self.others.documents()
+        others = self.journal.others()
         if name is None or command.get("annotator") not in others:
             raise BadInput(f"take: name a demonstration and one of the annotators {', '.join(others)}")
         return taken(self.document, others[command["annotator"]], name)

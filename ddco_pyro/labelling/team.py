@@ -1,10 +1,9 @@
-"""Several annotators of the same demonstrations: whose turn each demonstration is, and what the others said."""
+"""Several annotators of the same demonstrations: whose turn each demonstration is, and how they agree."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from ddco_pyro.data.labels import UNKNOWN
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.agreement import compared
 from ddco_pyro.evaluation.inferred import runs
-from ddco_pyro.labelling.document import FREE, OPEN, PAINT, Change, Document, replay, version
+from ddco_pyro.labelling.document import FREE, OPEN, PAINT, Change, Document
 
 TOLERANCE = 5
 """Steps between boundaries that match."""
@@ -56,46 +55,6 @@ class Team:
             found[names[index]] = tuple(members[(at + n) % len(members)] for n in range(count))
             at += count
         return {name: found[name] for name in names}
-
-
-@dataclass
-class Others:
-    """The documents of other annotators, whose journals lie beside one's own.
-
-    :param ours: the path of one's own journal, ``<start>_<me><end>``.
-    :param labels: what the labels are for, as in the journal.
-    """
-
-    ours: Path
-    me: str
-    lengths: Mapping[str, int]
-    labels: str
-    _known: dict[Path, tuple[list[tuple[int, int]], Document | None]] = field(init=False, default_factory=dict)
-
-    def documents(self) -> dict[str, Document]:
-        """What each other annotator has said by now, by name; journals of other demonstrations are passed over."""
-        start, mine, end = self.ours.name.partition(f"_{self.me}.")
-        if not (self.me and mine):
-            return {}
-        found = dict[str, Document]()
-        for path in sorted(self.ours.parent.glob(f"{start}_*.{end}")):
-            name = path.name.removeprefix(f"{start}_").removesuffix(f".{end}")
-            if name == self.me:
-                continue
-            now = version([path])
-            if self._known.get(path, ([], None))[0] != now:
-                self._known[path] = now, self._read(path)
-            if document := self._known[path][1]:
-                found[name] = document
-        return found
-
-    def _read(self, path: Path) -> Document | None:
-        document = Document(self.lengths, ())
-        try:
-            replay(path, path.read_bytes(), document, self.labels)
-        except BadInput:
-            return None
-        return document
 
 
 def agreement(mine: Document, theirs: Document, names: Sequence[str]) -> dict[str, Any] | None:
