@@ -6,7 +6,7 @@ import math
 import os
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -74,13 +74,6 @@ class LazyArray:
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         refuse_too_much(self.dtype.itemsize * math.prod(self.shape), self.where or "an array", "divide the episode")
         return self[:].astype(dtype or self.dtype, copy=False)
-
-    def mapped(self, shape: tuple[int, ...], change: Callable[[np.ndarray], np.ndarray]) -> LazyArray:
-        """An array whose blocks are changed when they are read; ``shape`` is the new shape of a step."""
-        read = self.read
-        return replace(
-            self, shape=(len(self), *shape), read=lambda start, stop: map(change, read(start, stop)), file=""
-        )
 
 
 Observed = np.ndarray | LazyArray

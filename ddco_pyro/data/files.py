@@ -144,8 +144,8 @@ def _check_writable(output: Output) -> None:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
     there = next(path for path in (place, *place.parents) if path.is_dir())
     temporary = f"{_prefix(place)}{os.getpid()}-{'x' * 8}{2 * _TEMPORARY}"  # of the greatest length
-    names = (*place.relative_to(there).parts, temporary)
-    if max(len(os.fsencode(name)) for name in names) > os.pathconf(there, "PC_NAME_MAX"):
+    longest = max(len(os.fsencode(name)) for name in (*place.relative_to(there).parts, temporary))
+    if longest > os.pathconf(there, "PC_NAME_MAX"):
         raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG))
     try:
         with tempfile.TemporaryFile(dir=there):
@@ -195,8 +195,9 @@ def _whole(path: Path) -> Iterator[Path]:
         replaced = temporary.with_name(f"{temporary.name}{_TEMPORARY}")
         try:
             yield temporary
-            for part in (temporary, *temporary.rglob("*")):
-                _flush(part)
+            for part in filter(Path.is_file, (temporary, *temporary.rglob("*"))):
+                with part.open("rb") as written:
+                    os.fsync(written.fileno())
             temporary.chmod(0o755 if temporary.is_dir() else 0o644)
             if place.is_dir():
                 place.rename(replaced)
@@ -206,12 +207,6 @@ def _whole(path: Path) -> Iterator[Path]:
                 replaced.rename(place)
             _remove(replaced)
             _remove(temporary)
-
-
-def _flush(path: Path) -> None:
-    if path.is_file():
-        with path.open("rb") as written:
-            os.fsync(written.fileno())
 
 
 def _remove(path: Path) -> None:
@@ -251,14 +246,6 @@ def only_one(folder: Path, wait: bool = False) -> Iterator[None]:
     :raises Busy: another process holds the lock.
     :raises NotWritable: the folder cannot be made.
     """
-    handle = _locked(folder, wait)
-    try:
-        yield
-    finally:
-        os.close(handle)
-
-
-def _locked(folder: Path, wait: bool) -> int:
     while True:
         with _explained(folder):
             folder.mkdir(parents=True, exist_ok=True)
@@ -269,8 +256,12 @@ def _locked(folder: Path, wait: bool) -> int:
             os.close(handle)
             raise Busy(f"{folder}: another process is at work on it; wait for it, or choose another place") from None
         if folder.exists() and os.path.samestat(os.fstat(handle), folder.stat()):
-            return handle
+            break
         os.close(handle)  # the last holder has removed the folder
+    try:
+        yield
+    finally:
+        os.close(handle)
 
 
 def json_text(data: Any) -> str:

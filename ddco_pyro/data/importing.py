@@ -272,4 +272,7 @@ def _scaled(array: Observed, size: tuple[int, int]) -> Observed:
     if not is_picture(array) or array.shape[1:3] == size:
         return array
     change = partial(resized, size=size)
-    return array.mapped((*size, array.shape[3]), change) if isinstance(array, LazyArray) else change(array)
+    if not isinstance(array, LazyArray):
+        return change(array)
+    stored, shape = array.read, (len(array), *size, array.shape[3])
+    return replace(array, shape=shape, read=lambda start, stop: map(change, stored(start, stop)), file="")

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ddco_pyro.data.arrays import LARGEST, NUMBERS, LazyArray, Observed, blocks, is_picture, network_input, usable
-from ddco_pyro.data.coincidences import CLOCKS, Beside, Jumps, copies, generated, jumps
+from ddco_pyro.data.coincidences import Beside, Jumps, copies, generated, jumps
 from ddco_pyro.data.controls import (
     FEWEST,
     MOST_DIMENSIONS,
@@ -33,12 +33,8 @@ from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.labels import UNKNOWN, label_names
 from ddco_pyro.data.likeness import EXCLUDE, Traits, reasons_told, traits_of, unlike
 from ddco_pyro.data.sources import Source, open_source
-from ddco_pyro.data.sources.metadata import clock_fault
 from ddco_pyro.data.tasks import Where, are_several, by_task, task_of
 from ddco_pyro.spec import ControlSpec
-
-GAP = 3.0
-"""A clock among observations has a gap where a step is so many times as long as the median; computers are late."""
 
 
 @dataclass
@@ -181,7 +177,6 @@ class Inspection:
     :param relative_to: the observation of which the control is a target; None without one.
     :param excluded: names of demonstrations that were skipped.
     :param unreadable: names of demonstrations that could not be read.
-    :param clocks: a line for the first fault of each clock among observations, by place.
     :param turns: the angles and quaternions that jump, by place of the array.
     :param odd: names of demonstrations that are dead, unlike the others, or change the kind of a control dimension, and
         why.
@@ -204,7 +199,6 @@ class Inspection:
     unreadable: list[str] = field(default_factory=list)
     odd: Mapping[str, str] = field(default_factory=dict)
     turns: dict[str, Jumps] = field(default_factory=dict)
-    clocks: dict[str, str] = field(default_factory=dict)
     attributes: dict[str, Mapping[str, Attribute]] = field(default_factory=dict)
     where: Where = field(default_factory=dict)
 
@@ -224,7 +218,6 @@ class Inspection:
         return [
             *self.exclusions,
             *followed,
-            *self.clocks.values(),
             *notes(self.control),
             *self.coincidences,
             *leaks,
@@ -339,10 +332,6 @@ class _Inspector:
             if known:
                 commands = [controls[name] for name in known]
                 beside[array.place] = Beside(array.place, [*known.values()], commands, varying, array.constant)
-            if array.key.rpartition("/")[2] in CLOCKS and array.minimum.shape == (1,):
-                faults = ((name, clock_fault(rows[:, 0].astype(np.float64), GAP)) for name, rows in known.items())
-                for line in (f"{array.place} {fault}, in {name}" for name, fault in faults if fault):
-                    found.clocks.setdefault(array.place, line)
             why = generated(array.place) or (beside[array.place].reason if known else "")
             found.leaks |= {array.place: why} if why else {}
         if not any(dimension.integer or len(dimension.values) == 2 for dimension in found.control):

@@ -202,20 +202,11 @@ EPISODES_NOT_WHOLE = {
         r"demo_1: timestamp has a gap before row 2: 0\.1, then 0\.3",
     ),
     "lerobot reversed": (changed(reversed_rows(5, 11)), "demo_1: frame_index steps back in row 1: 5, then 4"),
-    "lerobot wrong length": (changed(episode(1, "length", 9)), "demo_1: length in meta/episodes is 9, and .* has 6"),
     "lerobot no rows": (changed(without_rows(*range(5, 11))), "demo_1: its rows are missing in"),
     "lerobot ragged": (changed(RAGGED), "demo_0: action has 1 numbers in row 0, and meta/info.json says 2; correct"),
-    "lerobot null action": (
-        in_episode_1("action", lambda row, value: None if row == 7 else value),
-        "demo_1: action has 0 numbers in row 2, and meta/info.json says 2; correct",
-    ),
     "lerobot late": (
         in_episode_1("timestamp", lambda _, value: value + 3.2),
         r"demo_1: timestamp is 3\.2 in row 0, not 0; correct it, or fps",
-    ),
-    "lerobot 50 Hz": (
-        in_episode_1("timestamp", lambda _, value: value / 5),
-        r"demo_1: timestamp is 0\.02 in row 1, not 0\.1; correct it, or fps",
     ),
 }
 """Datasets of which one episode is not whole, and what is said of it."""
@@ -229,7 +220,6 @@ ROWS = {
         changed(rewritten(EPISODES, lambda table: table.slice(0, 3))),
         "the metadata counts 4 episodes, and meta/episodes has 3; correct total_episodes, or fetch",
     ),
-    "lerobot uncounted episode": Row(changed(info(total_episodes=3)), "counts 3 episodes, and meta/episodes has 4"),
     "lerobot without episodes": Row(
         changed(rewritten(EPISODES, lambda table: table.slice(0, 0)), info(total_episodes=0)),
         "meta/episodes holds no episodes",
