@@ -89,7 +89,13 @@ def fit(
     :raises TrainingError: training stopped; the checkpoints stay.
     """
     spec, folder = spec if isinstance(spec, Spec) else load_spec(spec), None if out is None else path_of(out, "out")
-    workers = Workers(jobs) if _check_shards(spec.training.shards) == 1 else ALONE  # torchrun's others train along
+    processes, shards = Ranks.here().size, spec.training.shards
+    if processes > shards:
+        raise BackendError(
+            f"torchrun started {processes} processes, but a minibatch is cut into training.shards={shards}; add "
+            f"--set training.shards={processes} (results depend on the shards, not on the processes)"
+        )
+    workers = Workers(jobs) if processes == 1 else ALONE  # torchrun's others train along
     clock, given = Clock(), None
     with clock("demonstrations"):
         if isinstance(demonstrations, Iterable) and not isinstance(demonstrations, str | Demonstrations):
@@ -130,19 +136,6 @@ def fit(
                 return replace(load(folder, allow_code=True), given=demos)  # the caller has this very spec
         assert demos is not None
         return _fit_models(models, demos, folder, on_event, workers, clock)
-
-
-def _check_shards(shards: int) -> int:
-    """The number of processes of ``torchrun``, of which each has a part of a minibatch.
-
-    :raises BackendError: there are more of them than shards.
-    """
-    if (processes := Ranks.here().size) > shards:
-        raise BackendError(
-            f"torchrun started {processes} processes, but a minibatch is cut into training.shards={shards}; add "
-            f"--set training.shards={processes} (results depend on the shards, not on the processes)"
-        )
-    return processes
 
 
 Models = Mapping[str, tuple[Spec, Hierarchy]]

@@ -226,13 +226,14 @@ class StageTraining:
 
     def _backward_in_shards(self, batch: Batch, rows: Tensor, number: int) -> float:
         """:func:`backward`, shard after shard; the processes take turns in computing them."""
-        steps, now, total = int(batch.lengths[rows].sum()), self.restart.progress, 0.0
+        steps, at, total = int(batch.lengths[rows].sum()), self.restart.progress, 0.0
         sums: Gradients = [None] * len(self.parameters)
-        seeds = (self.data.seed(now.restart, now.stage, now.epoch, number, shard) for shard in range(self.spec.shards))
+        seeds = (self.data.seed(at.restart, at.stage, at.epoch, number, shard) for shard in range(self.spec.shards))
         shards = zip(rows.tensor_split(min(self.spec.shards, len(rows))), seeds, strict=False)  # none is empty
         for value, gradients in self.ranks.each(partial(self._shard, batch, *shard, steps) for shard in shards):
             total += value
-            sums = [_sum(*pair) for pair in zip(sums, gradients, strict=True)]
+            pairs = zip(sums, gradients, strict=True)
+            sums = [before if now is None else now if before is None else before + now for before, now in pairs]
         for parameter, gradient in zip(self.parameters, sums, strict=True):
             parameter.grad = None if gradient is None else torch.from_numpy(gradient).to(parameter.device)
         return total
@@ -300,10 +301,3 @@ def backward(objective: Objective, model: Hierarchy, batch: Batch, rows: Tensor,
         (-prior / (steps or batch.steps)).backward()  # type: ignore[no-untyped-call]
         total += float(prior.detach())
     return total / objective.likelihoods
-
-
-def _sum(before: np.ndarray | None, gradient: np.ndarray | None) -> np.ndarray | None:
-    if before is None or gradient is None:
-        return gradient if before is None else before
-    before += gradient
-    return before

@@ -63,6 +63,7 @@ def plan(spec: Spec, depth: int, restart: int = 0) -> list[Stage]:
         return [Stage("joint", None, None, EVERYTHING)]
     stages: list[Stage] = []
     way = WAYS[starts_of(spec)[restart]]
+    acts = spec.hierarchy is not None and "control" in spec.hierarchy.meta_policy.emits
     mixed = way.memoryless
     layerwise = bool(training.layerwise) and not mixed
     together = training.layerwise == "segments" and depth > 1 and not mixed
@@ -71,7 +72,7 @@ def plan(spec: Spec, depth: int, restart: int = 0) -> list[Stage]:
         networks = networks if level > 1 else ("trunk.", *networks)
         if way.stage:
             name = f"{way.stage}-{level}"
-            if level == depth and not layerwise and _meta_policy_selects(spec):
+            if level == depth and not layerwise and not acts:  # clamped choices do not show when it acts itself
                 trained = (*networks, "meta_policy.")
                 stages.append(Stage(name, None, level, trained, selecting=True, memoryless=mixed))
             else:
@@ -93,12 +94,6 @@ def plan(spec: Spec, depth: int, restart: int = 0) -> list[Stage]:
 def _memoryless(level: int) -> tuple[str, ...]:
     """The networks of a level without its terminations."""
     return f"levels.{level - 1}.trunk.", f"levels.{level - 1}.policy."
-
-
-def _meta_policy_selects(spec: Spec) -> bool:
-    """Whether the meta-policy can be trained on clamped choices: they do not show when it emits the control itself."""
-    assert spec.hierarchy is not None  # only levels are clamped
-    return "control" not in spec.hierarchy.meta_policy.emits
 
 
 def stage_end(
