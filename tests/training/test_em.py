@@ -372,7 +372,9 @@ def test_ridges_are_raised_where_demonstrations_are_few_for_their_observations(t
         demos.write(path)
         spec = parse_spec(yaml.safe_load(starting_spec(inspect(path), path).text))
         return ddco_pyro.fit(
-            with_overrides(spec, {"compare_with": [], "training.epochs": 16, **dict(overrides)})
+            with_overrides(
+                spec, {"compare_with": [], "training.epochs": 16, "training.starts": ["vq_controls"], **dict(overrides)}
+            )
         ).metrics
 
     fallen = fitted(bimanual(20), ("training.optimizer.ridge.cross_validated", False))
