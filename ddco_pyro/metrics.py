@@ -297,6 +297,10 @@ class Worth(Record, Generic[T]):
         return {name: part for name, part in each.items() if part}
 
 
+NatsWorth, SuccessWorth = Worth[Difference], Worth[Against]
+"""Made here, where pickle looks for the classes."""
+
+
 class Seeds(Record):
     """Results of a fit and its repetitions, in the order of their training seeds.
 
@@ -317,6 +321,10 @@ class Dimensions(Record):
 
     by_dimension: list[Finite | None]
     options: Finite
+
+
+ByDimension = Parts[Dimensions]
+"""Made here, where pickle looks for the class."""
 
 
 class Listed(Record):
@@ -429,7 +437,7 @@ class Rollouts(Record):
     seed: int
     episodes: AtLeastOne
     methods: dict[str, Method]
-    worth: LeftOut[Worth[Against] | None] = None
+    worth: LeftOut[SuccessWorth | None] = None
     seeds: LeftOut[Seeds | None] = None
 
     @property
@@ -536,12 +544,12 @@ class Metrics(Record, frozen=False):
 
     model: str
     log_likelihood_per_step: Parts[Finite]
-    log_likelihood_by_dimension: Parts[Dimensions]
+    log_likelihood_by_dimension: ByDimension
     marginal: LeftOut[Marginal | None] = None
     valid: list[HeldOut]
     demonstrations_by_likelihood: list[Listed]
     comparison: dict[str, Compared]
-    worth: LeftOut[Worth[Difference] | None] = None
+    worth: LeftOut[NatsWorth | None] = None
     below: LeftOut[dict[str, Below]] = {}
     """By the name of each mixture among the baselines that the hierarchy contains."""
     branches: LeftOut[list[BranchUse]] = []
