@@ -297,7 +297,8 @@ class Worth(Record, Generic[T]):
         return {name: part for name, part in each.items() if part}
 
 
-NatsWorth, SuccessWorth = Worth[Difference], Worth[Against]
+NatsWorth = Worth[Difference]
+SuccessWorth = Worth[Against]
 """Made here, where pickle looks for the classes."""
 
 
