@@ -244,7 +244,7 @@ def rolled(toy_run, other, folders, tmp_path_factory):
     """Two runs with rollouts from initial states of which some are the same; one more without."""
     first = load(shutil.copytree(toy_run.folder, tmp_path_factory.mktemp("rolled") / "first"))
     second = other("second", rollout__policies=[])
-    for run, episodes in ((first, 6), (second, 7)):
+    for run, episodes in ((first, 4), (second, 5)):
         roll_out(run, episodes, film=0, jobs=1)
     return first, second, load(folders[-1])
 

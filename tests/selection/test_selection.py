@@ -22,9 +22,9 @@ ONE = Workers(1)
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    """A selection over two candidates and four folds: its spec, folder, result, and what was told."""
+    """A selection over two candidates and three folds: its spec, folder, result, and what was told."""
     folder = tmp_path_factory.mktemp("selection")
-    spec, told = with_overrides(spec_at(folder), {"training.starts": ["vq", "vq"]}), Told()
+    spec, told = with_overrides(spec_at(folder, folds=3), {"training.starts": ["vq", "vq"]}), Told()
     return spec, folder / "run", select(spec, folder / "run", told, ONE), told
 
 
@@ -44,13 +44,13 @@ def test_a_score_is_that_of_a_fit_without_the_fold(finished):
 def test_every_candidate_has_the_same_folds(finished):
     _, folder, made, told = finished
     scores = kept(folder)
-    assert set(scores) == {(c, f) for c in range(2) for f in range(4)}
+    assert set(scores) == {(c, f) for c in range(2) for f in range(3)}
     for (_, fold), one in scores.items():
         assert tuple(demo.name for demo in one.valid) == tuple(made.held_out[fold])
         assert [demo.steps for demo in one.valid] == [len(demo) for demo in two_skills().select(made.held_out[fold])]
-    assert told.begun == [("cross-validation", 8, 0)]
+    assert told.begun == [("cross-validation", 6, 0)]
     assert {pair[0] for pair in told.pairs} == {
-        f"{row.candidate.name}, fold {f}" for row in made.choice.rows for f in range(4)
+        f"{row.candidate.name}, fold {f}" for row in made.choice.rows for f in range(3)
     }
 
 
@@ -59,13 +59,13 @@ def test_the_file_is_what_the_scores_say(finished):
     data = json.loads((folder / "selection.json").read_text())
     scores, means = kept(folder), []
     for row in data["candidates"]:
-        own = [demo for fold in range(4) for demo in scores[row["number"], fold].valid]
+        own = [demo for fold in range(3) for demo in scores[row["number"], fold].valid]
         means.append(sum(demo.log_likelihood for demo in own) / sum(demo.steps for demo in own))
         assert row["log_likelihood_per_step"] == pytest.approx(means[-1])
         assert row["status"] == "scored"
     assert data["best"] == int(np.argmax(means)) == made.choice.best.candidate.number
     assert data["chosen"] == made.choice.chosen.candidate.number
-    assert (data["folds"], data["demonstrations"]) == (4, 12)
+    assert (data["folds"], data["demonstrations"]) == (3, 12)
     assert ElementTree.parse(folder / "figures" / "selection.svg").getroot().get("aria-label")
     assert made.choice.chosen.candidate.name in (folder / "selection.md").read_text()
 
@@ -76,7 +76,7 @@ def test_what_is_there_is_not_done_again(finished, monkeypatch):
     monkeypatch.setattr(selection, "fit_beside", None)
     told = Told()
     again = select(spec, folder, told, ONE)
-    assert (told.begun, told.pairs) == ([("cross-validation", 8, 8)], [])
+    assert (told.begun, told.pairs) == ([("cross-validation", 6, 6)], [])
     assert (folder / "selection.json").read_bytes() == before
     assert again.choice == made.choice
 
