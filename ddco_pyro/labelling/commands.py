@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,9 +17,6 @@ from ddco_pyro.labelling.proposals import Shown, first_wrong, labels_shown, sour
 
 LONGEST = 80
 """Characters of a name."""
-
-REACH = 2
-"""Steps that a boundary goes to a change point."""
 
 
 @dataclass(frozen=True)
@@ -40,13 +37,11 @@ class View:
     """What a person looks at: the labels, and what is shown of each demonstration.
 
     :param first: what was shown before anything was said of a demonstration.
-    :param changes_of: the steps of a demonstration at which its observations and controls change.
     """
 
     document: Document
     shown: Mapping[str, Shown]
     first: Mapping[str, Shown]
-    changes_of: Callable[[str], Sequence[int]]
 
     def segments(self, name: str) -> list[Segment]:
         """The segments of a demonstration that are shown."""
@@ -100,17 +95,13 @@ class View:
                     f"paint: steps {start} to {stop} are not in {name}, which has {self.document.lengths[name]}"
                 )
             return [(PAINT, name, start, stop, self._option(command, 0) or OPEN)]
-        if do == "scratch":
-            return [(PAINT, name, 0, self.document.lengths[name], OPEN)]
         if do == "move":
             return self._move(name, whole(command, "boundary"), whole(command, "to"))
         step = whole(command, "step")
         here = self.at(name, step)
-        if do == "name":
-            start = self._snapped(name, step, here) if command.get("from_here") else here.start
-            return [(PAINT, name, start, here.stop, self._option(command, 1))]
-        if do == "open":
-            return [(PAINT, name, here.start, here.stop, OPEN)]
+        if do in ("name", "open"):
+            reached = (step, self._said_until(name, step)) if command.get("from_here") else (here.start, here.stop)
+            return [(PAINT, name, *reached, OPEN if do == "open" else self._option(command, 1))]
         if do == "everywhere":
             option = self._option(command, 1)
             return [
@@ -135,11 +126,11 @@ class View:
             return [("cut", name, here.stop, False), (PAINT, name, here.start, following.stop, here.option)]
         raise BadInput(f"{do}: is no command")
 
-    def _snapped(self, name: str, step: int, here: Segment) -> int:
-        """The change point that is nearest to a step of a segment, within reach; else the step."""
-        near = [point for point in self.changes_of(name) if abs(point - step) <= REACH]
-        inside = [point for point in near if here.start < point < here.stop]
-        return min(inside, key=lambda point: (abs(point - step), point), default=step)
+    def _said_until(self, name: str, step: int) -> int:
+        """The step before which what was said of a step ends, with all that is proposed alone behind it."""
+        said = self.document.labels[name][step:]
+        others = np.flatnonzero((said != FREE) & np.logical_or.accumulate(said != said[0]))
+        return step + int(min(others, default=len(said)))
 
     def _drop(self, option: int, into: int) -> list[Change]:
         """An option is none any more: its labels are those of another one, or nothing where that is 0."""

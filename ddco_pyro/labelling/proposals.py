@@ -21,7 +21,7 @@ from ddco_pyro.evaluation.agreement import agreement
 from ddco_pyro.evaluation.inferred import Inferred, runs
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.labelling.document import CONFIRM, FREE, OPEN, PAINT, Change, Document
-from ddco_pyro.model.recogniser import SCALES, Windows
+from ddco_pyro.model.recogniser import Windows
 from ddco_pyro.model.tables import NEVER, Tables
 from ddco_pyro.names import choice_names, label_name, option_name
 from ddco_pyro.segmenting.segments import LevelLabels, Segmented, Segments, segments
@@ -265,24 +265,6 @@ class Proposals:
         lengths = np.diff(starts, append=len(rows))[:, None]
         centres: np.ndarray = (np.add.reduceat(rows, starts) / lengths - self.middle) / self.spread
         return centres
-
-    def change_points(self, name: str) -> list[int]:
-        """The steps at which what is observed and done changes most: local maxima of d(t), t from 1 on.
-
-        d(t) is the distance between the means of standardised features of the w steps before t and of the w steps from
-        t on, and w is a quarter of a usual segment.
-        """
-        rows = self._rows(name).numpy()
-        size = rows.shape[1] // (1 + SCALES)
-        sums = np.cumsum(np.pad((rows[:, :size] - self.middle[:size]) / self.spread[:size], ((1, 0), (0, 0))), axis=0)
-        wide, steps = max(1, round(self.half / 2)), np.arange(1, len(rows))
-        low, high = (steps - wide).clip(0), (steps + wide).clip(max=len(rows))
-        before = (sums[steps] - sums[low]) / (steps - low)[:, None]
-        after = (sums[high] - sums[steps]) / (high - steps)[:, None]
-        away = np.linalg.norm(after - before, axis=1)
-        around = np.lib.stride_tricks.sliding_window_view(np.pad(away, wide, constant_values=-1.0), 2 * wide + 1)
-        peaks: list[int] = steps[away >= around.max(1)].tolist()
-        return peaks
 
     def _rows(self, name: str) -> Tensor:
         """The features of each step of a demonstration, [T, 3 F]."""

@@ -31,7 +31,7 @@ from ddco_pyro.evaluation.inferred import Inferred, runs, within
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.labelling.background import Background
 from ddco_pyro.labelling.commands import Segment, View, whole
-from ddco_pyro.labelling.document import FREE, OPEN, SUFFIX, Change, Document, Journal, digest, version
+from ddco_pyro.labelling.document import FREE, SUFFIX, Change, Document, Journal, digest, version
 from ddco_pyro.labelling.following import Following
 from ddco_pyro.labelling.proposals import (
     Proposals,
@@ -55,7 +55,7 @@ NEAREST = 5
 """Segments elsewhere that are shown for one."""
 
 TENTH = 10
-"""The part of a demonstration that has to be named before naming from scratch is offered, as a divisor."""
+"""The part of a demonstration that has to be named before names from the cursor are offered, as a divisor."""
 
 UNCERTAIN = 20
 """Boundaries that are named as the most uncertain ones."""
@@ -139,7 +139,7 @@ class Session:
         self.refits, self.again = 0, False
         self.background = Background(self.lock, self._ended, "ddco_pyro.labelling.refitting", "sklearn.linear_model")
         self.shown, self.untouched, self.sure = dict[str, Shown](), dict[str, Shown](), 0.0
-        self.view = View(self.document, self.shown, self.untouched, lambda name: self.proposals.change_points(name))
+        self.view = View(self.document, self.shown, self.untouched)
         self.segments, self.recent = dict[str, list[Segment]](), dict[str, Inferred]()
         trajectory = fit.spec.report.trajectory
         self.following: Following = first.following if first else Following(path, self.demos, trajectory)
@@ -369,13 +369,13 @@ class Session:
         return found
 
     def _scratch(self) -> bool:
-        """Whether a first demonstration is likely cheaper to name from scratch than to correct.
+        """Whether a first demonstration likely takes fewer edits where names go from the cursor on.
 
         That is so where most of the steps that a person named were proposed wrong. The posterior says nothing of it:
         the model may be sure of segments that are none of the person's.
         """
         labels = self.document.labels
-        if self.document.accepted or any((own == OPEN).any() for own in labels.values()):
+        if self.document.accepted:
             return False
         named = {name: own > 0 for name, own in labels.items() if name in self.untouched}
         wrong = sum(int((self.untouched[name].options != labels[name])[said].sum()) for name, said in named.items())

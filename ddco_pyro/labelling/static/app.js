@@ -63,9 +63,9 @@ function render(keep = true) {
   $("task").textContent = demo.task;
   for (const mark of ["exclude", "flag"]) document.querySelector(`[data-do=${mark}]`).setAttribute("aria-pressed", marks[mark] === true);
   if (document.activeElement !== $("note")) $("note").value = marks.note ?? "";
-  document.querySelector("[data-do=from_here]").setAttribute("aria-pressed", fromHere);
+  document.querySelector(".bar [data-do=from_here]").setAttribute("aria-pressed", fromHere);
   document.querySelector("[data-do=loop]").setAttribute("aria-pressed", looping);
-  $("scratch").hidden = !state.scratch;
+  $("scratch").hidden = fromHere || !state.scratch;
   document.querySelector("[data-do=accept]").hidden = accepted; document.querySelector("[data-do=reopen]").hidden = !accepted;
   $("reason").textContent = [marks.exclude && "excluded", accepted && "accepted", held && "held out", people.length && `of ${people.join(" and ")}`, done.length && `accepted by ${done.join(", ")}`, reason].filter(Boolean).join(" · ");
   signals.show(demo.numbers?.names ?? []); timeline.show(demo, state, signals.chosen); look.show(demo, demo.segments, state.colours, `level/${level}`);
@@ -109,7 +109,7 @@ const enter = number => waiting = waiting.then(() => tried(async () => {  // ano
 const compare = ({ annotator, agreement }, x, y) => popup(x, y, annotator, [[`Take the labels of ${annotator}${agreement ? `: ${agrees(agreement)}` : ""}`, () => edit({ do: "take", demo: demo.index, annotator }, `Labels of ${annotator} taken`)]]);
 
 // One edit after the other: each is in the journal when the server answers.
-const DONE = { undo: "Undone", redo: "Done again", split: "Split", merge: "Merged", open: "Left open", move: "Moved", rename: "Renamed", new: "New option", accept: "Accepted", reopen: "Taken back", mark: "Marked", colour: "Coloured", drop: "Dropped", scratch: "Open from the first step", take: "Taken" };
+const DONE = { undo: "Undone", redo: "Done again", split: "Split", merge: "Merged", open: "Left open", move: "Moved", rename: "Renamed", new: "New option", accept: "Accepted", reopen: "Taken back", mark: "Marked", colour: "Coloured", drop: "Dropped", take: "Taken" };
 const edit = (command, words) => waiting = waiting.then(() => tried(async () => {
   const made = typeof command === "function" ? command() : command, at = wanted.index;
   if (!made) return false;
@@ -204,7 +204,7 @@ function popup(x, y, name, items) {  // a menu of [text, work]
 const speed = by => { const at = Math.min(Math.max(SPEEDS.indexOf(Number($("speed").value)) + by, 0), SPEEDS.length - 1); $("speed").value = SPEEDS[at]; if (playing) { play(); play(); } say(`Speed ${SPEEDS[at]} ×`); };
 const menu = (x, y) => popup(x, y, "Segment", [
   ...state.names.map((name, n) => [`${n + 1}  ${name}`, () => act(n + 1)]), ["New option …", () => options.added.focus()],
-  ["Split here  S", commands.split], ["Merge with the next  M", commands.merge], ["Leave open  0", commands.open], ["Begin from scratch", commands.scratch], ["Accept all  Enter", commands.accept],
+  ["Split here  S", commands.split], ["Merge with the next  M", commands.merge], ["Leave open  0", commands.open], ["Accept all  Enter", commands.accept],
 ]);
 addEventListener("pointerdown", event => { if (!$("menu").contains(event.target)) $("menu").hidden = true; });
 const download = format => tried(async () => {  // leaves the page where it is
@@ -218,14 +218,13 @@ const download = format => tried(async () => {  // leaves the page where it is
 
 const here = name => () => edit({ do: name, demo: demo.index, step: cursor });
 const commands = {
-  undo: () => edit({ do: "undo" }), redo: () => edit({ do: "redo" }), split: here("split"), merge: here("merge"), open: here("open"), accept, reopen: () => edit({ do: "reopen", demo: demo.index }), play, uncertain,
+  undo: () => edit({ do: "undo" }), redo: () => edit({ do: "redo" }), split: here("split"), merge: here("merge"), open: () => edit({ do: "open", demo: demo.index, step: cursor, from_here: fromHere }), accept, reopen: () => edit({ do: "reopen", demo: demo.index }), play, uncertain,
   refit: () => tried(async () => { await ask("refit", {}); await poll(); say("Refit begun"); }),
   cancel: () => tried(async () => { if (!state.refit.running) { say("Nothing is under way"); return; } await ask("cancel", {}); await poll(); say("Cancelled; what is shown stays"); }),
   save: () => tried(async () => { say((await ask("save", {})).message); status(Object.assign(state, { dirty: false })); }),
   export: () => { const { left, bottom } = document.querySelector("[data-do=export]").getBoundingClientRect(); popup(left, bottom, "Export", state.formats.map(name => [name, () => download(name)])); },
   exclude: () => toggle("exclude"), flag: () => toggle("flag"), note: () => $("note").focus(),
-  from_here: () => { fromHere = !fromHere; render(); say(fromHere ? "A name goes from the cursor to the end of the segment" : "A name is of the whole segment"); },
-  scratch: () => edit({ do: "scratch", demo: demo.index }).then(() => { fromHere = true; seek(0); render(); }),
+  from_here: () => { fromHere = !fromHere; render(); say(fromHere ? "A name goes from the cursor over all that is proposed" : "A name is of the whole segment"); },
   loop: () => { looping = !looping; render(); say(looping ? "Playing repeats the segment" : "Playing goes on to the end"); }, slower: () => speed(-1), faster: () => speed(1),
   help: () => $("help").showModal(), find: () => $("find").focus(),
   closer: () => timeline.zoom(.5), wider: () => timeline.zoom(2), all: () => timeline.all(),
