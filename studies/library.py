@@ -72,7 +72,8 @@ class NewTasks(MetaWorld):
     def _pooled(self, job: Job) -> dict[str, float]:
         """Agreement in the cell's task of a fit of its demonstrations and those of the library's other tasks."""
         others = [demo for task, each in recorded().items() if task != job.cell.task for demo in each]
-        own = [_named(demo, job.cell.task) for demo in job.demos]
+        (file,) = (job.folder.parents[1] / "demonstrations").glob(f"{job.cell.task}-*.hdf5")  # with all it has
+        own = [_named(demo, job.cell.task) for demo in Demonstrations.read(file).select(job.demos.names)]
         held_out = tuple(f"{job.cell.task}_{name}" for name in job.demos.masks["valid"])
         path = job.folder / "pooled.hdf5"
         Demonstrations((*own, *others), {"valid": held_out}).write(path)
