@@ -20,7 +20,7 @@ from ddco_pyro.metrics import Record, read_record
 
 NAME = "demonstrations.json"
 
-FORMAT = 4
+FORMAT = 5
 """The version of the run folder's format."""
 
 

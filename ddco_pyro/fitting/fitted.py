@@ -335,10 +335,10 @@ def load(folder: str | Path, allow_code: bool = False, overrides: Iterable[str] 
         if (folder / "folds.json").exists():
             what = f"a selection; the fit of what it chose is in {folder / 'fit'} once it is done"
         raise RunError(f"{folder}: {what} (it has no {missing[0]})")
+    recorded(folder)  # or the format is another, and so are the keys of the spec
     fitted, spec = (load_spec(folder / "spec.yaml", those, allow_code) for those in ((), overrides))
     if spec.model_copy(update={"report": fitted.report}) != fitted:
         raise SpecError(f"{folder}: is fitted; only settings of the report can change, such as report.trajectory=KEY")
-    recorded(folder)  # or the format is another
     hierarchy = read_model(folder, spec)
     counts = [level.count for level in spec.hierarchy.levels] if spec.hierarchy else []
     return Fit(spec, hierarchy, Metrics.read(folder, counts), folder, named=read_names(folder, spec) or {})

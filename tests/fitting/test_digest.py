@@ -158,11 +158,13 @@ def test_a_selection_of_a_file_that_has_changed_is_not_continued(tmp_path: Path)
 
 
 def test_a_run_of_another_version_is_to_be_fitted_again(finished: Path, tmp_path: Path) -> None:
-    said = "this run was written by version 2 of the run folder's format, and version 4 is read here"
+    said = "this run was written by version 2 of the run folder's format, and version 5 is read here"
     for name in ("run", "interrupted"):
         run = shutil.copytree(finished / name, tmp_path / name)
         digest = json.loads((run / "demonstrations.json").read_text()) | {"format": 2}
         (run / "demonstrations.json").write_text(json.dumps(digest))
+        if name == "run":  # whose spec has other keys
+            (run / "spec.yaml").write_text("a_former_key: 1\n" + (run / "spec.yaml").read_text())
         command = ("report", run) if name == "run" else ("fit", run / "spec.yaml", "--out", run, "--resume")
         assert call(*command) == (2, "", f"ddco-pyro: {run}: {said}: fit again\n")
 
