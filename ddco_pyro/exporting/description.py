@@ -176,7 +176,6 @@ def _networks(hierarchy: Hierarchy) -> tuple[dict[str, Any], Arrays]:
     levels = hierarchy.option_levels()
     networks = {f"caller_{number}": caller.network for number, caller in enumerate(hierarchy.callers())}
     networks |= {f"end_{n}": level.termination for n, level in enumerate(levels) if level.termination is not None}
-    networks |= {f"trunk_{number}": level.trunk for number, level in enumerate(levels) if level.trunk is not None}
     networks |= {} if hierarchy.trunk is None else {"trunk": hierarchy.trunk}
     forms = {name: form for name, network in networks.items() if (form := network.numpy_form()) is not None}
     for name, (_, parameters) in forms.items():

@@ -252,11 +252,8 @@ class NumpyNetworks:
         self._images, self._step = images, step
         self._before, self._after = iter(state), []
         outputs: Outputs = {}
-        whole = self._network("trunk")
+        self._features = self._network("trunk")
         for level, caller in enumerate(self._about["callers"]):
-            self._features = whole
-            trunk = self._network(f"trunk_{level}")
-            self._features = whole if trunk is None else trunk
             out = self._network(f"caller_{level}")
             assert out is not None  # every caller has a network
             logits, mean = out[:, : caller["logits"]], out[:, caller["logits"] :]

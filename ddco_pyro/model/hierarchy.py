@@ -87,8 +87,7 @@ class Caller(nn.Module):
 class Level(nn.Module):
     """The k options of one level: policies π (above the lowest level η) and terminations ψ.
 
-    Both read the observations, or the features of a trunk. ``termination`` is None where every option ends after every
-    step (ψ = 1).
+    ``termination`` is None where every option ends after every step (ψ = 1).
 
     :param shape: of the observations, or the hierarchy's trunk.
     """
@@ -104,17 +103,12 @@ class Level(nn.Module):
     ) -> None:
         super().__init__()
         self.count = spec.count
-        self.trunk: Network | None = None
-        if spec.trunk is not None:
-            with named(f"{place}.trunk"):
-                self.trunk = build_trunk(spec.trunk, shape, spec.count)
-        read = self.trunk or shape
         with named(f"{place}.policy"):
-            self.policy = Caller(spec.policy, spec.policy.emits, options_below, read, control, scaling, spec.count)
+            self.policy = Caller(spec.policy, spec.policy.emits, options_below, shape, control, scaling, spec.count)
         self.termination: Network | None = None
         if isinstance(spec.termination, AnyNetworkSpec):
             with named(f"{place}.termination"):
-                self.termination = build(spec.termination, read, 1, spec.count)
+                self.termination = build(spec.termination, shape, 1, spec.count)
 
 
 class Hierarchy(nn.Module):
@@ -200,7 +194,6 @@ class Hierarchy(nn.Module):
         each = {} if self.trunk is None else {"trunk": self.trunk}
         for number, level in enumerate(self.option_levels()):
             place = f"levels.{number}"
-            each |= {} if level.trunk is None else {f"{place}.trunk": level.trunk}
             each[f"{place}.policy"] = level.policy.network
             each |= {} if level.termination is None else {f"{place}.termination": level.termination}
         return each | {"meta_policy": self.meta_policy.network}
@@ -292,10 +285,9 @@ class Hierarchy(nn.Module):
         read = inputs if self.trunk is None else run("trunk", self.trunk, inputs)
         for number, level in enumerate(self.option_levels()[:discovering]):
             place = f"levels.{number}"
-            own = read if level.trunk is None else run(f"{place}.trunk", level.trunk, read)
-            raw.append(run(f"{place}.policy", level.policy.network, own))
+            raw.append(run(f"{place}.policy", level.policy.network, read))
             if level.termination is not None:
-                raw.append(run(f"{place}.termination", level.termination, own))
+                raw.append(run(f"{place}.termination", level.termination, read))
         if not discovering:
             raw.append(run("meta_policy", self.meta_policy.network, read))
         return [output.to(HOST) for output in raw], after

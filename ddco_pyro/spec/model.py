@@ -29,9 +29,6 @@ class LevelSpec(Model):
     """Name of the level in reports and files: a letter, then letters, digits, ``_`` and ``-``."""
     count: Count
     """Number of options, k."""
-    trunk: TrunkSpec | None = None
-    """A network for each option whose last hidden layer ``policy`` and ``termination`` read. Both are then ``linear``,
-    ``mlp`` or ``constant``. Null: ``policy`` and ``termination`` read the observations."""
     policy: PolicySpec = MlpSpec()
     """The options' policies, π: one network for each option."""
     termination: Termination = LinearSpec(network="linear")
@@ -45,7 +42,8 @@ class LevelSpec(Model):
 
     @property
     def networks(self) -> dict[str, Network]:
-        networks = {"trunk": self.trunk, "policy": self.policy, "termination": self.termination}
+        """The networks of its options by key."""
+        networks = {"policy": self.policy, "termination": self.termination}
         return {key: network for key, network in networks.items() if isinstance(network, Network)}
 
 
@@ -53,21 +51,26 @@ class HierarchySpec(Model):
     """Levels of options below a meta-policy."""
 
     trunk: TrunkSpec | None = None
-    """A single network whose last hidden layer replaces the observations for all other networks: the levels' trunks,
-    policies and terminations without a trunk, and the meta-policy. These are then ``linear``, ``mlp`` or ``constant``.
-    Null: every network reads the observations."""
+    """A single network whose last hidden layer replaces the observations for all other networks, which then are
+    ``linear``, ``mlp`` or ``constant``. Null: every network reads the observations."""
     levels: Items[LevelSpec] = Field(min_length=1)
     """The levels, lowest first."""
     meta_policy: PolicySpec = MlpSpec(emits=("options",))
     """The policy that selects from the highest level, η."""
+
+    @property
+    def networks(self) -> dict[str, Network]:
+        """The networks above the trunk, or the observations, by key path."""
+        levels = enumerate(self.levels)
+        of_levels = {f"levels.{n}.{key}": network for n, level in levels for key, network in level.networks.items()}
+        return {"meta_policy": self.meta_policy} | of_levels
 
     def read_by(self, level: int) -> tuple[str, ...]:
         """Names of the observations that the policies of a level read; empty: all of them.
 
         :param level: 1 for the lowest.
         """
-        options = self.levels[level - 1]
-        return (self.trunk or options.trunk or options.policy).reads
+        return (self.trunk or self.levels[level - 1].policy).reads
 
     @field_validator("levels")
     @classmethod
@@ -89,14 +92,7 @@ class HierarchySpec(Model):
                 yield f"levels.{index}.name", text
         if self.levels[0].policy.emits != ("control",):
             yield "levels.0.policy.emits", "the lowest level emits the control and nothing else; leave it out"
-        heads: dict[str, Network] = {"meta_policy": self.meta_policy} if self.trunk else {}
-        for index, level in enumerate(self.levels):
-            heads |= {
-                f"levels.{index}.{key}": network
-                for key, network in level.networks.items()
-                if (self.trunk if level.trunk is None or key == "trunk" else level.trunk)
-            }
-        for place, head in heads.items():
+        for place, head in self.networks.items() if self.trunk else ():
             if head.network not in HEADS:
                 yield f"{place}.network", f"reads the trunk: use one of {', '.join(HEADS)}, got {head.network!r}"
             elif head.inputs:

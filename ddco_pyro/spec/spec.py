@@ -98,9 +98,8 @@ class Spec(Model):
         if self.hierarchy is None:
             baseline = self.baseline
             return baseline is not None and baseline.kind == "flat" and baseline.policy.network in _LINEAR
-        trunks = (self.hierarchy.trunk, *(level.trunk for level in self.hierarchy.levels))
-        networks = [network for level in self.hierarchy.levels for network in level.networks.values()]
-        return not any(trunks) and all(n.network in _LINEAR for n in (*networks, self.hierarchy.meta_policy))
+        linear = all(network.network in _LINEAR for network in self.hierarchy.networks.values())
+        return linear and self.hierarchy.trunk is None
 
     def problems(self) -> Problems:
         checks = (self._choices, self._baselines, self._observed, self._labelled, self._segments)

@@ -68,7 +68,7 @@ def plan(spec: Spec, depth: int, restart: int = 0) -> list[Stage]:
     layerwise = bool(training.layerwise) and not mixed
     together = training.layerwise == "segments" and depth > 1 and not mixed
     for level in range(1, 2 if together else depth + 1):
-        networks = _memoryless(level) if mixed else (f"levels.{level - 1}.",)
+        networks = (f"levels.{level - 1}.policy." if mixed else f"levels.{level - 1}.",)
         networks = networks if level > 1 else ("trunk.", *networks)
         if way.stage:
             name = f"{way.stage}-{level}"
@@ -86,14 +86,9 @@ def plan(spec: Spec, depth: int, restart: int = 0) -> list[Stage]:
     elif layerwise:
         stages.append(Stage("meta-policy", None, None, ("meta_policy.",)))
     if mixed:
-        policies = (name for level in range(1, depth + 1) for name in _memoryless(level))
+        policies = (f"levels.{number}.policy." for number in range(depth))
         stages.append(Stage("mixture", None, None, ("trunk.", *policies, "meta_policy."), memoryless=True))
     return [*stages, Stage("joint", None, None, EVERYTHING)]
-
-
-def _memoryless(level: int) -> tuple[str, ...]:
-    """The networks of a level without its terminations."""
-    return f"levels.{level - 1}.trunk.", f"levels.{level - 1}.policy."
 
 
 def stage_end(

@@ -63,7 +63,7 @@ def test_activations_are_the_mean_sizes_of_what_the_branches_give(fitted):
     use, *_ = branch_use(fitted.hierarchy, fitted.infer(demos))
     (piece,) = fitted.infer(demos)
     level = fitted.hierarchy.levels[0]
-    network = fitted.hierarchy.trunk or level.trunk or level.policy.network
+    network = fitted.hierarchy.trunk or level.policy.network
     u = piece.posterior.u[0][..., 1:]
     for column, branch in enumerate(network.of):
         with torch.no_grad():

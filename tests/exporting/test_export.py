@@ -23,7 +23,7 @@ from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import InputShape, UserNetwork
 from ddco_pyro.spec import parse_spec
 
-PROGRAMS = ("read by all", "conv", "lstm", "trunk", "σ of the state", "per_timestep", "constant")
+PROGRAMS = ("branches", "conv", "lstm", "trunk", "σ of the state", "per_timestep", "constant")
 """The first has convolutions, LSTMs, perceptrons and linear networks, together."""
 
 

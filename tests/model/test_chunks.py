@@ -26,10 +26,7 @@ NETWORKS: dict[str, dict[str, Any]] = {
     "conv": {"policy": {**CONV, "dropout": 0.3}},
     "lstm over conv": {"policy": {"network": "lstm", "over": CONV, "hidden": 5}},
     "lstm over conv, a horizon": {"policy": {"network": "lstm", "over": CONV, "hidden": [5, 3], "horizon": 5}},
-    "lstm over branches, a trunk": {
-        "trunk": {"network": "lstm", "over": {**BRANCHES, "hidden": [5]}, "hidden": [4, 5]}
-    },
-    "lstm over branches, read by all": {"whole": {"network": "lstm", "over": {**BRANCHES, "hidden": [5]}, "hidden": 4}},
+    "lstm over branches, a trunk": {"whole": {"network": "lstm", "over": {**BRANCHES, "hidden": [5]}, "hidden": [4, 5]}},
     "branches": {"policy": {**BRANCHES, "hidden": [7]}},
     "constant": {"policy": {"network": "constant"}, "whole": CONV},
     "per_timestep": {"policy": {"network": "per_timestep", "hidden": [4], "inputs": ["state"]}},
@@ -43,9 +40,7 @@ def hierarchy(network: str, dtype: torch.dtype = torch.float64) -> Hierarchy:
     own = dict(NETWORKS[network])
     whole = own.pop("whole", None)
     reads: dict[str, Any] = {"network": "mlp", "inputs": [] if whole else ["state"]}
-    lower = {"name": "lower", "count": 3, "policy": {"network": "linear"}, **own}
-    if "trunk" not in own:
-        lower["termination"] = reads
+    lower = {"name": "lower", "count": 3, "policy": {"network": "linear"}, "termination": reads, **own}
     upper = {"name": "upper", "count": 2, "policy": reads, "termination": reads}
     meta = reads if whole else {"network": "lstm", "over": reads, "hidden": 3}
     model = {"trunk": whole, "levels": [lower, upper], "meta_policy": meta}

@@ -270,7 +270,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"control.parts": [{"name": "jaw", "dims": [0], "kind": "binary", "std": 1}]}, "control.parts.0.std: does"),
     ({"observations": ["state", {"key": "step", "differences": True}]}, "observations.1.differences: does not apply"),
     (
-        {"hierarchy.levels.0.trunk": {"network": "mlp"}, "hierarchy.levels.0.policy": {"network": "lstm"}},
+        {"hierarchy.trunk": {"network": "mlp"}, "hierarchy.levels.0.policy": {"network": "lstm"}},
         "hierarchy.levels.0.policy.network: reads the trunk: use one of linear, mlp, constant, got 'lstm'",
     ),
     ({"hierarchy": None}, "hierarchy: missing; declare a hierarchy, or a baseline in its place"),
@@ -308,10 +308,6 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"control.std": {**OF_STATE, "per_option": True}}, "control.std.per_option: per_state gives each option its own"),
     ({"hierarchy": None, "baseline": {"kind": "flat", "std": OF_STATE}}, "baseline.std: is for baselines in"),
     ({"compare_with": [{"kind": "flat", "std": OF_STATE}]}, "compare_with.0.std: no σ in control is learned"),
-    (
-        {"hierarchy.trunk": {}, "hierarchy.meta_policy": {"network": "lstm"}},
-        "hierarchy.meta_policy.network: reads the trunk: use one of",
-    ),
     (
         {"hierarchy.trunk": {}, "hierarchy.levels.0.policy": {"inputs": ["pose"]}},
         "hierarchy.levels.0.policy.inputs: the trunk reads the observations",

@@ -24,7 +24,6 @@ def make(
     endings=None,
     built_in=(),
     trunk=None,
-    whole=None,
     meta_policy=None,
     vectors=True,
     bins=0,
@@ -49,8 +48,8 @@ def make(
     endings = endings or {"network": network if network in ("conv", "per_timestep") else "linear"}
     model = {
         "hierarchy": {
-            "trunk": whole,
-            "levels": [level | {"termination": endings, "trunk": trunk} for level in levels],
+            "trunk": trunk,
+            "levels": [level | {"termination": endings} for level in levels],
             "meta_policy": (meta_policy or policy) | {"emits": list(emits)},
         }
     }
@@ -129,10 +128,8 @@ FITS = {
     "lstm over pictures": make(
         {"network": "lstm", "over": CONVOLUTIONS}, camera=True, endings=CONVOLUTIONS, steps=30, options="sample"
     ),
-    "trunk": make("linear", (2, 3), BOTH, trunk=BRANCHES, meta_policy=BRANCHES, **SMALL),
-    "read by all": make(
-        "linear", (2, 3), BOTH, trunk={"network": "mlp", "hidden": [5]}, whole=BRANCHES, options="sample", **SMALL
-    ),
+    "trunk": make("mlp", (2, 3), BOTH, trunk=BRANCHES, options="sample", **SMALL),
+    "branches": make(BRANCHES, (2, 3), BOTH, endings={"network": "linear", "inputs": ["state"]}, **SMALL),
     "pictures alone": make(LEAKY, camera=True, endings=LEAKY, vectors=False, options="sample"),
     "several convolutions": make(
         CONVOLUTIONS, camera=True, endings={"network": "linear", "inputs": ["step", "goal"]}, built_in=("step",)

@@ -20,7 +20,7 @@ def test_the_spec_fits_and_acts(cache: Path, tmp_path: Path) -> None:
     small = ["demonstrations.count=8", "training.epochs=6", "compare_with=[]"]
     found = ddco_pyro.fit(load_spec(SPEC, small, allow_code=True), out=tmp_path / "run")
     assert found.metrics.engine_check.value < 1e-6
-    trunk = found.hierarchy.levels[0].trunk
+    trunk = found.hierarchy.trunk
     assert isinstance(trunk.module, Radial)
     assert (trunk.features, trunk.module.width) == (32, 2.0)
     episode = run_episode(task, found.controller(), 0)

@@ -54,7 +54,7 @@ OTHER = {
     "per_timestep": {"policy": TIMES, "termination": MLP},
     "lstm": {"policy": LSTM, "termination": LINEAR},
     "constant": {"policy": MLP, "termination": {"network": "constant"}},
-    "a trunk of branches": {"trunk": BRANCHES, "policy": {"network": "linear"}, "termination": {"network": "linear"}},
+    "branches": {"policy": BRANCHES, "termination": LINEAR},
 }
 """Those that are computed by another algorithm, or in another order, where they are not on the host."""
 

@@ -336,7 +336,7 @@ LEVEL = {"count": 2, "policy": LINEAR}
         ("adam", {"hierarchy": None, "baseline": {"kind": "per_timestep", "policy": LINEAR}}),
         *(("adam", {f"training.{key}": value}) for key, value in (("optimizer.lr", 0.1), ("average", 0.9))),
         ("adam", {"training.optimizer.name": "adam"}),
-        *(("adam", {f"hierarchy.{key}": MLP}) for key in ("trunk", "meta_policy", "levels.0.trunk")),
+        *(("adam", {f"hierarchy.{key}": MLP}) for key in ("trunk", "meta_policy")),
         ("adam", {"hierarchy.levels.0.termination": MLP}),
     ],
 )
