@@ -14,6 +14,9 @@ class Radial(nn.Module):
     :param width: the distance at which the nearness is exp(-1/2).
     """
 
+    features = 32
+    """Centres of a trunk."""
+
     def __init__(self, shape: InputShape, outputs: int, copies: int, width: float = 1.0) -> None:
         super().__init__()
         self.centres, self.width = nn.Parameter(torch.randn(copies, outputs, shape.vector)), width

@@ -180,8 +180,6 @@ class UserNetworkSpec(Network):
     """The class, as ``module:Class``."""
     options: dict[str, Any] = Field(default={})
     """Keyword arguments of the class."""
-    features: Count = 64
-    """Number of outputs of each copy where another network reads the class as a trunk."""
 
     @property
     def settings(self) -> dict[str, Any]:

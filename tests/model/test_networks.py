@@ -190,6 +190,11 @@ def test_a_network_of_ones_own():
     assert_close(network(inputs)[0][:, :, 3, 1], 2 * inputs.vector.sum(-1))
 
 
+def test_another_network_reads_as_many_of_its_numbers_as_its_class_says():
+    over = [make(network="lstm", over={"network": f"user_networks:{name}"}).over for name in ("Own", "Narrow")]
+    assert [network.features for network in over] == [64, 5]
+
+
 SHOULD = "it has to be a tensor [N, T, copies, outputs], here"
 STATE = "has initial_state(N), which has to give a tuple of tensors [N, ...]; each call"
 BY_STEPS = "gives other outputs step by step than for a whole trajectory: its state has to hold all"

@@ -74,9 +74,9 @@ def test_higher_levels_select_from_below_unless_told_otherwise() -> None:
     [
         ({}, ()),
         ({"policy": {"inputs": ["a", "b"]}, "termination": {"inputs": ["b", "c"]}}, ("a", "b")),
-        ({"trunk": {"network": "branches", "of": {"a": {}, "x": {"inputs": ["c", "a"]}}}}, ("a", "c")),
-        ({"trunk": {"network": "lstm", "over": {"network": "branches", "of": {"a": {"network": "conv"}}}}}, ("a",)),
-        ({"trunk": {"network": "lstm", "inputs": ["b"]}}, ("b",)),
+        ({"policy": {"network": "branches", "of": {"a": {}, "x": {"inputs": ["c", "a"]}}}}, ("a", "c")),
+        ({"policy": {"network": "lstm", "over": {"network": "branches", "of": {"a": {"network": "conv"}}}}}, ("a",)),
+        ({"policy": {"network": "lstm", "inputs": ["b"]}}, ("b",)),
     ],
 )
 def test_what_the_policies_of_a_level_read(level: dict[str, object], read: tuple[str, ...]) -> None:

@@ -19,6 +19,12 @@ class Own(nn.Module):
         return (self.gain * inputs.vector.sum(-1))[..., None, None].expand(*inputs.batch, *self.size)
 
 
+class Narrow(Own):
+    """The same with its own number of outputs where another network reads it."""
+
+    features = 5
+
+
 class Diverging(Own):
     """Linear; where its first weight begins positive, NaN after so many training passes, which it counts."""
 

@@ -55,14 +55,12 @@ def build(spec: NetworkSpec, shape: InputShape | Network, outputs: int, copies: 
 def build_trunk(spec: NetworkSpec, shape: InputShape | Network, copies: int) -> Network:
     """``copies`` independent networks for others to read.
 
-    A user's network has ``spec.features`` outputs.
-
     :param shape: of the observations, or another trunk, which it reads in their place.
     :raises ShapeError: the network cannot read these observations, cannot be imported or made, or is refused by
         :func:`ddco_pyro.model.networks.probe.try_network`.
     """
     if isinstance(spec, UserNetworkSpec):
-        return _of_user(spec, shape, spec.features, copies)
+        return _of_user(spec, shape, None, copies)
     settings, seen = spec.settings, _selected(spec, shape)
     if isinstance(seen, InputShape):
         if settings.get("over"):
@@ -73,7 +71,7 @@ def build_trunk(spec: NetworkSpec, shape: InputShape | Network, copies: int) -> 
     return _selecting(spec, CLASSES[spec.network](seen, copies, **settings))
 
 
-def _of_user(spec: UserNetworkSpec, shape: InputShape | Network, outputs: int, copies: int) -> Network:
+def _of_user(spec: UserNetworkSpec, shape: InputShape | Network, outputs: int | None, copies: int) -> Network:
     seen = _selected(spec, shape)
     assert isinstance(seen, InputShape)  # a spec has built-in networks over a trunk
     return _selecting(spec, UserNetwork.made(spec.network, seen, outputs, copies, spec.options))

@@ -12,6 +12,9 @@ from ddco_pyro.model.networks.inputs import Inputs, InputShape, ShapeError
 from ddco_pyro.model.networks.perceptrons import Network, State
 from ddco_pyro.model.networks.probe import try_network
 
+FEATURES = 64
+"""Outputs of each copy of a class that is read as a trunk and has no attribute ``features``."""
+
 
 class UserNetwork(Network):
     """A user's module as a :class:`Network`.
@@ -26,12 +29,14 @@ class UserNetwork(Network):
         self.remembers = hasattr(module, "initial_state")
 
     @classmethod
-    def made(cls, name: str, shape: InputShape, outputs: int, copies: int, options: Mapping[str, Any]) -> Self:
+    def made(cls, name: str, shape: InputShape, outputs: int | None, copies: int, options: Mapping[str, Any]) -> Self:
         """The network of the class ``name``, tried on random observations.
 
+        :param outputs: None for a trunk, whose class says their number as ``features``.
         :raises ShapeError: the class cannot be imported or made, or its network is refused by :func:`try_network`.
         """
         network_class = _imported(name)
+        outputs = getattr(network_class, "features", FEATURES) if outputs is None else outputs
         try:
             module = network_class(shape, outputs, copies, **options)
         except Exception as error:  # whatever the user's code raises
