@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ddco_pyro.acting.monitor import run_lengths
 from ddco_pyro.drawing.words import capital, duration, listed, number, percent
 from ddco_pyro.evaluation.verdicts import said
 from ddco_pyro.inference import Posterior
@@ -19,6 +18,23 @@ from ddco_pyro.model.outputs import CallerOutputs, Outputs
 from ddco_pyro.names import numbered_name
 from ddco_pyro.spec import Spec, TrainingSpec
 from ddco_pyro.training.initialization import WAYS
+
+
+def run_lengths(choices: Iterable[np.ndarray], count: int) -> list[np.ndarray]:
+    """The lengths of the runs of each choice 0 to ``count``; a run lasts while the choice is the same.
+
+    >>> run_lengths([np.array([1, 1, 2, 1]), np.array([2, 2])], 2)
+    [array([], dtype=int64), array([1, 2]), array([1, 2])]
+
+    :param choices: of each demonstration [T], -1 past its end.
+    """
+    found: list[list[int]] = [[] for _ in range(1 + count)]
+    for row in choices:
+        known = row[row >= 0]
+        starts = np.flatnonzero(np.diff(known, prepend=-1))
+        for start, length in zip(starts, np.diff(starts, append=len(known)), strict=True):
+            found[known[start]].append(int(length))
+    return [np.sort(np.array(lengths, int)) for lengths in found]
 
 
 class OnPaths(NamedTuple):

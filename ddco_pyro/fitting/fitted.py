@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ddco_pyro.acting.controller import Controller
-from ddco_pyro.acting.monitor import Monitor, run_lengths
+from ddco_pyro.acting.monitor import Monitor
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, unknown
 from ddco_pyro.data.likeness import Traits, Usual, reasons_told, unlike
 from ddco_pyro.errors import BadInput, path_of
@@ -292,14 +292,9 @@ class Fit:
         """The model as a policy that acts, as the spec's ``rollout`` says."""
         return Controller(self.hierarchy, self.spec.rollout.control, self.spec.rollout.options, seed, self.names)
 
-    def monitor(self, demos: Iterable[Demonstration] | None = None) -> Monitor:
-        """A live monitor of the active options while another policy, or a person, acts.
-
-        :param demos: demonstrations that tell :meth:`Monitor.progress` how long options last.
-        """
-        segments = () if demos is None else self.segment(demos)
-        lengths = {own.level: run_lengths(own, len(own.names) - 1) for own in segments}
-        return Monitor(self.hierarchy, self.names, lengths)
+    def monitor(self) -> Monitor:
+        """A live monitor of the active options while another policy, or a person, acts."""
+        return Monitor(self.hierarchy, self.names)
 
 
 def _stacked(parts: Sequence[Tensor]) -> Tensor:

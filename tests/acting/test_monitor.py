@@ -11,9 +11,8 @@ from hierarchies import make_hierarchy
 from planted import make_spec, make_trainer
 from random_demonstrations import of_states
 
-import ddco_pyro
 from ddco_pyro.acting.monitor import Monitor
-from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.inference import log_likelihood, posterior
 from ddco_pyro.model.batch import encode
 
@@ -89,61 +88,3 @@ def test_a_recogniser_of_the_past_is_evidence_at_every_step(watched):
     with torch.no_grad():
         alone = log_likelihood(hierarchy.tabulate(batch), torch.tensor([len(demo) - 1]))
     assert value == pytest.approx(float(alone), rel=1e-5)
-
-
-PLANTED = [(1, 6), (2, 3), (3, 4)]
-"""Phases, each with its number of steps."""
-
-
-@pytest.fixture(scope="module")
-def phases():
-    """Demonstrations of three phases, and a fit that finds them; the state says the phase, with noise."""
-    rng, phase = np.random.default_rng(0), np.repeat(*zip(*PLANTED, strict=True))
-    means = np.array([[1.0, 0.0], [-1.0, 1.0], [0.0, -1.0]])
-    demos = []
-    for number in range(12):
-        state = np.eye(3)[phase - 1] + 0.1 * rng.normal(size=(len(phase), 3))
-        action = means[phase - 1] + 0.1 * rng.normal(size=(len(phase), 2))
-        demos.append(Demonstration(f"demo_{number}", {"state": state}, action))
-    demos = Demonstrations(tuple(demos))
-    spec = make_spec((3,), control={"std": 0.3}, epochs=200, optimizer={"name": "em"})
-    return ddco_pyro.fit(spec, demos), demos, phase
-
-
-def test_progress_is_the_planted_part_of_each_phase(phases):
-    fit, demos, phase = phases
-    (found,) = fit.segment(demos)
-    order = list(dict.fromkeys(fit.names["level-1"][option] for option in found[0]))
-    monitor, demo = fit.monitor(demos), demos[0]
-    expected = [
-        ((k + (step + 1) / steps) / 3, (step + 1) / steps)
-        for k, (_, steps) in enumerate(PLANTED)
-        for step in range(steps)
-    ]
-    for t, (whole, fraction) in enumerate(expected):
-        monitor.step({"state": demo.observations["state"][t]}, demo.actions[t - 1] if t else None)
-        progress = monitor.progress({"level-1": order})["level-1"]
-        assert progress.name == order[phase[t] - 1]
-        assert (progress.fraction, progress.whole) == (pytest.approx(fraction), pytest.approx(whole))
-    monitor.reset()
-    assert monitor.progress() == {}
-
-
-def test_the_expected_length_grows_with_what_a_run_has_outlasted(phases):
-    """Runs of 4 or 8 steps: 6 expected, and 8 once a fifth step has come; past the longest, all of it."""
-    fit, demos, _ = phases
-    lengths = [np.array([4, 4, 8, 8])] * 4
-    monitor = Monitor(fit.hierarchy, fit.names, {"level-1": lengths})
-    fractions = []
-    for t in range(10):
-        state = demos[0].observations["state"][0]
-        monitor.step({"state": state}, demos[0].actions[0] if t else None)
-        fractions.append(monitor.progress()["level-1"].fraction)
-    assert fractions == pytest.approx([a / 6 for a in range(1, 5)] + [a / 8 for a in range(5, 9)] + [1.0, 1.0])
-
-
-def test_without_demonstrations_no_fraction_is_known(phases):
-    fit, demos, _ = phases
-    monitor = fit.monitor()
-    monitor.step({"state": demos[0].observations["state"][0]})
-    assert monitor.progress({"level-1": fit.names["level-1"]})["level-1"][2:] == (1, None, None)

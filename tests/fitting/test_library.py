@@ -137,8 +137,6 @@ def test_what_cannot_be_acted_on_is_refused_in_a_line_and_changes_nothing(fault:
         (lambda fit: fit.draws(two_skills(), 0), "draws=0: has to be a whole number from 1 on"),
         (lambda fit: fit.draws(two_skills(), 2).boundaries("skill", 0, np.ones(8)), "there is no level 'skill'"),
         (lambda fit: fit.monitor().step(SEEN, np.zeros(2)), "no control comes before the first observation"),
-        (lambda fit: fit.monitor().progress({"skill": []}), "order: there is no 'skill'"),
-        (lambda fit: fit.monitor().progress({"option": ["reach"]}), "order: there is no 'reach'"),
         (lambda fit: ddco_pyro.fit(fit.spec, np.ones((8, 2))), "got ndarray"),
         (lambda fit: ddco_pyro.fit({"observations": []}, two_skills()), "spec: has to be the path .*; got dict"),
         (lambda fit: ddco_pyro.segment(fit, two_skills()), "demonstrations: has to be the path .*; got Demonstrations"),

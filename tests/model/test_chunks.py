@@ -26,7 +26,9 @@ NETWORKS: dict[str, dict[str, Any]] = {
     "conv": {"policy": {**CONV, "dropout": 0.3}},
     "lstm over conv": {"policy": {"network": "lstm", "over": CONV, "hidden": 5}},
     "lstm over conv, a horizon": {"policy": {"network": "lstm", "over": CONV, "hidden": [5, 3], "horizon": 5}},
-    "lstm over branches, a trunk": {"whole": {"network": "lstm", "over": {**BRANCHES, "hidden": [5]}, "hidden": [4, 5]}},
+    "lstm over branches, a trunk": {
+        "whole": {"network": "lstm", "over": {**BRANCHES, "hidden": [5]}, "hidden": [4, 5]}
+    },
     "branches": {"policy": {**BRANCHES, "hidden": [7]}},
     "constant": {"policy": {"network": "constant"}, "whole": CONV},
     "per_timestep": {"policy": {"network": "per_timestep", "hidden": [4], "inputs": ["state"]}},

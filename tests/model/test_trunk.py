@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
 import torch
 from hierarchies import SHAPES, make_batch
 from planted import LINEAR, small_spec
