@@ -80,13 +80,14 @@ demos = Demonstrations(
 
 # %% [markdown]
 # The first fit is a point estimate by expectation-maximisation (EM). It has three linear options, one more than there
-# are skills.
+# are skills. Its σ is in units of the controls' standard deviation.
 
 # %%
+STD = SIGMA / velocity.std()
 SPEC = f"""
 demonstrations: {{path: made_here.hdf5}}
 observations: [place]
-control: {{std: {SIGMA}, scale: none}}
+control: {{std: {STD}}}
 hierarchy:
   levels: [{{count: 3, policy: {{network: linear}}, termination: {{network: linear}}}}]
   meta_policy: {{network: linear}}
@@ -184,7 +185,7 @@ plt.show()
 # %%
 ridge = spec.training.optimizer.ridge
 spreads = {
-    "levels.0.policy.network.layers.0.weight": SIGMA * ridge.policy**-0.5,
+    "levels.0.policy.network.layers.0.weight": STD * ridge.policy**-0.5,
     "levels.0.termination.layers.0.weight": ridge.gate**-0.5,
     "meta_policy.network.layers.0.weight": ridge.gate**-0.5,
 }
@@ -317,12 +318,12 @@ for name in ("drawn anew", "drawn anew, memoryless"):
     here, options, chosen, acted = np.tile(place[:, 0], (D, 1)), None, [], []
     for t in range(T):
         x = torch.from_numpy(hierarchy.encoder.scaled(here)).float()
-        normal = Gaussian((policy * x + policy_bias)[:, None, :, None], torch.tensor([SIGMA]), torch.zeros(1))
+        normal = Gaussian((policy * x + policy_bias)[:, None, :, None], torch.tensor([STD]), torch.zeros(1))
         callers = CallerOutputs(0, None, normal), CallerOutputs(3, (meta * x + meta_bias)[:, None, None], None)
         ending = (termination * x + termination_bias)[:, None] if name == "drawn anew" else None
         now = complete(Outputs(callers, (ending,)).tables(), torch.ones(D * N, dtype=torch.long)).steps()[0]
         options = choose(t, now, options)
-        control = Acting((normal.steps()[0], None), options).sample().numpy()
+        control = hierarchy.scaling.emitted(Acting((normal.steps()[0], None), options).sample()).numpy()
         here = here + control
         chosen.append(options[0])
         acted.append(control[:, 0])

@@ -54,11 +54,10 @@ class ControlScaling(nn.Module):
         self.counts = [len(part.dims) * part.continuous for part in parts]
         varying = [dimension for dimension in range(size) if dimension not in constant]
         self.groups = [tuple(varying.index(dimension) for dimension in part.dims) for part in parts]
-        count, self.standardized = len(varying), np.zeros(len(varying), dtype=bool)
+        count = len(varying)
         shift, scale, low, high = np.zeros(count), np.ones(count), np.full(count, -math.inf), np.full(count, math.inf)
         for dims, part in zip(self.groups, parts, strict=True):
             places = list(dims)
-            self.standardized[places] = part.continuous and spec.scale == "standardize"
             if part.low:
                 low[places], high[places] = part.low, part.high
             if part.exact:
@@ -89,18 +88,17 @@ class ControlScaling(nn.Module):
         return [dimension for dims, part in both if part.continuous for dimension in dims]
 
     def fit(self, demonstrations: Demonstrations) -> None:
-        """Where the spec says ``standardize``: take mean and spread of these demonstrations' controls."""
-        if self.standardized.any():
-            rows = np.concatenate([self._exactly(demo.controls(self.relative_to)) for demo in demonstrations])
-            shift, spread = rows.mean(0), rows.std(0)
-            for dims, part in zip(self.groups, self.parts, strict=True):
-                if part.exact:
-                    places = list(dims)
-                    free = rows[(rows[:, places] != part.exact).any(1)][:, places]
-                    shift[places], spread[places] = part.exact, free.std(0) if len(free) else 1.0
-            scale = np.where(spread > 1e-9, spread, 1.0)
-            self.shift.copy_(torch.as_tensor(np.where(self.standardized, shift, self.shift.numpy())))
-            self.scale.copy_(torch.as_tensor(np.where(self.standardized, scale, self.scale.numpy())))
+        """Take mean and spread of the continuous dimensions from these demonstrations' controls."""
+        rows = np.concatenate([self._exactly(demo.controls(self.relative_to)) for demo in demonstrations])
+        shift, spread = rows.mean(0), rows.std(0)
+        for dims, part in zip(self.groups, self.parts, strict=True):
+            places = list(dims)
+            if part.exact:
+                free = rows[(rows[:, places] != part.exact).any(1)][:, places]
+                shift[places], spread[places] = part.exact, free.std(0) if len(free) else 1.0
+            if part.continuous:
+                self.shift[places] = torch.as_tensor(shift[places])
+                self.scale[places] = torch.as_tensor(np.where(spread > 1e-9, spread, 1.0)[places])
 
     def scaled(self, actions: np.ndarray) -> np.ndarray:
         """[T, A] in the control's own units to [T, A'] in scaled units; NaN for an unknown discrete action."""

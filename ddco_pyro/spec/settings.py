@@ -209,9 +209,8 @@ class ControlSpec(DistributionSpec):
     """The distribution of the control."""
 
     std: Std = 0.1
-    """Standard deviation σ in scaled units, or ``{learn: true, floor: ...}``."""
-    scale: Literal["standardize", "none"] = "standardize"
-    """``standardize``: continuous dimensions are scaled by their mean and spread in the training demonstrations."""
+    """Standard deviation σ in scaled units, or ``{learn: true, floor: ...}``. Continuous dimensions are scaled by their
+    mean and spread in the training demonstrations."""
     relative_to: Text | None = None
     """An observation of as many numbers as the control, such as measured joints where the control is their targets.
     Options are of the control minus this observation. Controllers and exports give the control itself. Null: none."""

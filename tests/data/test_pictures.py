@@ -242,7 +242,7 @@ def test_a_dot_is_followed():
         {
             "demonstrations": {"path": "unused.hdf5"},
             "observations": ["camera"],
-            "control": {"std": 0.1, "scale": "none"},
+            "control": {"std": 0.1},
             "baseline": {"kind": "flat", "policy": CONVOLUTION},
             "training": {"epochs": 60, "batch_size": 4, "optimizer": {"lr": 0.01}},
         }

@@ -124,7 +124,7 @@ def test_the_step_is_a_part_of_the_longest_training_demonstration():
 
 def batch():
     encoder = fitted(ObservationSpec(key="pose"), ObservationSpec(key="camera"))
-    scaling = ControlScaling(ControlSpec(scale="none"), 3, {}, all_gaussian(range(3)))
+    scaling = ControlScaling(ControlSpec(), 3, {}, all_gaussian(range(3)))
     return encode(DEMOS, encoder, scaling)
 
 
@@ -144,14 +144,13 @@ def test_batches_are_padded_with_zeros_and_images_stay_bytes():
 # --- controls ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("scale", ["standardize", "none"])
-def test_the_density_is_in_the_controls_own_units(scale):
+def test_the_density_is_in_the_controls_own_units():
     """log p(a) of a flat policy against scipy's Gaussian of a with the mean and deviation carried over to a's units."""
     spec = parse_spec(
         {
             "demonstrations": {"path": "unused.hdf5"},
             "observations": ["pose"],
-            "control": {"std": 0.2, "scale": scale},
+            "control": {"std": 0.2},
             "baseline": {"kind": "flat", "policy": {"network": "linear"}},
         }
     )

@@ -103,7 +103,7 @@ def noisy(number=40, steps=25):
 def flat_spec(**changes):
     sections = {
         "demonstrations": {"path": "unused.hdf5", "valid_fraction": 0.4},
-        "control": {"std": {**OF_STATE, "floor": 0.02}, "scale": "none", "kind": "gaussian"},
+        "control": {"std": {**OF_STATE, "floor": 0.02}, "kind": "gaussian"},
         "training": {"epochs": 150, "optimizer": {"lr": 0.03}, "batch_size": 24},
     }
     return small_spec((), **sections | changes)

@@ -295,7 +295,6 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"report.trajectory": ["pose", "grip", 3]}, "report.trajectory: must be KEY or [KEY, slice], such as [pose, 3:6]"),
     ({"report.trajectory": ["pose", "3-6"]}, "report.trajectory: there is no observation '3-6'"),
     ({"control.std": -0.1}, "control.std: must be a positive number or {learn: true}, got -0.1"),
-    ({"control.scale": "standardise"}, "control.scale: must be standardize or none, got 'standardise'"),
     ({"training.optimizer.lr": float("inf")}, "training.optimizer.lr: must be a finite number, got inf"),
     ({"training.layerwise": "yes"}, "training.layerwise: must be true, false, or segments, got 'yes'"),
     ({"seed": 2**32}, "seed: must be at most 4294967295, got 4294967296"),

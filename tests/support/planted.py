@@ -17,7 +17,7 @@ from ddco_pyro.training.networks import Dimensions, build_hierarchy
 from ddco_pyro.training.restarts import Trainer
 
 LINEAR = {"network": "linear"}
-CONTROL = {"std": 0.05, "scale": "none"}
+CONTROL = {"std": 0.05}
 TRAINING = {"epochs": 900, "starts": ["vq_controls"] * 3, "patience": 25}
 
 
@@ -37,7 +37,7 @@ def small_spec(counts=(2,), policy=LINEAR, **sections):
 
 def make_spec(counts=(2,), seed=0, control=None, **training):
     training = {"optimizer": {"lr": 0.03}, "epochs": 20, **training}
-    return small_spec(counts, control=control or {"std": 0.1, "scale": "none"}, training=training, seed=seed)
+    return small_spec(counts, control=control or {"std": 0.1}, training=training, seed=seed)
 
 
 def make_trainer(spec, demos, path, on_event=ignore, jobs=1):

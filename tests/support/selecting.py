@@ -38,7 +38,7 @@ def two_skills(count=12, steps=8, seed=0):
 
 DATA = {
     "observations": ["place", "turn"],
-    "control": {"std": 0.5, "scale": "none"},
+    "control": {"std": 0.5},
     "hierarchy": {
         "levels": [{"count": 2, "policy": {"network": "linear"}, "termination": {"network": "linear"}}],
         "meta_policy": {"network": "linear"},

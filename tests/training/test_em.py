@@ -303,11 +303,11 @@ def flat_spec(kind="flat", **control):
 
 def test_a_flat_policy_for_each_time_step_is_least_squares_at_that_step():
     demos = demonstrations(40)
-    spec = flat_spec("per_timestep", std=1.0, scale="none")
+    spec = flat_spec("per_timestep", std=1.0)
     spec = with_overrides(spec, {"training.tune_fraction": 0.1, "training.patience": 300, "training.epochs": 300})
     trainer = make_trainer(spec, demos, None)
     trainer.run()
-    batch = trainer.data.train
+    batch, units = trainer.data.train, trainer.data.hierarchy(0).scaling.scale.log().sum()
     assert trainer.summary["by_lbfgs"]
     last = trainer.history[-1]["train"]
     residual = 0.0
@@ -317,7 +317,7 @@ def test_a_flat_policy_for_each_time_step_is_least_squares_at_that_step():
         a = batch.actions[rows, t].double().numpy()
         residual += float(np.square(a - x @ np.linalg.lstsq(x, a, rcond=None)[0]).sum())
     dims = batch.actions.shape[-1]
-    truth = -0.5 * residual / batch.steps - 0.5 * dims * np.log(2 * np.pi)
+    truth = -0.5 * residual / batch.steps - 0.5 * dims * np.log(2 * np.pi) - float(units)
     assert last == pytest.approx(truth, abs=1e-6)
 
 

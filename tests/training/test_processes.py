@@ -40,7 +40,7 @@ TRAINING = {"shards": 4, "batch_size": 5, "epochs": 16, "starts": ["vq", "random
 
 
 def make_spec(path="unused.hdf5", **training):
-    control, training = {"std": 0.5, "scale": "none"}, {**TRAINING, **training}
+    control, training = {"std": 0.5}, {**TRAINING, **training}
     return small_spec(policy=DROPPING, demonstrations={"path": str(path)}, control=control, training=training)
 
 

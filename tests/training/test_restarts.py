@@ -149,7 +149,7 @@ def test_the_objective_has_the_ridges_log_prior(demos, tmp_path):
     """Σ log p − ½ ρ Σ w² of gate and termination, and of the mean in units of 1/σ² with its normaliser."""
     ridge = {"policy": 2.0, "gate": 3.0}
     optimizer = {"name": "em", "ridge": ridge}
-    spec = make_spec((2,), starts=["vq"], control={"std": 1.0, "scale": "none"}, optimizer=optimizer, epochs=30)
+    spec = make_spec((2,), starts=["vq"], control={"std": 1.0}, optimizer=optimizer, epochs=30)
     trainer = make_trainer(spec, demos, tmp_path)
     model, batch = trainer.run(), trainer.data.train
     (level,) = model.option_levels()
@@ -202,7 +202,7 @@ def diverging(passes, **training):
     """Restarts of which those that begin with a positive weight have that many passes before they give NaN."""
     policy = {"network": "user_networks:Diverging", "options": {"passes": passes}}
     own = {"starts": ["random"] * 6, "epochs": 12, "patience": None, "tune_fraction": 0.2, **training}
-    return small_spec((), policy, control={"std": 1.0, "scale": "none"}, training=own)
+    return small_spec((), policy, control={"std": 1.0}, training=own)
 
 
 @pytest.mark.parametrize("passes", [1, 4])

@@ -239,7 +239,7 @@ def test_what_is_called_converged_is_at_the_optimum(tmp_path):
     optimum = (-0.5 * (error / 0.5) ** 2 - np.log(0.5) - 0.5 * np.log(2 * np.pi)).sum(1).mean()
     below = {}
     for epochs in (15, 400):
-        spec = make_spec((), control={"std": 0.5, "scale": "none"}, epochs=epochs, patience=None, batch_size=8)
+        spec = make_spec((), control={"std": 0.5}, epochs=epochs, patience=None, batch_size=8)
         trainer = make_trainer(spec, demos, tmp_path / str(epochs))
         trainer.run()
         below[trainer.summary["converged"]] = optimum - trainer.restarts[0].progress.best
