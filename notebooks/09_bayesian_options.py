@@ -280,9 +280,9 @@ axes.legend()
 plt.show()
 
 # %% [markdown]
-# The policies of options 1 and 2 are known well, and the three approximations agree on them. Terminations and the
+# The policies of options 2 and 3 are known well, and the three approximations agree on them. Terminations and the
 # meta-policy are known less well: a demonstration has few switches. `AutoNormal` knows no correlations, and most of its
-# intervals for ψ and η of options 1 and 2 are narrower than those of NUTS. Where the chain has few effective draws, its
+# intervals for ψ and η of options 2 and 3 are narrower than those of NUTS. Where the chain has few effective draws, its
 # intervals are rough.
 #
 # ## How many options are used?
