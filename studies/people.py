@@ -66,19 +66,10 @@ class PeopleCell(Cell):
         """Of its files."""
         return f"{self.task}-{self.fold}-{self.labelled}"
 
-    @property
-    def further(self) -> dict[str, dict[str, Any]]:
-        """Further fits without labels, of which the highest level counts: what they change in the spec."""
-        return {"options, β = 1": USUAL}
-
-    def demonstrations(self, settings: Settings) -> tuple[Path, Demonstrations]:
-        """The file, and its demonstrations with the masks of the fold and the true labels as :data:`LABELS`."""
-        path = Path(self.data) / f"{self.task}.hdf5"
-        return path, divided(labelled_demonstrations(path), self.fold)
-
     def results(self, settings: Settings, folder: Path) -> dict[str, Any]:
         """Fit, and compare with the gestures of the held-out demonstrations."""
-        path, demos = self.demonstrations(settings)
+        path = Path(self.data) / f"{self.task}.hdf5"
+        demos = divided(labelled_demonstrations(path), self.fold)
         train, valid = (demos.select(demos.masks[part]) for part in ("train", "valid"))
         facts = inspect(path, exclude=[name for name in Demonstrations.read(path).names if name not in train.names])
         plain = parse_spec(read_yaml(starting_spec(replace(facts, excluded=(), masks={}), path).text))
@@ -90,8 +81,7 @@ class PeopleCell(Cell):
             found, typical = fit(spec, demos), typical_length(demo.labels[LABELS] for demo in train)
             kinds = {"options": list(found.segment(valid)[0]), "windowed k-means": clusters(found, train, valid, count)}
             kinds |= dict(zip(("AR-HMM", "AR-HMM, sticky"), autoregressive(train, valid, count, typical), strict=True))
-            for name, changes in self.further.items():
-                kinds[name] = list(fit(with_overrides(spec, changes), demos).segment(valid)[-1])
+            kinds["options, β = 1"] = list(fit(with_overrides(spec, USUAL), demos).segment(valid)[0])
             asked = decide(plain, replace(train, masks={}), demos.frequency, typical)
             as_asked = starting_spec(replace(facts, excluded=(), masks={}), path, decided=asked).text
             longer = with_overrides(parse_spec(read_yaml(as_asked)), ALONE | {"seed": settings.values["seed"]})
