@@ -17,7 +17,7 @@ import torch
 from ddco_pyro.data.files import whole_folder, write_text
 from ddco_pyro.errors import BadInput, Failed
 from ddco_pyro.exporting import runner
-from ddco_pyro.exporting.description import StepProgram, describe
+from ddco_pyro.exporting.description import StepProgram, describe, without_arrays
 from ddco_pyro.exporting.recording import MOST, record, tolerance
 from ddco_pyro.exporting.runner import TOLERANCE
 from ddco_pyro.fitting.fitted import Fit
@@ -80,13 +80,14 @@ def write_numpy(fit: Fit, folder: Path) -> bool:
     :returns: whether numpy can evaluate every network; otherwise there is no ``weights.npz``.
     """
     hierarchy = fit.hierarchy.place(HOST).eval()
-    about, weights = describe(hierarchy, fit.spec.rollout, StepProgram(hierarchy).eval())
-    about["names"] = fit.names
-    if about["numpy"]:
+    weights: dict[str, np.ndarray] = {}
+    about = describe(hierarchy, fit.spec.rollout, StepProgram(hierarchy).eval()) | {"names": fit.names}
+    facts = without_arrays(about, "", weights)
+    if weights:
         np.savez(folder / "weights.npz", **weights)  # type: ignore[arg-type]
     (folder / "runner.py").write_text(runner_source(), encoding="utf-8")
-    (folder / "controller.json").write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
-    return bool(about["numpy"])
+    (folder / "controller.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+    return bool(weights)
 
 
 def runner_source() -> str:

@@ -1,17 +1,16 @@
-"""One step of an exported controller as a module for ONNX, and its facts for the numpy runner.
-
-The facts are ``controller.json`` and ``weights.npz``.
-"""
+"""One step of an exported controller as a module for ONNX, and its description for the numpy runner."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ddco_pyro.exporting.runner import ARRAY
 from ddco_pyro.model.emissions import KINDS
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs
@@ -81,20 +80,25 @@ class StepProgram(nn.Module):
         return ["features", "step", *images, *state], [*self.names, *(f"next_{name}" for name in state)]
 
 
-Arrays = dict[str, np.ndarray]
+def describe(hierarchy: Hierarchy, control: RolloutSpec, program: StepProgram) -> dict[str, Any]:
+    """The controller for its runner, a tree of facts and arrays.
 
-
-def describe(hierarchy: Hierarchy, control: RolloutSpec, program: StepProgram) -> tuple[dict[str, Any], Arrays]:
-    """The contents of ``controller.json`` and ``weights.npz``.
-
-    ``numpy`` says whether numpy can evaluate every network.
+    ``networks`` is None where numpy cannot evaluate every network.
     """
-    networks, weights = _networks(hierarchy)
     encoder = hierarchy.encoder
     vectors = {spec.name: spec for spec in encoder.specs}
     scaling = hierarchy.scaling
     scale, shift = scaling.scale.numpy(), scaling.shift.numpy()
-    return networks | {
+    return {
+        "networks": _networks(hierarchy),
+        "callers": [
+            {
+                "logits": caller.sizes[0],
+                "choices": caller.options,
+                "hybrid": caller.emits_control and caller.emits_options,
+            }
+            for caller in hierarchy.callers()
+        ],
         "outputs": program.names,
         "state": [
             {"kind": str(part.dtype), "shape": list(part.shape), "values": part.ravel().tolist()}
@@ -125,7 +129,7 @@ def describe(hierarchy: Hierarchy, control: RolloutSpec, program: StepProgram) -
         "constant": [float(value) for value in scaling.emitted(torch.zeros(len(scaling.varying)))],
         "parts": [_part(hierarchy, number) for number in range(len(scaling.parts))],
         "termination_bound": TERMINATION_BOUND,
-    }, weights
+    }
 
 
 def _part(hierarchy: Hierarchy, number: int) -> dict[str, Any]:
@@ -166,27 +170,27 @@ def _part(hierarchy: Hierarchy, number: int) -> dict[str, Any]:
     }
 
 
-def _networks(hierarchy: Hierarchy) -> tuple[dict[str, Any], Arrays]:
-    """The form of each network, and every array by name."""
-    encoder = hierarchy.encoder
-    arrays: Arrays = {"mean": encoder.mean.numpy(), "deviation": encoder.std.numpy()}
-    if encoder.has_bins:
-        ends = {"low": encoder.low, "high": encoder.high, "places": encoder.places}
-        arrays |= {name: array.numpy() for name, array in ends.items()}
+def _networks(hierarchy: Hierarchy) -> dict[str, Any] | None:
+    """The scaling of features, and the form of each network; None where one has none."""
     levels = hierarchy.option_levels()
     networks = {f"caller_{number}": caller.network for number, caller in enumerate(hierarchy.callers())}
     networks |= {f"end_{n}": level.termination for n, level in enumerate(levels) if level.termination is not None}
     networks |= {} if hierarchy.trunk is None else {"trunk": hierarchy.trunk}
-    forms = {name: form for name, network in networks.items() if (form := network.numpy_form()) is not None}
-    for name, (_, parameters) in forms.items():
-        arrays |= {f"{name}.{key}": array for key, array in parameters.items()}
-    callers = [
-        {
-            "logits": caller.sizes[0],
-            "choices": caller.options,
-            "hybrid": caller.emits_control and caller.emits_options,
-        }
-        for caller in hierarchy.callers()
-    ]
-    facts = {name: about for name, (about, _) in forms.items()}
-    return {"networks": facts, "callers": callers, "numpy": len(forms) == len(networks)}, arrays
+    forms = {name: network.numpy_form() for name, network in networks.items()}
+    encoder = hierarchy.encoder
+    scaling = {"mean": encoder.mean, "deviation": encoder.std}
+    if encoder.has_bins:
+        scaling |= {"low": encoder.low, "high": encoder.high, "places": encoder.places}
+    return None if None in forms.values() else forms | {key: own.numpy() for key, own in scaling.items()}
+
+
+def without_arrays(node: Any, name: str, arrays: dict[str, np.ndarray]) -> Any:
+    """A tree with the name of each array in its place; ``arrays`` gets them, named by their places below ``name``."""
+    if isinstance(node, np.ndarray):
+        arrays[name] = node
+        return {ARRAY: name}
+    if isinstance(node, Mapping):
+        return {key: without_arrays(own, f"{name}.{key}".lstrip("."), arrays) for key, own in node.items()}
+    if isinstance(node, list):
+        return [without_arrays(own, f"{name}.{number}", arrays) for number, own in enumerate(node)]
+    return node

@@ -30,6 +30,9 @@ TOLERANCE = 1e-6
 distance from its centre. ``check.npz`` holds this controller's tolerance, which grows with its rounding error."""
 
 
+ARRAY = "weights.npz"
+"""The key, alone in its mapping, under which ``controller.json`` names an array."""
+
 Outputs = dict[str, np.ndarray]
 """``selection_d`` log-probabilities [K, 1 + k], ``termination_d`` ψ [k], ``control_d`` the numbers of the control
 [K, size] (scaled means, logits of switches and of discrete actions, then y of every σ that depends on the state); d
@@ -50,7 +53,7 @@ class Runner:
 
     def __init__(self, folder: str | Path, networks: str = "numpy") -> None:
         folder = Path(folder)
-        self.about: dict[str, Any] = json.loads((folder / "controller.json").read_text(encoding="utf-8"))
+        self.about = _read(folder)
         if networks not in FORMS:
             raise ValueError(f"networks={networks!r}: it has to be one of {', '.join(FORMS)}")
         self._networks = FORMS[networks](folder, self.about)
@@ -225,6 +228,17 @@ def _checked(observation: Mapping[str, Any], spec: Mapping[str, Any]) -> np.ndar
     return data
 
 
+def _read(folder: Path) -> dict[str, Any]:
+    """What ``controller.json`` says, with the arrays that it names."""
+    weights = read_arrays(folder / ARRAY) if (folder / ARRAY).exists() else {}
+
+    def placed(node: dict[str, Any]) -> Any:
+        return weights[node[ARRAY]] if [*node] == [ARRAY] else node
+
+    about: dict[str, Any] = json.loads((folder / "controller.json").read_text(encoding="utf-8"), object_hook=placed)
+    return about
+
+
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """The arrays in an ``.npz`` file by name."""
     with np.load(path, allow_pickle=False) as file:
@@ -232,20 +246,20 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 class NumpyNetworks:
-    """Every network of the hierarchy, from the arrays of ``weights.npz``."""
+    """Every network of the hierarchy, as :class:`ddco_pyro.model.networks.perceptrons.NumpyForm` describes it."""
 
-    def __init__(self, weights: Mapping[str, np.ndarray], about: Mapping[str, Any]) -> None:
-        self._weights, self._about = weights, about
+    def __init__(self, about: Mapping[str, Any]) -> None:
+        self._about, self._networks = about, about["networks"]
         self._after: State = []
 
     def __call__(
         self, features: np.ndarray, step: int, images: Mapping[str, np.ndarray], state: State
     ) -> tuple[Outputs, State]:
         """The outputs of every network for one observation, and the next state."""
-        weights, depth = self._weights, len(self._about["levels"])
-        if "places" in weights:
-            features = np.clip(features[weights["places"]], weights["low"], weights["high"])
-        vector = ((features - weights["mean"]) / weights["deviation"]).astype(np.float32)
+        own, depth = self._networks, len(self._about["levels"])
+        if "places" in own:
+            features = np.clip(features[own["places"]], own["low"], own["high"])
+        vector = ((features - own["mean"]) / own["deviation"]).astype(np.float32)
         sizes = self._about["features"]
         ends = np.cumsum([0, *sizes.values()])
         self._seen = {key: vector[first:end] for key, first, end in zip(sizes, ends, ends[1:], strict=False)}
@@ -275,44 +289,42 @@ class NumpyNetworks:
 
     def _network(self, name: str) -> np.ndarray | None:
         """The outputs of a network for each of K copies, [K, outputs]; None where there is no such network."""
-        node = self._about["networks"].get(name)
-        return None if node is None else self._evaluate(node, name)
+        node = self._networks.get(name)
+        return None if node is None else self._evaluate(node)
 
-    def _evaluate(self, node: Mapping[str, Any], name: str) -> np.ndarray:
-        """Features of a part of a network for each of K copies, [K, features]; ``name`` begins its arrays' names."""
-        values: np.ndarray = getattr(self, f"_{node['kind']}")(node, name)
+    def _evaluate(self, node: Mapping[str, Any]) -> np.ndarray:
+        """Features of a part of a network for each of K copies, [K, features]."""
+        values: np.ndarray = getattr(self, f"_{node['kind']}")(node)
         return values
 
-    def _vectors(self, node: Mapping[str, Any], _: str) -> np.ndarray:
+    def _vectors(self, node: Mapping[str, Any]) -> np.ndarray:
         vector = np.concatenate([np.zeros(0, np.float32), *(self._seen[key] for key in node["keys"])])
         return np.broadcast_to(vector, (node["copies"], len(vector)))
 
-    def _trunk(self, _: Mapping[str, Any], __: str) -> np.ndarray:
+    def _trunk(self, _: Mapping[str, Any]) -> np.ndarray:
         assert self._features is not None  # what reads a trunk comes after it
         return self._features
 
-    def _joined(self, node: Mapping[str, Any], name: str) -> np.ndarray:
-        return np.concatenate([self._evaluate(of, f"{name}.{number}") for number, of in enumerate(node["of"])], axis=1)
+    def _joined(self, node: Mapping[str, Any]) -> np.ndarray:
+        return np.concatenate([self._evaluate(of) for of in node["of"]], axis=1)
 
-    def _perceptrons(self, node: Mapping[str, Any], name: str) -> np.ndarray:
+    def _perceptrons(self, node: Mapping[str, Any]) -> np.ndarray:
         """K perceptrons, those of this step; an activation follows the hidden layers."""
-        values = self._evaluate(node["of"], f"{name}.of")[:, None]
+        values = self._evaluate(node["of"])[:, None]
         first = min(self._step, node["steps"] - 1) * node["copies"]
         now = slice(first, first + node["copies"])
-        for layer in range(node["layers"]):
-            values = values @ self._weights[f"{name}.{layer}.weight"][now] + self._weights[f"{name}.{layer}.bias"][now]
-            if layer < node["hidden"]:
+        for number, layer in enumerate(node["layers"]):
+            values = values @ layer["weight"][now] + layer["bias"][now]
+            if number < node["hidden"]:
                 values = ACTIVATIONS[node["activation"]](values)
         return values[:, 0]
 
-    def _lstm(self, node: Mapping[str, Any], name: str) -> np.ndarray:
+    def _lstm(self, node: Mapping[str, Any]) -> np.ndarray:
         """K LSTMs. Networks are evaluated in the order of their states."""
-        values = self._evaluate(node["of"], f"{name}.of")[:, None]
+        values = self._evaluate(node["of"])[:, None]
         goes_on = np.float32(not node["horizon"] or self._step % node["horizon"] != 0)
-        for layer in range(node["layers"]):
-            weight, bias, recurrent = (
-                self._weights[f"{name}.{layer}.{part}"] for part in ("inputs.weight", "inputs.bias", "recurrent")
-            )
+        for layer in node["layers"]:
+            weight, bias, recurrent = (layer[part] for part in ("inputs.weight", "inputs.bias", "recurrent"))
             h, c = (goes_on * next(self._before).transpose(1, 0, 2) for _ in "hc")
             take, keep, new, give = np.split(values @ weight + bias + h @ recurrent, 4, axis=2)
             c = _sigmoid(keep) * c + _sigmoid(take) * np.tanh(new)
@@ -320,14 +332,13 @@ class NumpyNetworks:
             self._after += [state.transpose(1, 0, 2) for state in (values, c)]
         return values[:, 0]
 
-    def _convolutions(self, node: Mapping[str, Any], name: str) -> np.ndarray:
+    def _convolutions(self, node: Mapping[str, Any]) -> np.ndarray:
         """Convolutions of a picture, each with an activation, and a pooling of the last maps."""
         maps = self._images[node["key"]].astype(np.float32).transpose(2, 0, 1)[None] / 255
         if node["standardize"]:
             maps = (maps - maps.mean()) / np.sqrt(np.maximum(maps.var(), 1 / maps.size))
-        for number, layer in enumerate(node["layers"]):
-            weight, bias = self._weights[f"{name}.{number}.weight"], self._weights[f"{name}.{number}.bias"]
-            maps = _convolved(np.broadcast_to(maps, (node["copies"], *maps.shape[1:])), weight, bias, layer)
+        for layer in node["layers"]:
+            maps = _convolved(np.broadcast_to(maps, (node["copies"], *maps.shape[1:])), layer)
             maps = ACTIVATIONS[node["activation"]](maps)
         return POOLS[node["pool"]](maps).reshape(node["copies"], -1)
 
@@ -336,8 +347,9 @@ def _sigmoid(x: np.ndarray) -> np.ndarray:
     return 0.5 * (1 + np.tanh(0.5 * x))
 
 
-def _convolved(maps: np.ndarray, weight: np.ndarray, bias: np.ndarray, layer: Mapping[str, Any]) -> np.ndarray:
+def _convolved(maps: np.ndarray, layer: Mapping[str, Any]) -> np.ndarray:
     """[K, C, H, W] to [K, filters, H', W']; filters [K · filters, C, size, size]."""
+    weight, bias = layer["weight"], layer["bias"]
     size, pad, stride = weight.shape[-1], (layer["padding"],) * 2, layer["stride"]
     padded = np.pad(maps, ((0, 0), (0, 0), pad, pad))
     windows = np.lib.stride_tricks.sliding_window_view(padded, (size, size), axis=(2, 3))[:, :, ::stride, ::stride]
@@ -388,10 +400,10 @@ def _selection(logits: np.ndarray, caller: Mapping[str, Any]) -> np.ndarray:
     return log_probabilities if caller["hybrid"] else np.insert(log_probabilities, 0, -np.inf, axis=1)
 
 
-def _numpy(folder: Path, about: Mapping[str, Any]) -> Networks:
-    if not about["numpy"]:
+def _numpy(_: Path, about: Mapping[str, Any]) -> Networks:
+    if about["networks"] is None:
         raise ValueError('it has networks that numpy cannot evaluate: use Runner(..., networks="onnx")')
-    return NumpyNetworks(read_arrays(folder / "weights.npz"), about)
+    return NumpyNetworks(about)
 
 
 def _onnx(folder: Path, about: Mapping[str, Any]) -> Networks:

@@ -23,7 +23,7 @@ from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import InputShape, UserNetwork
 from ddco_pyro.spec import parse_spec
 
-PROGRAMS = ("branches", "conv", "lstm", "trunk", "σ of the state", "per_timestep", "constant")
+PROGRAMS = ("trunk", "conv", "lstm", "branches", "σ of the state", "per_timestep", "constant")
 """The first has convolutions, LSTMs, perceptrons and linear networks, together."""
 
 
@@ -138,7 +138,7 @@ def edited_numpy(folder):
     np.savez(folder / "weights.npz", **weights)
 
 
-def damage_numpy(folder, tensor="caller_0.0.bias", by=1e-3):
+def damage_numpy(folder, tensor="networks.caller_0.layers.0.bias", by=1e-3):
     with edited_numpy(folder) as weights:
         weights[tensor][-1, :, -1] += by
 
@@ -166,10 +166,10 @@ LONG = make("per_timestep", (), steps=30)
 @pytest.mark.parametrize(
     ("fit", "tensor", "by", "message"),
     [
-        pytest.param(MANY, "caller_0.0.bias", 1e-3, ".*; with networks", id="policies"),
-        pytest.param(MANY, "caller_1.0.bias", np.nan, ".*; with networks", id="selections"),
-        pytest.param(MANY, "end_0.0.bias", 1e-3, ".*; with networks", id="terminations"),
-        pytest.param(LONG, "caller_0.1.bias", 1e-3, r"1\.0e-03, of 1\.0e-06 that", id="steps"),
+        pytest.param(MANY, "networks.caller_0.layers.0.bias", 1e-3, ".*; with networks", id="policies"),
+        pytest.param(MANY, "networks.caller_1.layers.0.bias", np.nan, ".*; with networks", id="selections"),
+        pytest.param(MANY, "networks.end_0.layers.0.bias", 1e-3, ".*; with networks", id="terminations"),
+        pytest.param(LONG, "networks.caller_0.layers.1.bias", 1e-3, r"1\.0e-03, of 1\.0e-06 that", id="steps"),
     ],
 )
 def test_every_network_of_every_option_and_step_is_compared(fit, tensor, by, message, tmp_path, damaged):
@@ -324,7 +324,7 @@ def measured(folder: Path) -> float:
     and what it did (``controls``), one step after the other.
     """
     with np.load(folder / "weights.npz") as file:
-        names = [f"caller_0.{layer}.{part}" for layer in (0, 1) for part in ("weight", "bias")]
+        names = [f"networks.caller_0.layers.{layer}.{part}" for layer in (0, 1) for part in ("weight", "bias")]
         weight, bias, weight_2, bias_2 = (file[name][0].astype(np.float64) for name in names)
     largest = 0.0
     with np.load(folder / "check.npz") as file:

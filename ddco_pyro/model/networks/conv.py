@@ -16,7 +16,6 @@ from ddco_pyro.model.networks.perceptrons import (
     Perceptrons,
     State,
     arrays_of,
-    joined,
     options_last,
     vectors,
 )
@@ -79,14 +78,12 @@ class Conv(Network):
 
     def numpy_form(self) -> NumpyForm:
         pictures = [self._picture_form(key, layers) for key, layers in self._layers().items()]
-        return self.layers.numpy_form(joined([vectors(self.reads, self.copies), *pictures]))
+        return self.layers.numpy_form({"kind": "joined", "of": [vectors(self.reads, self.copies), *pictures]})
 
     def _picture_form(self, key: str, layers: Sequence[nn.Conv2d]) -> NumpyForm:
-        strides = [{"stride": layer.stride[0], "padding": int(layer.padding[0])} for layer in layers]
-        facts = {"kind": "convolutions", "key": key, "copies": self.copies, "layers": strides}
-        facts |= {"activation": self.layers.activation, "standardize": self.standardize}
-        arrays = arrays_of({str(number): layer for number, layer in enumerate(layers)})
-        return facts | {"pool": self.pool}, arrays
+        each = [{"stride": own.stride[0], "padding": int(own.padding[0])} | arrays_of(own) for own in layers]
+        form = {"kind": "convolutions", "key": key, "copies": self.copies, "layers": each, "pool": self.pool}
+        return form | {"activation": self.layers.activation, "standardize": self.standardize}
 
     def _layers(self) -> dict[str, list[nn.Conv2d]]:
         """The convolutions of each picture."""

@@ -17,9 +17,9 @@ from ddco_pyro.model.networks.perceptrons import (
     Perceptrons,
     StackedLinear,
     State,
+    arrays_of,
     options_first,
     options_last,
-    over_layers,
 )
 
 
@@ -62,9 +62,8 @@ class Lstm(Network):
         of = self.over.numpy_form()
         if of is None:
             return None
-        layers = {str(number): layer for number, layer in enumerate(self.memory)}
-        facts = {"kind": "lstm", "layers": len(layers), "horizon": self.horizon}
-        return self.layers.numpy_form(over_layers(of, facts, layers))
+        layers = [arrays_of(layer) for layer in self.memory]
+        return self.layers.numpy_form({"kind": "lstm", "of": of, "layers": layers, "horizon": self.horizon})
 
     def _memory(self) -> list[StackedLstm]:
         return [layer for layer in self.memory if isinstance(layer, StackedLstm)]

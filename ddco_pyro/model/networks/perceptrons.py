@@ -13,42 +13,21 @@ from torch import Tensor, nn
 from ddco_pyro.model.networks.inputs import Inputs, InputShape, ShapeError
 from ddco_pyro.spec import Activation
 
-NumpyForm = tuple[dict[str, Any], dict[str, np.ndarray]]
-"""What the numpy runner of exports has to know: facts for ``controller.json``, and arrays for ``weights.npz``.
+NumpyForm = dict[str, Any]
+"""What the numpy runner of exports has to know: a tree of facts and arrays.
 
-Facts are a tree. Each node has a ``kind``, a method of :class:`ddco_pyro.exporting.runner.NumpyNetworks`, and reads
-what its ``of`` gives. The arrays of ``of`` are called ``of.<name>``."""
+Each node has a ``kind``, a method of :class:`ddco_pyro.exporting.runner.NumpyNetworks`, and reads what its ``of``
+gives."""
 
 
 def vectors(keys: Sequence[str], copies: int) -> NumpyForm:
     """The form of these vectors side by side, for each of K copies."""
-    return {"kind": "vectors", "keys": list(keys), "copies": copies}, {}
+    return {"kind": "vectors", "keys": list(keys), "copies": copies}
 
 
-def over_layers(of: NumpyForm, facts: Mapping[str, Any], layers: Mapping[str, nn.Module]) -> NumpyForm:
-    """The form of layers, by name, that read what another form gives."""
-    return {**facts, "of": of[0]}, arrays_of(layers) | _within("of", of[1])
-
-
-def joined(forms: Sequence[NumpyForm]) -> NumpyForm:
-    """The form of what several forms give, side by side."""
-    arrays: dict[str, np.ndarray] = {}
-    for number, (_, own) in enumerate(forms):
-        arrays |= _within(str(number), own)
-    return {"kind": "joined", "of": [facts for facts, _ in forms]}, arrays
-
-
-def arrays_of(layers: Mapping[str, nn.Module]) -> dict[str, np.ndarray]:
-    """The parameters of layers, as ``<layer>.<parameter>``."""
-    return {
-        f"{name}.{key}": parameter.detach().numpy()
-        for name, layer in layers.items()
-        for key, parameter in layer.named_parameters()
-    }
-
-
-def _within(name: str, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    return {f"{name}.{key}": array for key, array in arrays.items()}
+def arrays_of(layer: nn.Module) -> dict[str, np.ndarray]:
+    """The parameters of a layer by name."""
+    return {key: parameter.detach().numpy() for key, parameter in layer.named_parameters()}
 
 
 State = tuple[Tensor, ...]
@@ -112,10 +91,9 @@ class Perceptrons(nn.Sequential):
 
     def numpy_form(self, of: NumpyForm) -> NumpyForm:
         """The numpy form of these layers over what ``of`` gives."""
-        linear = [layer for layer in self if isinstance(layer, StackedLinear)]
-        facts = {"kind": "perceptrons", "layers": len(linear), "hidden": self.hidden, "activation": self.activation}
-        facts |= {"copies": self.copies, "steps": 1}
-        return over_layers(of, facts, {str(number): layer for number, layer in enumerate(linear)})
+        linear = [arrays_of(layer) for layer in self if isinstance(layer, StackedLinear)]
+        form = {"kind": "perceptrons", "of": of, "layers": linear, "hidden": self.hidden, "activation": self.activation}
+        return form | {"copies": self.copies, "steps": 1}
 
 
 class Network(nn.Module):
@@ -156,7 +134,7 @@ class Network(nn.Module):
                 parameter[..., -outputs:] = value if name == "bias" else 0.0
 
     def numpy_form(self) -> NumpyForm | None:
-        """Facts and arrays for the numpy runner of an exported controller; None where it cannot evaluate this."""
+        """The network for the numpy runner of an exported controller; None where it cannot evaluate this."""
         return None
 
 
@@ -193,7 +171,7 @@ class Mlp(Network):
         return options_last(self.layers(seen.vector.flatten(0, 1).unsqueeze(0)), seen.batch), state
 
     def numpy_form(self) -> NumpyForm:
-        return self.layers.numpy_form(({"kind": "trunk"}, {}) if self.trunk_size else vectors(self.reads, self.copies))
+        return self.layers.numpy_form({"kind": "trunk"} if self.trunk_size else vectors(self.reads, self.copies))
 
 
 class Constant(Mlp):
@@ -252,8 +230,8 @@ class PerTimestep(Network):
         return values.unflatten(0, maps.shape).permute(2, 0, 1, 3), state
 
     def numpy_form(self) -> NumpyForm:
-        facts, arrays = self.layers.numpy_form(vectors(self.reads, self.copies))
-        return facts | {"copies": self.copies, "steps": self.steps}, arrays
+        form = self.layers.numpy_form(vectors(self.reads, self.copies))
+        return form | {"copies": self.copies, "steps": self.steps}
 
 
 class Branches(Network):
@@ -293,8 +271,8 @@ class Branches(Network):
         return options_last(self.layers(torch.cat(values, -1)), inputs.batch), after
 
     def numpy_form(self) -> NumpyForm | None:
-        forms = [form for branch in self.branches() if (form := branch.numpy_form()) is not None]
-        return self.layers.numpy_form(joined(forms)) if len(forms) == len(self.of) else None
+        forms = [branch.numpy_form() for branch in self.branches()]
+        return None if None in forms else self.layers.numpy_form({"kind": "joined", "of": forms})
 
 
 def _vectors_of(shape: InputShape) -> list[str]:
