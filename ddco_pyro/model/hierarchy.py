@@ -24,8 +24,7 @@ from ddco_pyro.model.outputs import CallerOutputs, Outputs
 from ddco_pyro.model.recogniser import Recogniser
 from ddco_pyro.model.seeding import HOST
 from ddco_pyro.model.tables import Tables
-from ddco_pyro.spec import ControlSpec, LevelSpec, NetworkSpec, Spec
-from ddco_pyro.spec.base import Emission
+from ddco_pyro.spec import ControlSpec, LevelSpec, PolicySpec, Spec
 from ddco_pyro.spec.networks import Network as AnyNetworkSpec
 from ddco_pyro.spec.networks import PerTimestepSpec
 
@@ -49,8 +48,7 @@ class Caller(nn.Module):
 
     def __init__(
         self,
-        network: NetworkSpec,
-        emits: tuple[Emission, ...],
+        policy: PolicySpec,
         options: int,
         shape: InputShape | Network,
         control: ControlSpec,
@@ -59,13 +57,13 @@ class Caller(nn.Module):
     ) -> None:
         super().__init__()
         self.options, self.copies = options, copies
-        self.emits_control = "control" in emits
-        self.emits_options = "options" in emits and options > 0
+        self.emits_control = "control" in policy.emits
+        self.emits_options = "options" in policy.emits and options > 0
         logits = options + self.emits_control if self.emits_options else 0
         std = ControlStd(control, scaling, copies) if self.emits_control else None
         of_state = 0 if std is None else len(std.of_state)
         self.sizes = (logits, scaling.numbers + of_state if self.emits_control else 0)
-        self.network = build(network, shape, sum(self.sizes), copies)
+        self.network = build(policy, shape, sum(self.sizes), copies)
         if of_state:
             self.network.begin_at(of_state)
         self.std = std
@@ -104,7 +102,7 @@ class Level(nn.Module):
         super().__init__()
         self.count = spec.count
         with named(f"{place}.policy"):
-            self.policy = Caller(spec.policy, spec.policy.emits, options_below, shape, control, scaling, spec.count)
+            self.policy = Caller(spec.policy, options_below, shape, control, scaling, spec.count)
         self.termination: Network | None = None
         if isinstance(spec.termination, AnyNetworkSpec):
             with named(f"{place}.termination"):
@@ -155,9 +153,8 @@ class Hierarchy(nn.Module):
             levels.append(Level(f"hierarchy.levels.{number}", level, below, shape, spec.control, scaling))
             below = level.count
         self.levels = nn.ModuleList(levels)
-        network, emits = _meta_policy(spec)
         with named("hierarchy.meta_policy" if levels else "baseline.policy"):
-            self.meta_policy = Caller(network, emits, below, shape, spec.control, scaling, copies=1)
+            self.meta_policy = Caller(_meta_policy(spec), below, shape, spec.control, scaling, copies=1)
         self.recogniser: Recogniser | None = None
         if spec.hierarchy is not None and (labels := spec.training.labels) is not None and labels.recogniser:
             place = 1 + [each.name for each in spec.hierarchy.levels].index(labels.level)
@@ -313,12 +310,13 @@ def _bytes_at_once(device: torch.device) -> float:
     return BYTES_AT_ONCE
 
 
-def _meta_policy(spec: Spec) -> tuple[NetworkSpec, tuple[Emission, ...]]:
+def _meta_policy(spec: Spec) -> PolicySpec:
+    """The meta-policy, or the flat policy, which emits the control."""
     if spec.hierarchy is not None:
-        return spec.hierarchy.meta_policy, spec.hierarchy.meta_policy.emits
+        return spec.hierarchy.meta_policy
     assert spec.baseline is not None  # a spec has one or the other
     policy = spec.baseline.policy
     if spec.baseline.kind == "per_timestep":
         kept = {"hidden": ()} | policy.model_dump(exclude={"network"})  # a linear policy has no hidden layers
         policy = PerTimestepSpec(network="per_timestep", **kept)
-    return policy, ("control",)
+    return policy.model_copy(update={"emits": ("control",)})

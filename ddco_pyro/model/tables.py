@@ -10,9 +10,9 @@ control itself, for this step. Below a choice 0 every lower choice is 0 too.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -119,22 +119,24 @@ class Tables:
         *lower, top = self.selection
         uniform = torch.full_like(top, -math.log(top.shape[-1] - 1))
         uniform[..., 0] = NEVER
-        detached = [None if one is None else one.detach() for one in self.leaves()]
-        fixed = Tables.of(self.depth, detached, self.power, self.logits)
+        fixed = self.map(Tensor.detach)
         levels = replace(self, selection=(*lower, uniform))
         return levels, replace(fixed, selection=(*fixed.selection[:-1], top))
 
     def part(self, rows: Tensor, steps: int) -> Tables:
         """The first steps of the trajectories ``rows`` [M] alone; without a copy where these stand side by side."""
         chosen = slice(int(rows[0]), int(rows[-1]) + 1) if bool((rows.diff() == 1).all()) else rows
+        return self.map(lambda table: table[chosen, :steps])
 
-        def cut(tables: Sequence[Tensor | None]) -> Any:
-            return tuple(None if table is None else table[chosen, :steps] for table in tables)
-
-        selection, termination, control, evidence = map(
-            cut, (self.selection, self.termination, self.control, self.evidence)
+    def map(self, change: Callable[[Tensor], Tensor]) -> Tables:
+        """These tables, each changed."""
+        return replace(
+            self,
+            selection=tuple(map(change, self.selection)),
+            termination=tuple(map(change, self.termination)),
+            control=tuple(map(change, self.control)),
+            evidence=tuple(None if own is None else change(own) for own in self.evidence),
         )
-        return Tables(selection, termination, control, evidence, self.power, self.logits)
 
 
 def normalised(logits: Tensor) -> Tensor:

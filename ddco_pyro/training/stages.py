@@ -68,7 +68,7 @@ def plan(spec: Spec, depth: int, restart: int = 0) -> list[Stage]:
     layerwise = bool(training.layerwise) and not mixed
     together = training.layerwise == "segments" and depth > 1 and not mixed
     for level in range(1, 2 if together else depth + 1):
-        networks = (f"levels.{level - 1}.policy." if mixed else f"levels.{level - 1}.",)
+        networks: tuple[str, ...] = (f"levels.{level - 1}.policy." if mixed else f"levels.{level - 1}.",)
         networks = networks if level > 1 else ("trunk.", *networks)
         if way.stage:
             name = f"{way.stage}-{level}"

@@ -182,13 +182,5 @@ class Emission(ABC):
         }
         return replace(self, **changed)  # type: ignore[type-var]
 
-    def tensors(self) -> tuple[Tensor, ...]:
-        """The floating-point tensors, those of other emissions included."""
-        found: list[Tensor] = []
-        for value in self._fields().values():
-            own = (value,) if isinstance(value, Tensor) else value.tensors()
-            found.extend(tensor for tensor in own if tensor.is_floating_point())
-        return tuple(found)
-
     def _fields(self) -> dict[str, Any]:
         return {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]

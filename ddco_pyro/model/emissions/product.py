@@ -42,9 +42,6 @@ class Product(Emission):
     def log_density(self, actions: Tensor) -> Tensor:
         return reduce(add, (emission.log_density(actions[..., dims]) for dims, emission in self.groups))
 
-    def tensors(self) -> tuple[Tensor, ...]:
-        return tuple(tensor for _, emission in self.groups for tensor in emission.tensors())
-
     @property
     def mode(self) -> Tensor:
         return self._joined([emission.mode for _, emission in self.groups])
