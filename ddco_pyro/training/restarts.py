@@ -308,8 +308,8 @@ class Trainer:
         """
         values = {n: one.progress.objective for n, one in enumerate(self.restarts) if n not in self.stopped}
         best = max(values, key=lambda number: (values[number], -number))
-        first = values.get(0, -math.inf)
-        return 0 if first >= max(self._least, values[best] - self.spec.training.margin) else best
+        least = max(self._least, values[best] - self.spec.training.margin)
+        return 0 if 0 in values and values[0] >= least else best
 
     @property
     def history(self) -> list[dict[str, Any]]:
