@@ -70,7 +70,7 @@ def test_numbers_whose_squares_networks_cannot_hold(tmp_path: Path, key: str, va
     assert ended.status == 2
     assert ended.err.startswith(f"ddco-pyro: demo_6: {key} at step 5 is 1")
     assert ended.err.endswith(
-        f"once it is scaled, and networks take at most 1e+12; repair it, or leave demo_6 out (demonstrations.exclude)\n"
+        "once it is scaled, and networks take at most 1e+12; repair it, or leave demo_6 out (demonstrations.exclude)\n"
     )
     assert not list(tmp_path.glob("run/*.safetensors"))
     assert "training" not in ended.err  # it was said before

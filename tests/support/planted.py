@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from random_demonstrations import numbered
 from sklearn.metrics import normalized_mutual_info_score
@@ -12,12 +13,14 @@ from ddco_pyro.model.ahmm import Acting, choose
 from ddco_pyro.model.batch import encode
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.tables import complete
-from ddco_pyro.spec import parse_spec
+from ddco_pyro.spec import parse_spec, with_overrides
 from ddco_pyro.training.networks import Dimensions, build_hierarchy
 from ddco_pyro.training.restarts import Trainer
 
 LINEAR = {"network": "linear"}
-CONTROL = {"std": 0.05}
+SIGMA = 0.05
+CONTROL = {"std": SIGMA}
+"""Of a truth, whose scaled units are the control's own."""
 TRAINING = {"epochs": 900, "starts": ["vq_controls"] * 3, "patience": 25}
 
 
@@ -38,6 +41,13 @@ def small_spec(counts=(2,), policy=LINEAR, **sections):
 def make_spec(counts=(2,), seed=0, control=None, **training):
     training = {"optimizer": {"lr": 0.03}, "epochs": 20, **training}
     return small_spec(counts, control=control or {"std": 0.1}, training=training, seed=seed)
+
+
+def in_units_of(spec, demos):
+    """A spec with the truth's σ in the units to which the controls of these demonstrations are scaled."""
+    spreads = np.concatenate([demo.actions for demo in demos]).std(0)
+    parts = [{"name": f"x{d}", "dims": [d], "kind": "gaussian", "std": SIGMA / own} for d, own in enumerate(spreads)]
+    return with_overrides(spec, {"control.parts": parts})
 
 
 def make_trainer(spec, demos, path, on_event=ignore, jobs=1):

@@ -11,7 +11,7 @@ import pytest
 import torch
 from command_line import call
 from oracle import brute_force, paths
-from planted import CONTROL, LINEAR, make_spec, make_trainer, make_truth, plant, small_spec, tabulated
+from planted import CONTROL, LINEAR, in_units_of, make_spec, make_trainer, make_truth, plant, small_spec, tabulated
 from random_demonstrations import numbered
 from sklearn.metrics import normalized_mutual_info_score
 
@@ -341,7 +341,7 @@ def test_three_labelled_demonstrations_name_the_options_of_thirty(tmp_path):
     phases[3:] = -1
     demos = Demonstrations(tuple(replace(demo, labels={"phase": row}) for demo, row in zip(demos, phases, strict=True)))
     held_out, true = plant(truth, 20, 24, seed=11)
-    model = make_trainer(spec, demos, tmp_path).run()
+    model = make_trainer(in_units_of(spec, demos), demos, tmp_path).run()
     tables, batch = tabulated(model, held_out)
     (found,) = segment(tables, batch.lengths)
     number = np.argsort(np.argsort(names)) + 1

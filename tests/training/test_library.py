@@ -23,7 +23,7 @@ from linear import (
     linear,
     score,
 )
-from planted import CONTROL, make_spec, make_truth, per_step, plant, small_spec, tabulated
+from planted import CONTROL, in_units_of, make_spec, make_truth, per_step, plant, small_spec, tabulated
 
 from ddco_pyro.inference.marginal import bayesian_ahmm
 from ddco_pyro.model.batch import Batch
@@ -138,7 +138,7 @@ def test_a_new_task_is_learned_from_one_demonstration():
     drawn = with_overrides(spec, {"training.library": {"run": "known", "ridge": 3}})
     prior = Prior(library, 3.0, 20.0)
     adapted = train_model(drawn, size.like(library, "known"), first, library=prior).hierarchy
-    scratch = train_model(spec, size, first).hierarchy
+    scratch = train_model(in_units_of(spec, first), size, first).hierarchy
     value = {name: per_step(one, tabulated(one, held_out)[1]) for name, one in
              {"truth": truth, "library": library, "adapted": adapted, "scratch": scratch}.items()}  # fmt: skip
     assert value["adapted"] > value["truth"] - 0.5

@@ -8,7 +8,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from planted import CONTROL, TRAINING, make_spec, make_trainer, make_truth, per_step, plant, recovered
+from planted import (
+    CONTROL,
+    TRAINING,
+    in_units_of,
+    make_spec,
+    make_trainer,
+    make_truth,
+    per_step,
+    plant,
+    recovered,
+)
 from random_demonstrations import numbered, of_states
 
 from ddco_pyro.inference import log_likelihood
@@ -113,14 +123,14 @@ def test_stages_share_the_budget_and_what_one_leaves_goes_to_the_later_ones(tmp_
         assert trainer.summary["stages"][number]["cap"] == cap
         left -= taken[stage.name]
     assert min(taken.values()) < 10  # one has stopped early
-    assert max(taken.values()) > 11  # and another has taken more than an even share
+    assert max(taken.values()) > 62 / 6  # and another has taken more than an even share
     assert trainer.summary["spent"]["epochs"] == 62 - left
 
 
 @pytest.mark.parametrize(("name", "apart"), [("adamw", True), ("adam", False)])
 def test_weight_decay_of_adamw_is_apart_from_the_gradient(name, apart, tmp_path):
     """In the first step it takes as much more of every weight as it is larger; a penalty is lost in Adam's scaling."""
-    settings = {"starts": ["random"], "layerwise": False, "epochs": 1}
+    settings = {"control": {"std": 1.0}, "starts": ["random"], "layerwise": False, "epochs": 1}
     after = []
     for decay in (0.0, 1.0, 2.0):
         spec = make_spec((2,), optimizer={"name": name, "lr": 0.01, "weight_decay": decay}, **settings)
@@ -235,8 +245,8 @@ def test_what_is_called_converged_is_at_the_optimum(tmp_path):
         np.concatenate([np.column_stack([d.observations["state"], np.ones(50)]) for d in p]) for p in (train, tune)
     ]
     actions = [np.concatenate([d.actions for d in p]) for p in (train, tune)]
-    error = actions[1] - states[1] @ np.linalg.lstsq(states[0], actions[0], rcond=None)[0]
-    optimum = (-0.5 * (error / 0.5) ** 2 - np.log(0.5) - 0.5 * np.log(2 * np.pi)).sum(1).mean()
+    error, std = actions[1] - states[1] @ np.linalg.lstsq(states[0], actions[0], rcond=None)[0], 0.5 * actions[0].std(0)
+    optimum = (-0.5 * (error / std) ** 2 - np.log(std) - 0.5 * np.log(2 * np.pi)).sum(1).mean()
     below = {}
     for epochs in (15, 400):
         spec = make_spec((), control={"std": 0.5}, epochs=epochs, patience=None, batch_size=8)
@@ -256,7 +266,8 @@ EM = {"optimizer": {"name": "em"}, "epochs": 300}
 def test_a_planted_hierarchy_is_recovered_from_the_likeliest_of_several_starts(tmp_path):
     spec = make_spec((4,), control=CONTROL, starts=["random", "random", "equal_parts", "vq_controls"], **EM)
     truth = make_truth(spec)
-    trainer = make_trainer(spec, plant(truth, 80, 40, seed=1)[0], tmp_path)
+    demos, _ = plant(truth, 80, 40, seed=1)
+    trainer = make_trainer(in_units_of(spec, demos), demos, tmp_path)
     values = recovered(trainer.run(), truth, *plant(truth, 40, 40, seed=2))
     assert values["found"] > values["truth"] - 0.02 * abs(values["truth"])
     assert values["found nmi"][0] > values["truth nmi"][0] - 0.05
@@ -275,7 +286,9 @@ def test_a_planted_hierarchy_is_recovered_from_the_likeliest_of_several_starts(t
 def test_a_hierarchy_begins_from_the_mixtures_fit_with_psi_one_half(tmp_path, counts, optimizer):
     """The stage before the last maximises the likelihood of the spec whose options always end."""
     spec = make_spec(counts, control=CONTROL, starts=["mixture"], optimizer=optimizer, epochs=240)
-    data = make_trainer(spec, plant(make_truth(spec), 30, 20, seed=1)[0], tmp_path).data
+    demos, _ = plant(make_truth(spec), 30, 20, seed=1)
+    spec = in_units_of(spec, demos)
+    data = make_trainer(spec, demos, tmp_path).data
     restart = train(data, Restart(Progress(0)), until=0)
     begun = restart.paused.model.state_dict() if optimizer["name"] == "em" else restart.states["model"]
     model = data.hierarchy(0, begun)
@@ -310,7 +323,9 @@ def test_a_planted_hierarchy_is_recovered(tmp_path, counts):
     )
     truth = make_truth(spec)
     demos, _ = plant(truth, 80 if len(counts) > 1 else 40, 40, seed=1)
-    values = recovered(make_trainer(spec, demos, tmp_path).run(), truth, *plant(truth, 40, 40, seed=2))
+    values = recovered(
+        make_trainer(in_units_of(spec, demos), demos, tmp_path).run(), truth, *plant(truth, 40, 40, seed=2)
+    )
     assert values["found"] > values["truth"] - 0.02 * abs(values["truth"]), values
     assert values["found nmi"][0] > 0.95, values
 
