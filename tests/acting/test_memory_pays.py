@@ -1,20 +1,16 @@
 """Where the next skill is hidden from what is seen, options that last succeed and a memoryless mixture does not.
 
-Two kinds of hidden intention (``memory_tasks``): the way there and back along one line, and a side of an obstacle that
-is chosen at random and kept. In the control case the intention is observed, and the two are equal.
-
-Clusters are of observations and controls, since those of observations cannot tell apart what looks alike. Options are
-drawn (``sample``): only drawing reproduces a choice that the supervisor makes at random. Seeds are those that the
-library counts from by default; none is chosen for what it gives.
+The way there and back along one line (``memory_tasks``). In the control case the intention is observed, and the two
+are equal. Clusters are of observations and controls, since those of observations cannot tell apart what looks alike.
+Seeds are those that the library counts from by default; none is chosen for what it gives.
 """
 
 from __future__ import annotations
 
 from functools import cache
 
-import memory_tasks
-import pytest
 import yaml
+from memory_tasks import there_and_back
 from scipy import stats
 
 import ddco_pyro
@@ -25,7 +21,7 @@ from ddco_pyro.spec import parse_spec
 from ddco_pyro.statistics import paired_difference, rate
 
 SPEC = """
-task: memory_tasks:{task}
+task: memory_tasks:there_and_back
 demonstrations: {{count: 40, valid_fraction: 0.25}}
 observations: {observed}
 control: {{std: {{learn: true}}}}
@@ -47,27 +43,24 @@ UNLIKELY = 1e-3
 
 
 @cache
-def demonstrations(name):
-    task = getattr(memory_tasks, name)
-    return Demonstrations(tuple(run_episode(task, "supervisor", seed).record for seed in range(40)))
+def demonstrations():
+    return Demonstrations(tuple(run_episode(there_and_back, "supervisor", seed).record for seed in range(40)))
 
 
-def chance(name):
+def chance():
     """Successes of the supervisor whose intention is drawn anew at every step, in 300 episodes."""
-    task = getattr(memory_tasks, name)
-    episodes = [run_episode(task, "forgetful", seed) for seed in range(2000, 2300)]
+    episodes = [run_episode(there_and_back, "forgetful", seed) for seed in range(2000, 2300)]
     return rate(int(sum(episode.outcome["success"] for episode in episodes)), len(episodes))
 
 
-def fitted(name, observed):
-    """The fit, and the outcomes of its options and of the mixture from the same starts."""
-    spec = parse_spec(yaml.safe_load(SPEC.format(task=name, observed=observed)))
-    fit = ddco_pyro.fit(spec, demonstrations(name))
-    starts, task = range(1000, 1000 + spec.rollout.episodes), getattr(memory_tasks, name)
-    played = []
+def fitted(observed):
+    """The fit, and whether its options and the mixture succeed from the same starts."""
+    spec = parse_spec(yaml.safe_load(SPEC.format(observed=observed)))
+    fit = ddco_pyro.fit(spec, demonstrations())
+    starts, played = range(1000, 1000 + spec.rollout.episodes), []
     for hierarchy in (fit.hierarchy, fit.baselines["mixture"].hierarchy):
         controller = Controller(hierarchy, spec.rollout.control, spec.rollout.options)
-        played.append([run_episode(task, controller, seed).outcome for seed in starts])
+        played.append([run_episode(there_and_back, controller, seed).outcome["success"] for seed in starts])
     return fit, *played
 
 
@@ -78,29 +71,20 @@ def worth(fit):
     return found.nats_per_step - half, found.nats_per_step + half
 
 
-def successes(outcomes):
-    return [outcome["success"] for outcome in outcomes]
-
-
-@pytest.mark.parametrize("name", ["there_and_back", "obstacle"])
-def test_options_remember_what_a_mixture_cannot(name):
+def test_options_remember_what_a_mixture_cannot():
     """The mixture succeeds no more often than a binomial bound on what the supervisor does without memory."""
-    fit, options, mixture = fitted(name, ["seen"])
-    ours, theirs = sum(successes(options)), sum(successes(mixture))
-    by_chance = chance(name)
+    fit, options, mixture = fitted(["seen"])
+    by_chance = chance()
     low, _ = worth(fit)
-    assert ours >= 0.95 * len(options)
+    assert sum(options) >= 0.95 * len(options)
     most = stats.binomtest(by_chance.successes, by_chance.trials).proportion_ci(1 - 2 * UNLIKELY).high
-    assert theirs <= stats.binom.isf(UNLIKELY, len(mixture), most)
+    assert sum(mixture) <= stats.binom.isf(UNLIKELY, len(mixture), most)
     assert low > 0
-    if name == "obstacle":  # either side is passed, as in the demonstrations
-        assert {outcome["side"] for outcome in options} == {-1.0, 1.0}
 
 
-@pytest.mark.parametrize("name", ["there_and_back", pytest.param("obstacle", marks=pytest.mark.slow)])
-def test_where_the_intention_is_seen_there_is_nothing_to_remember(name):
-    fit, options, mixture = fitted(name, ["seen", "intention"])
+def test_where_the_intention_is_seen_there_is_nothing_to_remember():
+    fit, options, mixture = fitted(["seen", "intention"])
     low, high = worth(fit)
-    assert sum(successes(options)) >= 0.95 * len(options)
-    assert paired_difference(successes(options), successes(mixture)).p_value > 0.05
+    assert sum(options) >= 0.95 * len(options)
+    assert paired_difference(options, mixture).p_value > 0.05
     assert low <= 0 <= high

@@ -1,4 +1,4 @@
-"""Controls that the Pyro program draws, against the numbers of the networks that it draws them from."""
+"""Kinds of control against scipy, torch and brute force, and the Pyro program with controls that are given."""
 
 from __future__ import annotations
 
@@ -24,45 +24,12 @@ from ddco_pyro.model.tables import complete
 DRAWS = 600
 
 
-def said(counts, emits=("options", "control")):
-    """What random networks say of a batch of demonstrations, the batch, and the chain without its controls."""
-    hierarchy, batch = make_hierarchy(counts, emits), make_batch()
-    with torch.no_grad():
-        outputs = hierarchy(batch.inputs)
-    return outputs, batch, complete(outputs.tables(), batch.lengths)
-
-
-def actor(choices):
-    """The level and the option of who acts; the meta-policy is the option 0 of the last level."""
-    return next(((level, h - 1) for level, h in enumerate(choices) if h), (len(choices), 0))
-
-
-@pytest.mark.parametrize("counts", [(3,), (2, 2)])
-def test_controls_are_drawn_from_who_acts(counts):
-    """Of all draws in which the same caller acts: mean and deviation, within five standard errors."""
-    outputs, batch, chain = said(counts)
-    pyro.set_rng_seed(0)
-    draws = [pyro.poutine.trace(ahmm).get_trace(chain, outputs.emissions).nodes for _ in range(DRAWS // len(batch))]
-    t, of_actor = 1, {}
-    for nodes in draws:
-        for n in range(len(batch)):
-            choices = [int(nodes[f"h_{d}_{t}"]["value"][n]) for d in range(1, 1 + len(counts))]
-            of_actor.setdefault((n, *actor(choices)), []).append(nodes[f"a_{t}"]["value"][n])
-    checked = 0
-    for (n, level, option), values in of_actor.items():
-        if len(values) > 50:
-            emission, controls = outputs.emissions[level], torch.stack(values)
-            apart = (controls.mean(0) - emission.mean[n, t, option]) / emission.std
-            assert (apart.abs() < 5 / len(values) ** 0.5).all()
-            assert (controls.std(0) / emission.std - 1).abs().max() < 5 / (2 * len(values)) ** 0.5
-            checked += 1
-    assert checked > len(batch)
-
-
 def test_a_control_can_be_conditioned_on():
     """With every control given the program has the likelihood of the tables; with one changed, that of the changed."""
-    outputs, batch, chain = said((2,), ("options",))
-    actions = batch.actions.clone()
+    batch = make_batch()
+    with torch.no_grad():
+        outputs = make_hierarchy((2,))(batch.inputs)
+    chain, actions = complete(outputs.tables(), batch.lengths), batch.actions.clone()
     actions[:, 1] += 0.5
     given = {f"a_{t}": control for t, control in enumerate(actions.unbind(1))}
     elbo = pyro.infer.TraceEnum_ELBO(max_plate_nesting=1, strict_enumeration_warning=False)
@@ -159,13 +126,10 @@ KINDS = {
     "gaussian": lambda: Gaussian(numbers(2, 3, 2, 2), STD, SCALE.log()),
     "gaussian, own σ": lambda: Gaussian(numbers(2, 3, 2, 2), torch.stack([STD, 2 * STD]), SCALE.log()),
     "clipped": lambda: clipped(numbers(2, 3, 2, 2)),
-    "clipped, own σ": lambda: clipped(numbers(2, 3, 2, 2), torch.stack([STD, 2 * STD])),
     "gaussian, σ of each step": lambda: Gaussian(numbers(2, 3, 2, 2), std_of_steps(), SCALE.log()),
     "clipped, σ of each step": lambda: clipped(numbers(2, 3, 2, 2), std_of_steps()),
-    "hurdle, clipped, σ of each step": lambda: hurdle(numbers(2, 3, 2, 1, seed=2), numbers(2, 3, 2, 2), std_of_steps()),
     "student": lambda: student(STD),
     "student, own σ": lambda: student(torch.stack([STD, 2 * STD])),
-    "student, σ of each step": lambda: student(std_of_steps()),
     "student beside": lambda: Product((((2, 0), student(STD)), ((1,), Binary(numbers(2, 3, 2, 1, seed=1))))),
     "binary": lambda: Binary(numbers(2, 3, 2, 2)),
     "categorical": lambda: Categorical(numbers(2, 3, 2, 4)),

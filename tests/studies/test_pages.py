@@ -238,21 +238,6 @@ def test_no_page_shows_raw_markdown_or_comments(path):
     assert raw(path.read_text()) == []
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "<!-- table x: a -->5%<!-- / -->, and **so** on\n",
-        "<!-- end -->\n| a | b |\n|---|\n",
-        "Text\n| a | b |\n|---|\n",
-        "<b>\n**bold** in a block\n</b>\n",
-        "A link [to](a b) nowhere\n",
-        "An open `code span\n",
-    ],
-)
-def test_raw_markdown_is_found(text):
-    assert raw(text)
-
-
 def rows(table, **named):
     """The value of each seed, read by pandas alone."""
     whole = pd.read_csv(ROOT / table, dtype=str, keep_default_na=False)

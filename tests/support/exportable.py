@@ -122,7 +122,6 @@ FITS = {
     "three levels": make("mlp", (2, 3, 2), BOTH),
     "mixture": make("mlp", (3,), BOTH, endings="always", control="sample", options="sample"),
     "memoryless below": make("mlp", (2, 3), endings="always", options="marginal"),
-    "marginal": make("mlp", (2, 3, 2), BOTH, options="marginal"),
     "flat": make("mlp", (), built_in=("step",)),
     "lstm": make(RECURRENT, (2, 2), BOTH, endings=RECURRENT, control="sample"),
     "lstm over pictures": make(
