@@ -266,7 +266,9 @@ class NumpyNetworks:
         self._images, self._step = images, step
         self._before, self._after = iter(state), []
         outputs: Outputs = {}
-        self._features = self._network("trunk")
+        trunk = self._network("trunk")
+        if trunk is not None:
+            self._seen = {"trunk": trunk[0]}
         for level, caller in enumerate(self._about["callers"]):
             out = self._network(f"caller_{level}")
             assert out is not None  # every caller has a network
@@ -300,10 +302,6 @@ class NumpyNetworks:
     def _vectors(self, node: Mapping[str, Any]) -> np.ndarray:
         vector = np.concatenate([np.zeros(0, np.float32), *(self._seen[key] for key in node["keys"])])
         return np.broadcast_to(vector, (node["copies"], len(vector)))
-
-    def _trunk(self, _: Mapping[str, Any]) -> np.ndarray:
-        assert self._features is not None  # what reads a trunk comes after it
-        return self._features
 
     def _joined(self, node: Mapping[str, Any]) -> np.ndarray:
         return np.concatenate([self._evaluate(of) for of in node["of"]], axis=1)

@@ -34,6 +34,9 @@ BYTES_AT_ONCE = 256 * 10**6
 PART_OF_A_GPU = 0.1
 """Share of a GPU's whole memory that networks take in place of that, so that GPUs of one kind cut alike."""
 
+TRUNK = "trunk"
+"""The name of the trunk, and of its features as a vector that the other networks read."""
+
 RawOutputs = Sequence[Tensor]
 """The outputs of networks [N, T, K, F]: policy and, where it has one, termination of each level, lowest first, and the
 meta-policy's."""
@@ -50,7 +53,7 @@ class Caller(nn.Module):
         self,
         policy: PolicySpec,
         options: int,
-        shape: InputShape | Network,
+        shape: InputShape,
         control: ControlSpec,
         scaling: ControlScaling,
         copies: int,
@@ -87,7 +90,7 @@ class Level(nn.Module):
 
     ``termination`` is None where every option ends after every step (ψ = 1).
 
-    :param shape: of the observations, or the hierarchy's trunk.
+    :param shape: of what its networks read.
     """
 
     def __init__(
@@ -95,7 +98,7 @@ class Level(nn.Module):
         place: str,
         spec: LevelSpec,
         options_below: int,
-        shape: InputShape | Network,
+        shape: InputShape,
         control: ControlSpec,
         scaling: ControlScaling,
     ) -> None:
@@ -147,7 +150,7 @@ class Hierarchy(nn.Module):
         if spec.hierarchy is not None and spec.hierarchy.trunk is not None:
             with named("hierarchy.trunk"):
                 self.trunk = build_trunk(spec.hierarchy.trunk, self.input_shape, 1)
-        shape = self.trunk or self.input_shape
+        shape = self.read_shape
         levels, below = [], 0
         for number, level in enumerate(spec.hierarchy.levels if spec.hierarchy else ()):
             levels.append(Level(f"hierarchy.levels.{number}", level, below, shape, spec.control, scaling))
@@ -188,7 +191,7 @@ class Hierarchy(nn.Module):
 
     def networks(self) -> dict[str, Network]:
         """Every network by its place here, such as ``levels.0.policy``."""
-        each = {} if self.trunk is None else {"trunk": self.trunk}
+        each = {} if self.trunk is None else {TRUNK: self.trunk}
         for number, level in enumerate(self.option_levels()):
             place = f"levels.{number}"
             each[f"{place}.policy"] = level.policy.network
@@ -206,10 +209,16 @@ class Hierarchy(nn.Module):
         for place in self.networks():
             yield f"hierarchy.{place}" if self.depth else "baseline.policy", self.get_submodule(place)
 
+    @property
+    def read_shape(self) -> InputShape:
+        """The shapes of what all networks but the trunk read: the observations, or the trunk's features."""
+        return self.input_shape if self.trunk is None else InputShape({TRUNK: self.trunk.features}, {}, self.steps)
+
     @cached_property
     def step_bytes(self) -> int:
         """Bytes that all networks take for a step in training."""
-        return training_bytes(self.networks().values(), self.input_shape)
+        shapes = dict.fromkeys(self.networks().values(), self.read_shape)
+        return training_bytes(shapes | ({} if self.trunk is None else {self.trunk: self.input_shape}))
 
     @property
     def steps_in_memory(self) -> int:
@@ -273,13 +282,15 @@ class Hierarchy(nn.Module):
         inputs, states = inputs.loaded().to(self.device), before or self.initial_states(inputs.batch[0])
         after: dict[str, State] = {}
         raw: list[Tensor] = []
-        linear = linear_maps(self.networks(), inputs)
+        linear = linear_maps(self.networks(), inputs) if self.trunk is None else {}
 
-        def run(place: str, network: Network, seen: Inputs | Tensor) -> Tensor:
+        def run(place: str, network: Network, seen: Inputs) -> Tensor:
             output, after[place] = (linear[place], ()) if place in linear else network(seen, states[place])
             return output
 
-        read = inputs if self.trunk is None else run("trunk", self.trunk, inputs)
+        read = inputs
+        if self.trunk is not None:
+            read = Inputs({TRUNK: run(TRUNK, self.trunk, inputs).squeeze(2)}, {}, inputs.time)
         for number, level in enumerate(self.option_levels()[:discovering]):
             place = f"levels.{number}"
             raw.append(run(f"{place}.policy", level.policy.network, read))

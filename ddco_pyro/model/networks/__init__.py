@@ -42,9 +42,10 @@ CLASSES: dict[str, type[Network]] = {
 are those of :mod:`ddco_pyro.spec.networks`."""
 
 
-def build(spec: NetworkSpec, shape: InputShape | Network, outputs: int, copies: int) -> Network:
-    """``copies`` independent networks of the observations, or of a trunk's features, that give ``outputs`` numbers.
+def build(spec: NetworkSpec, shape: InputShape, outputs: int, copies: int) -> Network:
+    """``copies`` independent networks that give ``outputs`` numbers.
 
+    :param shape: of the observations.
     :raises ShapeError: as :func:`build_trunk`.
     """
     if isinstance(spec, UserNetworkSpec):
@@ -52,28 +53,26 @@ def build(spec: NetworkSpec, shape: InputShape | Network, outputs: int, copies: 
     return build_trunk(spec, shape, copies).add_head(outputs)
 
 
-def build_trunk(spec: NetworkSpec, shape: InputShape | Network, copies: int) -> Network:
+def build_trunk(spec: NetworkSpec, shape: InputShape, copies: int) -> Network:
     """``copies`` independent networks for others to read.
 
-    :param shape: of the observations, or another trunk, which it reads in their place.
+    :param shape: of the observations.
     :raises ShapeError: the network cannot read these observations, cannot be imported or made, or is refused by
         :func:`ddco_pyro.model.networks.probe.try_network`.
     """
     if isinstance(spec, UserNetworkSpec):
         return _of_user(spec, shape, None, copies)
-    settings, seen = spec.settings, _selected(spec, shape)
-    if isinstance(seen, InputShape):
-        if settings.get("over"):
-            with named("over"):
-                settings["over"] = build_trunk(settings["over"], seen, copies)
-        if "of" in settings:
-            settings["of"] = {name: _branch(name, branch, seen, copies) for name, branch in settings["of"].items()}
+    settings, seen = spec.settings, shape.select(spec.inputs) if spec.inputs else shape
+    if settings.get("over"):
+        with named("over"):
+            settings["over"] = build_trunk(settings["over"], seen, copies)
+    if "of" in settings:
+        settings["of"] = {name: _branch(name, branch, seen, copies) for name, branch in settings["of"].items()}
     return _selecting(spec, CLASSES[spec.network](seen, copies, **settings))
 
 
-def _of_user(spec: UserNetworkSpec, shape: InputShape | Network, outputs: int | None, copies: int) -> Network:
-    seen = _selected(spec, shape)
-    assert isinstance(seen, InputShape)  # a spec has built-in networks over a trunk
+def _of_user(spec: UserNetworkSpec, shape: InputShape, outputs: int | None, copies: int) -> Network:
+    seen = shape.select(spec.inputs) if spec.inputs else shape
     return _selecting(spec, UserNetwork.made(spec.network, seen, outputs, copies, spec.options))
 
 
@@ -83,14 +82,9 @@ def _branch(name: str, spec: NetworkSpec, shape: InputShape, copies: int) -> Net
         return build_trunk(spec.model_copy(update={"inputs": spec.inputs or (name,)}), shape, copies)
 
 
-def _selected(spec: NetworkSpec, shape: InputShape | Network) -> InputShape | Network:
-    """The shapes of the observations in the network's ``inputs``, or of all."""
-    return shape.select(spec.inputs) if spec.inputs and isinstance(shape, InputShape) else shape
-
-
 def _selecting(spec: NetworkSpec, network: Network) -> Network:
     """The network, which is given no other observations than those in its ``inputs``."""
-    if spec.inputs and network.trunk_size is None:
+    if spec.inputs:
         network.register_forward_pre_hook(partial(_select, spec.inputs))
     return network
 

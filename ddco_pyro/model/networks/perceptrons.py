@@ -99,18 +99,16 @@ class Perceptrons(nn.Sequential):
 class Network(nn.Module):
     """K networks side by side, a trunk for others to read; :meth:`add_head` makes it one that gives outputs.
 
-    Every network is called as ``network(seen, state)``. It maps T steps of N trajectories to [N, T, K, features] and
-    the state after them; ``seen`` are :class:`Inputs`, or the features of another trunk [N, T, K or 1, F]. A call on T
-    steps gives what T calls on one step each give, with the state carried from each to the next.
+    Every network is called as ``network(inputs, state)``. It maps T steps of N trajectories to [N, T, K, features] and
+    the state after them. A call on T steps gives what T calls on one step each give, with the state carried from each
+    to the next.
 
     :ivar copies: K; 1 where all options read the same features.
     :ivar layers: the last layers, which the head joins.
-    :ivar trunk_size: (copies, features) of the trunk that it reads; None for a network of observations.
     """
 
     copies: int
     layers: Perceptrons
-    trunk_size: tuple[int, int] | None = None
 
     @property
     def features(self) -> int:
@@ -139,7 +137,7 @@ class Network(nn.Module):
 
 
 class Mlp(Network):
-    """K perceptrons over all vectors side by side, or over the features of a trunk (SM 1.1, SM 1.3).
+    """K perceptrons over all vectors side by side (SM 1.1, SM 1.3).
 
     Without hidden layers the head is K linear maps.
 
@@ -148,44 +146,40 @@ class Mlp(Network):
 
     def __init__(
         self,
-        shape: InputShape | Network,
+        shape: InputShape,
         copies: int,
         hidden: tuple[int, ...] = (),
         dropout: float = 0.0,
         activation: Activation = "relu",
     ) -> None:
         super().__init__()
-        self.copies, self.reads = copies, [] if isinstance(shape, Network) else _vectors_of(shape)
-        self.trunk_size = (shape.copies, shape.features) if isinstance(shape, Network) else None
-        size = shape.features if isinstance(shape, Network) else shape.vector
-        self.layers = Perceptrons(copies, size, hidden, dropout, activation)
+        self.copies, self.reads = copies, _vectors_of(shape)
+        self.layers = Perceptrons(copies, shape.vector, hidden, dropout, activation)
 
     @property
     def is_linear(self) -> bool:
         """Whether it is K linear maps of vectors, or of none."""
-        return self.trunk_size is None and len(self.layers) == 1
+        return len(self.layers) == 1
 
-    def forward(self, seen: Inputs | Tensor, state: State = ()) -> tuple[Tensor, State]:
-        if isinstance(seen, Tensor):
-            return options_last(self.layers(options_first(seen)), (seen.shape[0], seen.shape[1])), state
-        return options_last(self.layers(seen.vector.flatten(0, 1).unsqueeze(0)), seen.batch), state
+    def forward(self, inputs: Inputs, state: State = ()) -> tuple[Tensor, State]:
+        return options_last(self.layers(self._read(inputs).flatten(0, 1).unsqueeze(0)), inputs.batch), state
+
+    def _read(self, inputs: Inputs) -> Tensor:
+        """The vectors that it reads, side by side, [N, T, F]."""
+        return inputs.vector
 
     def numpy_form(self) -> NumpyForm:
-        return self.layers.numpy_form({"kind": "trunk"} if self.trunk_size else vectors(self.reads, self.copies))
+        return self.layers.numpy_form(vectors(self.reads, self.copies))
 
 
 class Constant(Mlp):
-    """K biases: linear maps of no observation, and of no feature of a trunk."""
+    """K biases: linear maps of no observation."""
 
-    def __init__(self, shape: InputShape | Network, copies: int) -> None:
+    def __init__(self, shape: InputShape, copies: int) -> None:
         super().__init__(InputShape({}), copies)
-        self.trunk_size = (shape.copies, shape.features) if isinstance(shape, Network) else None
 
-    def forward(self, seen: Inputs | Tensor, state: State = ()) -> tuple[Tensor, State]:
-        return super().forward(seen[..., :0] if isinstance(seen, Tensor) else seen.vector[..., None, :0], state)
-
-    def numpy_form(self) -> NumpyForm:
-        return self.layers.numpy_form(vectors((), self.copies))
+    def _read(self, inputs: Inputs) -> Tensor:
+        return inputs.vector[..., :0]
 
 
 def linear_maps(networks: Mapping[str, Network], inputs: Inputs) -> dict[str, Tensor]:

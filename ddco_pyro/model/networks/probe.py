@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -125,13 +125,14 @@ def _without_zeros(network: Network) -> Iterator[None]:
             parameter.copy_(values)
 
 
-def training_bytes(networks: Iterable[Network], shape: InputShape) -> int:
-    """Bytes that these networks take for a step while all of them are trained together.
+def training_bytes(networks: Mapping[Network, InputShape]) -> int:
+    """Bytes that these networks, each with what it reads, take for a step while all of them are trained together.
 
     Each keeps tensors until its gradient is computed. While that happens, what one network computed and its gradient
     are there too: measured with convolutions, at most twice what the largest network keeps.
     """
-    kept = [_kept(network, shape, *_one_more(network)) - _kept(network, shape, 1, 1) for network in networks]
+    each = networks.items()
+    kept = [_kept(network, shape, *_one_more(network)) - _kept(network, shape, 1, 1) for network, shape in each]
     return sum(kept) + 2 * max(kept)
 
 
@@ -147,9 +148,7 @@ def _one_more(network: Network) -> tuple[int, int]:
 def _kept(network: Network, shape: InputShape, trajectories: int, steps: int) -> int:
     """Bytes of all tensors, parameters included, that torch keeps for the gradient."""
     dtype = next((parameter.dtype for parameter in network.parameters()), torch.float32)
-    seen: Inputs | Tensor = _random_inputs(shape, trajectories, steps, dtype)
-    if network.trunk_size is not None:
-        seen = torch.zeros(trajectories, steps, *network.trunk_size, dtype=dtype)
+    seen = _random_inputs(shape, trajectories, steps, dtype)
     storages: dict[int, int] = {}
 
     def keep(tensor: Tensor) -> Tensor:
