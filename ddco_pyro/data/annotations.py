@@ -42,26 +42,18 @@ class LabelTable:
     rate: float | None = None
 
 
-@dataclass(frozen=True)
-class TableLabels:
-    """The labels that a table gives to demonstrations.
-
-    :param labels: for labels by name and demonstrations by name, the label of each step [T]; -1 where none is said.
-    :param names: the names of labels 0, 1, ... of the table and of the source, as the attribute ``label_names``.
-    :param notes: a line for each thing in the table that is left out, or read in another way.
-    """
-
-    labels: Mapping[str, Mapping[str, np.ndarray]]
-    names: str
-    notes: list[str]
+Labelled = dict[str, dict[str, np.ndarray]]
+"""For labels by name and demonstrations by name, the label of each step [T]; -1 where none is said."""
 
 
-def labels_of_table(table: LabelTable, source: Source) -> TableLabels:
+def labels_of_table(table: LabelTable, source: Source) -> tuple[Labelled, dict[str, list[str]], list[str]]:
     """The labels that a table gives to the demonstrations of a source, whose names of labels keep their numbers.
 
+    :returns: the labels, the names of labels 0, 1, ... of the table and of the source, and a line for each thing in the
+        table that is left out, or read in another way.
     :raises BadInput: the table cannot be read, or does not fit the demonstrations.
     """
-    names, found = label_names(source.attributes), dict[str, dict[str, np.ndarray]]()
+    names, found = label_names(source.attributes), Labelled()
     try:
         rows, unit, notes = _segments(_read(table.path), table.columns)
         rows = _in_steps(rows, table.unit or unit, source.frequency)
@@ -81,7 +73,7 @@ def labels_of_table(table: LabelTable, source: Source) -> TableLabels:
             }
     except BadInput as error:
         raise BadInput(f"--labels {table.path}: {error}") from None
-    return TableLabels(found, json.dumps(names), notes)
+    return found, names, notes
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -10,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ddco_pyro.data.annotations import LabelTable, labels_of_table
+from ddco_pyro.data.annotations import Labelled, LabelTable, labels_of_table
 from ddco_pyro.data.arrays import NUMBERS, LazyArray, Observed, is_picture, network_input
 from ddco_pyro.data.controls import few
-from ddco_pyro.data.demonstration import Demonstration, check, check_values
+from ddco_pyro.data.demonstration import Attribute, Demonstration, check, check_values
 from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.labels import BOUNDARY, LABEL_NAMES, SOURCE, UNKNOWN
 from ddco_pyro.data.pictures import resized
@@ -90,15 +91,14 @@ def import_demonstrations(
     paths = [Path(source)] if isinstance(source, str | Path) else [*source]
     pooled = open_pooled(paths, form, choice.actions, choice.where) if len(paths) > 1 else None
     with pooled or open_source(paths[0], form, choice.actions, choice.where) as whole:
-        table, counts, notes = None, dict[str, int](), list[str]()
+        labels, notes, about = Labelled(), list[str](), dict[str, Attribute]()
         if choice.labels:
             whole = replace(whole, frequency=choice.labels.rate or whole.frequency)
-            table = labels_of_table(choice.labels, whole)
-            whole = replace(whole, read=partial(_labelled, whole, table.labels))
-            counts, notes = {labels: len(each) for labels, each in table.labels.items()}, table.notes
+            labels, label_names, notes = labels_of_table(choice.labels, whole)
+            whole = replace(whole, read=partial(_labelled, whole, labels))
+            about[LABEL_NAMES] = json.dumps(label_names)
         names, masks, rate = _names(whole, choice), dict[str, tuple[str, ...]](), choice.hz or whole.frequency
-        about = {**whole.attributes, **({FREQUENCY: rate} if rate else {})}
-        about |= {LABEL_NAMES: table.names} if table else {}
+        about = {**whole.attributes, **({FREQUENCY: rate} if rate else {}), **about}
         about |= {"source": ", ".join(path.name for path in paths), "source_format": whole.format}
         alone = _of_some_tasks(whole, names)
         chosen = partial(_chosen, whole, choice=choice, alone=alone)
@@ -126,7 +126,7 @@ def import_demonstrations(
             kept = {mask: tuple(name for name in members if name in data) for mask, members in whole.masks.items()}
             masks |= {mask: members for mask, members in kept.items() if members}
     reasons = {name: str(error) for name, error in left_out.items()}
-    return Imported(out, written, reasons, tuple(notes), counts)
+    return Imported(out, written, reasons, tuple(notes), {key: len(each) for key, each in labels.items()})
 
 
 def _of_some_tasks(source: Source, names: Sequence[str]) -> dict[str, str]:
