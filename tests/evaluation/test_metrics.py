@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 
 import numpy as np
 import pytest
@@ -77,6 +78,7 @@ def test_a_single_held_out_demonstration_has_no_error_and_every_file_is_json(tmp
     read = strictly((tmp_path / "run" / "metrics.json").read_text())
     for metrics in (run.metrics, again.metrics, Metrics.model_validate(read)):
         assert metrics.comparison["flat"].difference.standard_error is None
+        assert pickle.loads(pickle.dumps(metrics)) == metrics  # processes hand it over
     assert "(1 held-out demonstration is too few for an error" in verdicts.verdict(run.metrics)
     page = write_report(run, run.demonstrations).read_text()
     assert "± –" in page
