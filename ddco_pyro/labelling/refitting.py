@@ -52,7 +52,9 @@ def refit(
     :param kept: the option that each step begins with whatever the recogniser finds, [T], by demonstration; below 1 for
         none.
     """
-    spec, before, demos = refit_spec(trained, level, count), trained.hierarchy, labelled(demos, labels)
+    spec, before = refit_spec(trained, level, count), trained.hierarchy
+    said = tuple(replace(demo, labels={SAID: labels[demo.name]}) for demo in demos)
+    demos = replace(demos, demonstrations=said, masks={})  # all train
     with one_thread():
         if before.depth > 1 or not _by_em(trained):
             return fit(spec, _tuned(spec, demos), on_event=on_event)
@@ -118,9 +120,3 @@ def refit_spec(trained: Fit, level: str, count: int) -> Spec:
 
 def _by_em(trained: Fit) -> bool:
     return optimizer_of(trained.spec.training.optimizer, trained.hierarchy) == "em"
-
-
-def labelled(demos: Demonstrations, labels: Mapping[str, np.ndarray]) -> Demonstrations:
-    """The demonstrations with a person's labels alone, all to train with."""
-    each = tuple(replace(demo, labels={SAID: labels[demo.name]}) for demo in demos)
-    return replace(demos, demonstrations=each, masks={})
