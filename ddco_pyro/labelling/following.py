@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Sequence
 from contextlib import ExitStack
 from functools import cached_property, lru_cache
@@ -41,7 +40,8 @@ class Following:
 
     def __init__(self, path: Path, demos: Demonstrations, trajectory: Sequence[PathSpec] | None) -> None:
         self.path, self.demos, self.paths, self.opened = path, demos, trajectory or (), ExitStack()
-        self.names: dict[str, list[str]] = json.loads(str(demos.attributes.get(DIMENSION_NAMES, "{}")))
+        known: dict[str, list[str]] = json.loads(str(demos.attributes.get(DIMENSION_NAMES, "{}")))
+        self.names = {f"{key}[{n}]": f"{key} {name}" for key, names in known.items() for n, name in enumerate(names)}
         self.cameras, self.block = lru_cache(KEPT)(self._cameras), lru_cache(KEPT)(self._block)
         self.lock = Lock()
 
@@ -67,18 +67,11 @@ class Following:
         """Numbers and paths of a demonstration, and the names of its cameras."""
         demo = self.demos[index]
         (found,) = following([demo], [], len(demo), self.paths)
-        numbers = found.get("n")
-        if numbers:
-            numbers = {**numbers, "names": [self._named(name) for name in numbers["names"]]}
+        if numbers := found.get("n"):
+            numbers = {**numbers, "names": [self.names.get(name, name) for name in numbers["names"]]}
         with self.lock:
             cameras = [*self.cameras(index)]
         return {"numbers": numbers, "paths": found.get("paths"), "view": found.get("view"), "cameras": cameras}
-
-    def _named(self, name: str) -> str:
-        """A number such as ``state[2]``, by the name of its dimension where there is one."""
-        key, place = re.fullmatch(r"(.*?)(?:\[(\d+)\])?", name).groups()  # type: ignore[union-attr]
-        names = self.names.get(key, [])
-        return f"{key} {names[int(place)]}" if place and int(place) < len(names) else name
 
     def picture(self, index: int, camera: int, step: int) -> bytes:
         """The picture of a step as JPEG.
