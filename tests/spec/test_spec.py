@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -99,7 +100,7 @@ DEEP = "not valid YAML: nested too deeply"
         ("seed: 1\ntask: [a\n", "line 3, column 1: not valid YAML: expected ',' or ']', but got '<stream end>'"),
         ("seed: 1\ntask: a\nseed: 2\n", "line 3, column 1: not valid YAML: key 'seed' is given twice"),
         ("a: *b\n", "line 1, column 4: not valid YAML: found undefined alias 'b'"),
-        pytest.param("[" * 5000, DEEP, id="opened"),
+        pytest.param("[" * 1000, DEEP, id="opened"),
         ("a: &a [1, *a]", DEEP),
         ("seed: !!python/name:os.system\n", "could not determine a constructor for the tag"),
         (b"\x89HDF\r\n\x1a\n\x00\x00", "not valid YAML: "),
@@ -350,9 +351,10 @@ ODD = (None, True, -1, 10**40, 1e-320, float("nan"), "", "x" * 9999, "a:b:c", "\
 def test_an_odd_value_anywhere_is_read_or_refused_in_lines() -> None:
     """Never a traceback; the value is written into each place of the example in turn."""
     problems: list[str] = []
-    for number in range(len([*places(yaml.safe_load(EXAMPLE))])):
+    example = yaml.safe_load(EXAMPLE)
+    for number in range(len([*places(example)])):
         for value in ODD:
-            data = yaml.safe_load(EXAMPLE)
+            data = deepcopy(example)
             node, key = [*places(data)][number]
             node[key] = value
             try:
