@@ -15,7 +15,6 @@ from targets import targets, velocities
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
 from ddco_pyro.exporting.runner import Runner
-from ddco_pyro.segmenting import baselines
 from ddco_pyro.spec import SpecError, parse_spec, with_overrides
 
 ABSOLUTE = targets(velocities())
@@ -88,14 +87,6 @@ def test_its_export_gives_targets(fits: Fits, form: str, tmp_path: Path) -> None
     for step in range(10):
         seen = {key: rows[step] for key, rows in ABSOLUTE[4].observations.items()}
         np.testing.assert_allclose(runner.act(seen), controller.act(seen), atol=1e-6)
-
-
-def test_baselines_of_segments_read_the_differences() -> None:
-    asked: dict[str, Any] = {"count": 3, "seed": 0, "observations": RELATIVE.observations}
-    ours = baselines.segment("kmeans", ABSOLUTE, ABSOLUTE, **asked, relative_to="gripper")
-    theirs = baselines.segment("kmeans", BY_HAND, BY_HAND, **asked)
-    for one, other in zip(ours, theirs, strict=True):
-        np.testing.assert_array_equal(one, other)
 
 
 # --- what is not possible ---------------------------------------------------------------------------------------------
