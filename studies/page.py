@@ -91,6 +91,7 @@ class Numbers:
     """The numbers of a page, families of differences in ``.csv`` files, and verdicts on these and primary contrasts."""
 
     tables: dict[str, tuple[Study | None, pd.DataFrame]] = field(default_factory=dict)
+    estimates: dict[Any, Estimate | None] = field(default_factory=dict)
     families: dict[Any, dict[Any, Estimate]] = field(default_factory=lambda: defaultdict(dict))
     verdicts: dict[Any, str] = field(default_factory=dict)
 
@@ -144,13 +145,15 @@ class Numbers:
         (source, what, measure, counts, task), times = named, float(settings.get("times", 1))
         study, table = self.table(source)
         taken = tuple((column, settings[column]) for column in ("study", "seed") if column in settings)
-        for column, value in taken:
-            first, _, last = value.partition("-") if column == "seed" else (value, "", "")
-            those = [*map(str, range(int(first), int(last) + 1))] if last else [value]
-            table = table[table[column].isin(those)]
-        if (known := estimated(study, table, what, measure, counts, task, times)) is None:
-            return ""
         key = source, taken, what, measure, counts, task
+        if (key, times) not in self.estimates:
+            for column, value in taken:
+                first, _, last = value.partition("-") if column == "seed" else (value, "", "")
+                those = [*map(str, range(int(first), int(last) + 1))] if last else [value]
+                table = table[table[column].isin(those)]
+            self.estimates[key, times] = estimated(study, table, what, measure, counts, task, times)
+        if (known := self.estimates[key, times]) is None:
+            return ""
         difference, verdict = " - " in what, self.verdicts.get(key, NOT_TESTED)
         show = settings.get("show") or ("interval" if alone or difference else "mean")
         if show in ("interval", "±", "verdict") and difference and study is None:
