@@ -177,9 +177,10 @@ def window(rows, width, past=False):
     return np.stack([rows[max(t - width, 0) : t + 1 + (0 if past else width)].mean(0) for t in range(len(rows))])
 
 
-def features(demo, past=False):
-    """Those of a demonstration whose observation and control are neither standardised nor of other dimensions."""
-    actions = np.concatenate([np.zeros((1, 2)), demo.actions[:-1]]) if past else demo.actions
+def features(demo, mean=None):
+    """Those of a demonstration that are not standardised; of the past with the mean of controls before the first."""
+    past = mean is not None
+    actions = np.concatenate([mean[None], demo.actions[:-1]]) if past else demo.actions
     rows = np.concatenate([demo.observations["state"], actions], axis=1)
     return np.concatenate([rows, *(window(rows, width, past) for width in WIDTHS)], axis=1)
 
@@ -199,7 +200,7 @@ def recognised():
     return demos, make_trainer(spec, demos, None)
 
 
-def recogniser_of_sklearn(demos, past=False):
+def recogniser_of_sklearn(demos, mean=None):
     from sklearn.linear_model import LogisticRegression
     from sklearn.pipeline import make_pipeline
     from sklearn.preprocessing import StandardScaler
@@ -207,7 +208,7 @@ def recogniser_of_sklearn(demos, past=False):
     known = [demo for demo in demos if (demo.labels["phase"] >= 0).any()]
     rows, labels = (
         np.concatenate([part[demo.labels["phase"] >= 0] for demo, part in zip(known, each, strict=True)])
-        for each in ([features(demo, past) for demo in known], [demo.labels["phase"] for demo in known])
+        for each in ([features(demo, mean) for demo in known], [demo.labels["phase"] for demo in known])
     )
     regression = LogisticRegression(C=1 / RECOGNISER["ridge"], max_iter=500)
     return make_pipeline(StandardScaler(), regression).fit(rows, labels), np.array(
@@ -218,13 +219,14 @@ def recogniser_of_sklearn(demos, past=False):
 @pytest.mark.parametrize("past", [False, True])
 def test_it_is_the_regression_of_scikit_learn_on_windows(recognised, past):
     demos, trainer = recognised
-    truth, share = recogniser_of_sklearn(demos, past)
     model = trainer.hierarchy
+    mean = model.scaling.shift.numpy() if past else None
+    truth, share = recogniser_of_sklearn(demos, mean)
     batch = encode(demos, model.encoder, model.scaling)
     windows = model.recogniser.past if past else model.recogniser.around
     ratio = windows.log_ratio(windows.features(batch.inputs, batch.actions, batch.lengths))
     for demo, own in zip(demos, ratio.numpy(), strict=True):
-        expected = np.maximum(truth.predict_log_proba(features(demo, past)), -12) - np.log(share)
+        expected = np.maximum(truth.predict_log_proba(features(demo, mean)), -12) - np.log(share)
         np.testing.assert_allclose(own[: len(demo), 1:3], expected, atol=1e-4)
         np.testing.assert_array_equal(own[: len(demo), [0, 3]], 0.0)  # of control, and of the option without labels
 
