@@ -14,7 +14,8 @@ import ddco_pyro
 from ddco_pyro import OptionSegmenter
 from ddco_pyro.errors import BadInput
 
-QUICK = {"training.epochs": 6, "training.starts": ["vq_controls"]}
+ONE_START = {"training.starts": ["vq_controls"]}
+QUICK = {"training.epochs": 6, **ONE_START}
 
 
 def two_options(number: int = 5, steps: int = 16, seed: int = 0) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -39,7 +40,7 @@ def hidden_markov_model() -> GaussianHMM:
 
 @pytest.fixture(scope="module")
 def fitted() -> OptionSegmenter:
-    return OptionSegmenter(2, random_state=3).fit(*two_options())
+    return OptionSegmenter(2, random_state=3, settings=ONE_START).fit(*two_options())
 
 
 def test_it_is_the_fit_of_its_spec(fitted: OptionSegmenter) -> None:
@@ -138,7 +139,7 @@ def test_the_data_that_people_hold_are_taken(kind: str, fitted: OptionSegmenter)
     given = KINDS[kind](pytest.importorskip(package), *two_options())
     assert fitted.score(*given) == pytest.approx(fitted.score(*two_options()))
     given = KINDS[kind](pytest.importorskip(package), *two_options())
-    again = OptionSegmenter(np.int64(2), random_state=np.int64(3)).fit(*given)
+    again = OptionSegmenter(np.int64(2), random_state=np.int64(3), settings=ONE_START).fit(*given)
     np.testing.assert_array_equal(again.predict(*two_options()), fitted.predict(*two_options()))
 
 
@@ -222,7 +223,7 @@ NOT_OF_SEQUENCES = {
 
 
 @parametrize_with_checks(
-    [RowsAlone(2, settings={"training.epochs": 2, "training.starts": ["vq_controls"]})],
+    [RowsAlone(2, settings={**QUICK, "training.epochs": 2})],
     expected_failed_checks=lambda _: NOT_OF_SEQUENCES,
 )
 def test_the_checks_of_scikit_learn(estimator: Any, check: Any) -> None:
