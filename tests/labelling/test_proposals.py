@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from oracle import paths
-from planted import make_spec, make_truth, plant
+from planted import in_units_of, make_spec, make_truth, plant
 
 import ddco_pyro
 from ddco_pyro.fitting.fitted import Fit
@@ -146,7 +146,7 @@ def test_a_demonstration_that_is_held_out_is_proposed_as_if_nothing_were_said_of
 def begun(demos, count, **training):
     """A first fit by EM, whose options have numbers of their own."""
     training = {"optimizer": {"name": "em"}, "starts": ["vq_controls"], "tune_fraction": 0.0, **training}
-    return ddco_pyro.fit(make_spec((count,), epochs=30, **training), demos)
+    return ddco_pyro.fit(in_units_of(make_spec((count,), epochs=30, **training), demos, 0.1), demos)
 
 
 def after(fit, demos, said, count):

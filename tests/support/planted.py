@@ -43,10 +43,10 @@ def make_spec(counts=(2,), seed=0, control=None, **training):
     return small_spec(counts, control=control or {"std": 0.1}, training=training, seed=seed)
 
 
-def in_units_of(spec, demos):
+def in_units_of(spec, demos, sigma=SIGMA):
     """A spec with the truth's σ in the units to which the controls of these demonstrations are scaled."""
     spreads = np.concatenate([demo.actions for demo in demos]).std(0)
-    parts = [{"name": f"x{d}", "dims": [d], "kind": "gaussian", "std": SIGMA / own} for d, own in enumerate(spreads)]
+    parts = [{"name": f"x{d}", "dims": [d], "kind": "gaussian", "std": sigma / own} for d, own in enumerate(spreads)]
     return with_overrides(spec, {"control.parts": parts})
 
 
