@@ -50,7 +50,7 @@ def in_memory(commanded: Path) -> ddco_pyro.Fit:
 
 # --- the same questions as the command asks ---------------------------------------------------------------------------
 
-READ = "log_likelihood", "draws", "monitor"
+READ = "log_likelihood", "segment", "draws"
 """Methods of a fit that take demonstrations."""
 
 

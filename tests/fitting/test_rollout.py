@@ -59,8 +59,8 @@ def test_an_episode_records_what_was_seen_before_each_control():
     assert (policy.seeds, len(record), record.name) == ([3], toy_task.STEPS, "demo_3")
     np.testing.assert_array_equal(record.actions, CONTROLS)
     for t, observation in enumerate(policy.seen):
-        for key, value in observation.items():
-            np.testing.assert_array_equal(record.observations[key][t], value)
+        for key, values in record.observations.items():
+            np.testing.assert_array_equal(values[t], observation[key])
     steps = -np.diff(record.observations["offsets"][:, :2], axis=0)
     np.testing.assert_allclose(steps, toy_task.SPEED * CONTROLS[:-1])
 
