@@ -1,6 +1,9 @@
 """A LeRobot dataset is labelled as it is, and labels are read back by this project's reader and by LeRobot itself."""
 
+import json
+import os
 import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +19,7 @@ from ddco_pyro.labelling.team import Team
 from ddco_pyro.spec import parse_spec
 
 HERE = Path(__file__).parents[1]
+TOOLS = Path(os.environ.get("DDCO_PYRO_TOOLS", HERE.parent / ".venv-tools")) / "bin" / "python"
 LINEAR = {"network": "linear"}
 SPEC = {
     "observations": ["state"],
@@ -104,3 +108,26 @@ def test_a_folder_of_something_else_is_refused(begin, tmp_path):
     (tmp_path / "mine").mkdir()
     with pytest.raises(BadInput, match="is not a labelled copy of"):
         begin(tmp_path / "mine")
+
+
+READ = """
+import json, sys
+from lerobot.datasets import LeRobotDataset
+from lerobot.datasets.language_render import active_at
+dataset = LeRobotDataset("ddco/labelled", root=sys.argv[1], video_backend="pyav")
+for frame in map(dataset.__getitem__, range(11)):
+    rows, now = frame["language_persistent"], float(frame["timestamp"])
+    active = active_at(now, persistent=rows, style="subtask", role="assistant")
+    print(json.dumps([active and active["content"], int(frame["subtask_source"]), frame["subtask_annotator"]]))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not TOOLS.exists(), reason="LeRobot is not installed: make tools")
+def test_lerobot_reads_the_subtask_of_each_frame(begin, tmp_path):
+    labelled(begin(tmp_path / "out"))
+    command, offline = [str(TOOLS), "-c", READ, str(tmp_path / "out")], {**os.environ, "HF_HUB_OFFLINE": "1"}
+    read = subprocess.run(command, capture_output=True, text=True, check=True, env=offline).stdout
+    found = [json.loads(line) for line in read.splitlines() if line.startswith("[")]
+    assert [own[0] for own in found] == ["reach"] * 2 + [None] + ["lift"] * 2 + [None] * 3 + ["lift"] * 3
+    assert [own[1:] for own in found[:3]] == [[3, "ann"], [3, "ann"], [1, ""]]

@@ -1,5 +1,7 @@
 """The page of ``label`` in a browser: what keys and the mouse do, and what a person sees of it."""
 
+import subprocess
+import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -8,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import h5py
+import httpx2
 import numpy as np
 import pytest
 
@@ -271,17 +274,41 @@ def test_an_undo_goes_to_the_demonstration_that_it_changes(tab, session):
 
 
 LATE = """
-const real = window.fetch;
+const real = window.fetch, kept = [];
+window.held = null;
 window.wait = () => 0;
+window.release = () => { window.held = null; kept.splice(0).forEach(done => done()); };
 window.fetch = async (...asked) => {
-  const answer = await real(...asked);
+  const held = window.held && new RegExp(window.held).test(asked[0]), answer = await real(...asked);
+  if (held) await new Promise(done => kept.push(done));
   await new Promise(done => setTimeout(done, window.wait()));
   return answer;
 };
 """
-"""Delays every answer, once ``wait`` says for how long."""
+"""Holds answers to what is asked while ``held`` matches it, until they are released, and delays every answer."""
 
 SHUFFLED = "let seed = 1; window.wait = () => (seed = seed * 16807 % 2147483647) % 100"
+
+
+def test_an_answer_that_comes_late_changes_nothing(tabs, session):
+    with served(session) as address:
+        tab = tabs(address, LATE)
+        heading, first = tab.get_by_role("heading", level=2), session.state()["order"][0]
+        playwright.expect(heading).to_have_text(f"demo_{first}")
+        tab.get_by_role("slider", name="Step").focus()
+        tab.evaluate(f"window.held = 'view/{first}$'")
+        session.edit({"do": "split", "demo": (first + 1) % 6, "step": 3})  # as another tab does; the page asks anew
+        tab.wait_for_timeout(1500)
+        tab.evaluate("window.held = null")
+        keys(tab, "2", "Enter")
+        playwright.expect(heading).not_to_have_text(f"demo_{first}")
+        second = heading.text_content()
+        tab.evaluate("release()")
+        tab.wait_for_timeout(300)
+        assert heading.text_content() == second
+        keys(tab, "Enter")
+        playwright.expect(heading).not_to_have_text(second)
+        assert set(session.document.accepted) == {f"demo_{first}", second}
 
 
 def test_enter_accepts_one_after_the_other_in_whichever_order_answers_come(tabs, session):
@@ -462,6 +489,54 @@ def test_the_picture_is_that_of_the_step_at_the_cursor(tabs, run, tmp_path):
     session.close()
 
 
+@pytest.mark.slow
+def test_a_server_killed_during_an_edit_loses_nothing_that_it_acknowledged(tabs, run, file, tmp_path):
+    place = [str(run.folder), str(file), "--out", str(tmp_path / "labels.hdf5"), "--no-browser"]
+
+    @contextmanager
+    def program():
+        command = [sys.executable, "-m", "ddco_pyro.cli", "label", *place]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+            try:
+                yield process, process.stdout.readline().strip()
+            finally:
+                process.kill()
+
+    acknowledged = set()
+
+    with program() as (process, address):
+
+        def answered(response):
+            if response.url.endswith("/edit") and response.ok:
+                acknowledged.add(response.request.post_data_json["step"])
+                if len(acknowledged) == 3:  # the next one is under way
+                    process.kill()
+
+        tab = tabs(address)
+        tab.on("response", answered)
+        tab.get_by_role("slider", name="Step").focus()
+        first = state_of(address)["order"][0]
+        before = starts_of(address, first)
+        for _ in range(12):
+            keys(tab, "ArrowRight", "s")
+        playwright.expect(tab.get_by_role("alert")).to_contain_text("start it again", timeout=6 * SOON)
+    assert 3 <= len(acknowledged) < 10
+    with program() as (_, address):
+        kept = starts_of(address, first) - before
+        assert acknowledged - before <= kept
+        assert len(kept - acknowledged) <= 1
+        playwright.expect(tabs(address).get_by_role("button", name="Undo")).to_be_enabled()
+
+
+def state_of(address):
+    return httpx2.get(f"{address}level/0/state", trust_env=False).json()
+
+
+def starts_of(address, demo):
+    """The first steps of the shown segments of a demonstration."""
+    return {start for start, *_ in state_of(address)["demos"][demo]["strip"]}
+
+
 @pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.slow)])
 def test_axe_has_no_serious_complaint(browser, session, scheme):
     axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe-playwright-python is not installed")
@@ -474,6 +549,7 @@ def test_axe_has_no_serious_complaint(browser, session, scheme):
             found = axe.Axe().run(tab).response["violations"]
             return [(one["id"], one["nodes"][0]["html"]) for one in found if one["impact"] in ("serious", "critical")]
 
+        assert complaints() == []
         tab.get_by_role("slider", name="Step").focus()
         keys(tab, "0")
         said(tab, "Left open")
