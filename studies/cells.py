@@ -256,6 +256,7 @@ class Folder:
         baseline, given, added = method.baseline, study.changes(cell.of, cell.point), dict[str, Any]()
         if study.base is None:
             added = {"template": hashlib.sha256(TEMPLATE.read_bytes()).hexdigest()[:16]}
+            given = {"demonstrations.leave_one_out": False, **given}  # keys of earlier results have it
         else:
             spec = with_overrides(study.base, {**given, **_placed(cell, "demonstrations.hdf5")})
             baseline = baseline and named_baselines(spec).get(baseline.kind, baseline)
