@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 
 from ddco_pyro.data.arrays import is_picture
+from ddco_pyro.data.coincidences import NEARLY, TURNS
 from ddco_pyro.data.controls import MOST_DIMENSIONS, few, listed
 from ddco_pyro.data.demonstration import Demonstration
 from ddco_pyro.data.tasks import are_several, task_of
@@ -39,8 +41,17 @@ RESTS = 0.4
 
 These are .5 and more of grippers' steps, and at most .32 of others', whose sign depends on where an object is."""
 
+JUMP = 2.0
+"""Numbers jump if they change by so many times their usual largest change, and any other change of the demonstration.
+
+Where recordings are joined, a quarter of the moving numbers and two at least do so at once."""
+
 OTHER_RATE = 0.05
 """Rates are of other data if their logarithms differ by more."""
+
+FASTER = 2.0
+"""Where no rate is known, another one makes steps longer by this factor at least, and demonstrations shorter by about
+as much."""
 
 SAMPLED = 200
 """Steps of each demonstration, about, by which a control's range is judged."""
@@ -53,15 +64,19 @@ EXCLUDE = "; exclude such ones (demonstrations.exclude)"
 class Traits:
     """What is compared of a demonstration.
 
+    :param steps: their number.
     :param sampled: some of its controls [S, A].
-    :param sizes: by place, the size, the span and the mean change in a step of each number [3, D].
+    :param sizes: by place, the size, the span, and the mean and the largest change in a step of each number [4, D].
+    :param jumps: by place, the step of each largest change; -1 where another is nearly as large [D].
     :param correlations: by place, of each control with each number, its change, and for ``actions`` time [A, F].
     """
 
     name: str
     task: str
+    steps: int
     sampled: np.ndarray
     sizes: Mapping[str, np.ndarray]
+    jumps: Mapping[str, np.ndarray]
     correlations: Mapping[str, np.ndarray]
 
 
@@ -69,9 +84,10 @@ class Traits:
 class Usual:
     """What the demonstrations of a fit have in common.
 
-    :param statistics: by place, the lowest, the median and the highest of each of the sizes of a number [3, 3, D].
+    :param statistics: by place, the lowest, the median and the highest of each of the sizes of a number [3, 4, D].
     :param correlations: of each control dimension with observations and time [A, F].
     :param agreement: the cosine with these that nine in ten demonstrations exceed [A].
+    :param steps: the median number of steps.
     :param frequency: control steps per second, Hz; None if unknown.
     :param unlike: why demonstrations are unlike the others, by name.
     """
@@ -79,6 +95,7 @@ class Usual:
     statistics: dict[str, list[list[list[float]]]]
     correlations: list[list[float]]
     agreement: list[float]
+    steps: float
     frequency: float | None
     unlike: dict[str, str]
 
@@ -95,7 +112,7 @@ def traits_of(name: str, task: str, arrays: Mapping[str, np.ndarray]) -> Traits:
 
     Wide arrays do not count.
     """
-    control, sizes, correlations = np.zeros((0, 0)), {}, {}
+    control, sizes, jumps, correlations = np.zeros((0, 0)), {}, {}, {}
     for place, array in sorted(arrays.items(), key=lambda item: item[0] != "actions"):
         rows = np.nan_to_num(array.reshape(len(array), -1).astype(np.float64), posinf=0, neginf=0)
         if rows.shape[1] > MOST_DIMENSIONS:
@@ -103,19 +120,25 @@ def traits_of(name: str, task: str, arrays: Mapping[str, np.ndarray]) -> Traits:
         control = rows if place == "actions" else control
         with np.errstate(over="ignore", invalid="ignore"):
             after = np.concatenate([rows[1:], rows[-1:]])
-            largest = np.abs(rows).max(0), np.ptp(rows, axis=0), np.abs(after - rows).mean(0)
-            sizes[place] = np.nan_to_num(np.stack(largest), posinf=0)
+            changes = np.abs(after - rows)
+            moves = np.where(_turned(rows, after, changes), 0, changes)
+            second, largest = np.partition(np.concatenate([0 * rows[:1], moves]), -2, axis=0)[-2:]
+            jumps[place] = np.where(largest > JUMP * second, moves.argmax(0), -1)
+            each = np.abs(rows).max(0), np.ptp(rows, axis=0), changes.mean(0), largest
+            sizes[place] = np.nan_to_num(np.stack(each), posinf=0)
             phase = np.cos(np.pi * np.outer(np.arange(len(rows)) / len(rows), (1, 2, 3)))
             around = phase if place == "actions" else np.concatenate([rows, after - rows], axis=1)
             correlations[place] = _correlations(control, around)
-    return Traits(name, task, control[:: 1 + len(control) // SAMPLED], sizes, correlations)
+    steps = len(control)
+    return Traits(name, task, steps, control[:: 1 + steps // SAMPLED], sizes, jumps, correlations)
 
 
 def usual(known: Sequence[Traits], frequency: float | None) -> Usual:
     """What demonstrations have in common; ``frequency`` is their rate, Hz."""
     extremes = {place: np.quantile(each, (0, 0.5, 1), axis=0).tolist() for place, each in _sizes(known).items()}
     reference, agreement = _agreement(known)
-    return Usual(extremes, reference.tolist(), np.quantile(agreement, 0.1, axis=0).tolist(), frequency, unlike(known))
+    least = np.quantile(agreement, 0.1, axis=0).tolist()
+    return Usual(extremes, reference.tolist(), least, _steps(known), frequency, unlike(known))
 
 
 def unlike(known: Sequence[Traits], usual: Usual | None = None, frequency: float | None = None) -> dict[str, str]:
@@ -130,7 +153,8 @@ def unlike(known: Sequence[Traits], usual: Usual | None = None, frequency: float
     if len(known) < (LEAST if usual is None else 1):
         return {}
     reasons = dict[str, str]()
-    for why, names in (*_other_units(known, usual), *_reversed(known, usual), *_other_rate(known, usual, frequency)):
+    found = _other_units(known, usual), _reversed(known, usual), _other_rate(known, usual, frequency)
+    for why, names in (*chain(*found), *_joined(known, usual)):
         reasons |= {name: why for name in names if name not in reasons}
     return reasons
 
@@ -148,7 +172,7 @@ def _other_units(known: Sequence[Traits], usual: Usual | None) -> Iterator[tuple
     """Numbers in other units."""
     found: dict[tuple[str, tuple[str, ...]], dict[str, list[int]]] = {}
     for place, each in _sizes(known).items():
-        for dim, own in enumerate(np.moveaxis(each, 2, 0)):
+        for dim, own in enumerate(np.moveaxis(each[:, :3], 2, 0)):
             others = _larger_part(own) if usual is None else np.array(usual.statistics[place])[:, :3, dim]
             others = others[others.min(1) > 0]
             if len(others) > (len(own) // 2 if usual is None else 0):
@@ -179,8 +203,42 @@ def _other_rate(
     known: Sequence[Traits], usual: Usual | None, frequency: float | None
 ) -> Iterator[tuple[str, Sequence[str]]]:
     """All demonstrations, where their rate is not that of the fit."""
-    if usual and usual.frequency and frequency and abs(math.log(frequency / usual.frequency)) > OTHER_RATE:
-        yield f"{frequency:g} Hz, and {usual.frequency:g} Hz in the fit", [one.name for one in known]
+    if usual is None:
+        return
+    names = [one.name for one in known]
+    if usual.frequency and frequency:
+        if abs(math.log(frequency / usual.frequency)) > OTHER_RATE:
+            yield f"{frequency:g} Hz, and {usual.frequency:g} Hz in the fit", names
+        return
+    seen = {place: np.median(sizes[:, 2], axis=0) for place, sizes in _sizes(known).items() if place != "actions"}
+    with np.errstate(all="ignore"):
+        ratios = np.concatenate([[1.0], *(own / usual.statistics[place][1][2] for place, own in seen.items())])
+    faster = float(np.median(ratios[np.isfinite(ratios) & (ratios > 0)]))
+    shorter = usual.steps / _steps(known)
+    if max(faster, 1 / faster) >= FASTER and 1 / FASTER < faster / shorter < FASTER:
+        yield f"steps are {faster:.2g} times as long as in the fit, perhaps at another rate", names
+
+
+def _joined(known: Sequence[Traits], usual: Usual | None) -> Iterator[tuple[str, Sequence[str]]]:
+    """Two recordings in a demonstration: observations that jump together."""
+    if not (places := [place for place in _shared(known) if place != "actions"]):
+        return
+    changes = np.stack([np.concatenate([one.sizes[place][3] for place in places]) for one in known])
+    usually = np.concatenate([usual.statistics[place][1][3] for place in places]) if usual else np.median(changes, 0)
+    found: dict[str, int] = {}
+    for one, largest in zip(known, changes, strict=True):
+        at = np.concatenate([one.jumps[place] for place in places])
+        together = np.bincount(at[(at >= 0) & (usually > 0) & (largest > JUMP * usually)])
+        if together.max(initial=0) >= max(2, np.count_nonzero(usually) / 4):
+            found[one.name] = int(together.argmax()) + 1
+    if found and (usual or 2 * len(found) <= len(known)):
+        first, step = next(iter(found.items()))
+        yield f"observations jump at once, in {first} at step {step}: perhaps two recordings are joined", [*found]
+
+
+def _steps(known: Sequence[Traits]) -> float:
+    """The median number of steps."""
+    return float(np.median([one.steps for one in known]))
 
 
 def _shared(known: Sequence[Traits]) -> list[str]:
@@ -189,7 +247,7 @@ def _shared(known: Sequence[Traits]) -> list[str]:
 
 
 def _sizes(known: Sequence[Traits]) -> dict[str, np.ndarray]:
-    """The sizes [N, 3, D] of each array that all demonstrations have."""
+    """The sizes [N, 4, D] of each array that all demonstrations have."""
     return {place: np.stack([one.sizes[place] for one in known]) for place in _shared(known)}
 
 
@@ -237,6 +295,14 @@ def _larger_part(sizes: np.ndarray) -> np.ndarray:
     rows = sizes[sizes[:, 0].argsort()][np.count_nonzero(sizes[:, 0] == 0) :]
     cut = int(np.diff(np.log(rows[:, 0])).argmax()) + 1 if len(rows) > 1 else 0
     return max(rows[:cut], rows[cut:], key=len)
+
+
+def _turned(rows: np.ndarray, after: np.ndarray, changes: np.ndarray) -> np.ndarray:
+    """Whether numbers change by a turn of an angle, or to nearly their negative as those of a quaternion [T, D]."""
+    turned = np.abs(after + rows) < (1 - NEARLY) * changes
+    for turn in TURNS.values():
+        turned |= np.abs(changes - turn) < (1 - NEARLY) * turn
+    return turned
 
 
 def _correlations(controls: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -37,6 +37,17 @@ def reversed_gripper(demo: Demonstration, other: Demonstration) -> tuple[dict[st
     return seen(demo), demo.actions * [1, 1, 1, -1]
 
 
+def joined(demo: Demonstration, other: Demonstration) -> tuple[dict[str, Any], np.ndarray]:
+    observed = {key: np.concatenate([array, other.observations[key]]) for key, array in seen(demo).items()}
+    return observed, np.concatenate([demo.actions, other.actions])
+
+
+def third(demo: Demonstration, other: Demonstration) -> tuple[dict[str, Any], np.ndarray]:
+    """At a third of the rate."""
+    steps = demo.actions[::3] * [3, 3, 3, 1]
+    return {key: array[::3] for key, array in seen(demo).items()}, steps
+
+
 def moved(demo: Demonstration, other: Demonstration) -> tuple[dict[str, Any], np.ndarray]:
     """With the origin elsewhere."""
     return {key: array + 3.0 * (key != "jaw") for key, array in seen(demo).items()}, demo.actions
@@ -53,6 +64,7 @@ FAULTS: dict[str, tuple[Change, str, str]] = {
     ),
     "degrees": (scaled(57.3, "gripper"), "obs/gripper", "57.3 times as large as {}, perhaps degrees for radians"),
     "gripper": (reversed_gripper, "control dimension 3", "the other sign than {}, perhaps reversed"),
+    "joined": (joined, "observations jump at once, in demo_3 at step 4", "perhaps two recordings are joined"),
 }
 
 
@@ -112,7 +124,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 OTHERS: dict[str, tuple[Change, str, str]] = {
-    **{name: FAULTS[name] for name in ("millimetres", "gripper")},
+    **{name: FAULTS[name] for name in ("millimetres", "gripper", "joined")},
+    "rate": (third, "steps are 2.", "times as long as {}, perhaps at another rate"),
     "origin": (moved, "-", "nats a step, and"),
 }
 
@@ -120,11 +133,12 @@ OTHERS: dict[str, tuple[Change, str, str]] = {
 @pytest.mark.parametrize("name", OTHERS)
 def test_segment_names_demonstrations_unlike_those_of_the_fit(name: str, run: Path, tmp_path: Path) -> None:
     change, what, why = OTHERS[name]
-    path = tmp_path / "demos.hdf5"
-    spoilt(pick_and_place(6, seed=1), change, (3, 5)).write(path)
+    path, which = tmp_path / "demos.hdf5", range(6) if name == "rate" else (3, 5)
+    spoilt(pick_and_place(6, seed=1), change, which).write(path)
     ended = call("segment", run, path, "--csv", tmp_path / "segments.csv")
     (line,) = (line for line in ended.err.splitlines() if line.startswith("note: "))
-    assert line.startswith(f"note: unlike the demonstrations of the fit: demo_3, demo_5 (2 of 6): {what}")
+    members = "demo_0, demo_1, demo_2, ... (6 of 6)" if name == "rate" else "demo_3, demo_5 (2 of 6)"
+    assert line.startswith(f"note: unlike the demonstrations of the fit: {members}: {what}")
     assert why.format("in the fit") in line
     assert (tmp_path / "segments.csv").exists()
 
