@@ -13,6 +13,7 @@ from urllib.parse import unquote, urlsplit
 import numpy as np
 import pandas as pd
 
+from ddco_pyro.data.controls import few
 from ddco_pyro.data.labels import UNKNOWN, label_names
 from ddco_pyro.data.sources import Source
 from ddco_pyro.errors import BadInput, nearest
@@ -115,7 +116,7 @@ def _segments(table: pd.DataFrame, said: Mapping[str, str]) -> tuple[pd.DataFram
 
     :param said: the columns by role that the user named.
     """
-    notes = list[str]()
+    table, notes = _aggregated(table)
     for name in said.values():
         if name not in table:
             raise BadInput(f"has no column {name!r}{nearest(name, table)}; there is: {', '.join(table)}")
@@ -137,6 +138,28 @@ def _segments(table: pd.DataFrame, said: Mapping[str, str]) -> tuple[pd.DataFram
     words = {word for side in ("start", "stop") for word in re.split(r"[^a-z]+", columns[side].lower())}
     units = [unit for unit, its_words in UNITS.items() if its_words & words]
     return rows, "seconds" if "ss" in words else units[0] if len(units) == 1 else None, notes
+
+
+def _aggregated(table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
+    """BORIS' tabular events as its aggregated ones: a row for each START with the STOP that is next of its behavior.
+
+    Other tables stay. Events without a partner are left out, and a line names them.
+    """
+    ends = ["START", "STOP"]
+    kind = next((name for name in ("Behavior type", "Status") if name in table and table[name].isin(ends).any()), "")
+    if not kind or not {"Observation id", "Subject", "Behavior", "Time"} <= {*table}:
+        return table, []
+    times = _numbers(table, "Time")
+    table = table.assign(**{"Behavior type": table[kind], "Start (s)": times, "Stop (s)": times})
+    events = table[table[kind].isin(ends)].sort_values("Start (s)", kind="stable")
+    of_behavior = events.groupby(["Observation id", "Subject", "Behavior"], sort=False)
+    starts = (events[kind] == "START") & (of_behavior[kind].shift(-1) == "STOP")
+    stops = (events[kind] == "STOP") & (of_behavior[kind].shift(1) == "START")
+    alone = events[~starts & ~stops]
+    states = events.assign(**{"Stop (s)": of_behavior["Stop (s)"].shift(-1), "Behavior type": "STATE"})[starts]
+    named = alone["Observation id"] + ": " + alone["Behavior"] + " " + alone[kind] + " at " + alone["Time"]
+    notes = [f"left out {len(alone)} events without a partner: {few([*named])}"] if len(alone) else []
+    return pd.concat([states, table.drop(events.index)]).sort_index(), notes
 
 
 def _states(rows: pd.DataFrame, table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:

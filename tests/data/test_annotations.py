@@ -132,6 +132,39 @@ def test_boris(tmp_path, name, text):
     ]
 
 
+EVENTS = [  # of BORIS' tabular events: behavior, modifier, what it is, time
+    ("reach", "", "STOP", 5.2),
+    ("reach", "slow", "START", 5.3),
+    ("beep", "", "POINT", 5.4),
+    ("reach", "", "STOP", 5.8),
+    ("grasp", "", "START", 5.8),
+    ("grasp", "", "STOP", 6.1),
+    ("grasp", "", "START", 6.1),
+    ("grasp", "", "START", 6.2),
+    ("grasp", "", "STOP", 6.3),
+    ("lift", "", "START", 6.4),
+]
+
+
+@pytest.mark.parametrize("kind", ["Behavior type", "Status"])
+def test_boris_events_are_pairs_by_behavior(tmp_path, kind):
+    """Events without a partner are named and lose nothing else. Another demonstration has events at the same times."""
+    each = [(f"demo_{n}", "5", "No focal subject", *event) for event in EVENTS for n in (0, 1)]
+    columns = ["Observation id", "Time offset (s)", "Subject", "Behavior", "Modifier #1", kind, "Time"]
+    pd.DataFrame(each, columns=columns).to_csv(tmp_path / "a.csv", index=False)
+    names, found, notes = labels({"demo_0": 16, "demo_1": 14}, tmp_path / "a.csv")
+    assert names == {"behavior": ["reach", "grasp"]}
+    for name, steps in (("demo_0", 16), ("demo_1", 14)):
+        expected = ["", "", "", *["reach"] * 5, *["grasp"] * 3, "", "grasp", *[""] * 3][:steps]
+        assert found[name]["behavior"] == expected
+    assert notes == [
+        "left out 6 events without a partner: demo_0: reach STOP at 5.2, demo_1: reach STOP at 5.2, "
+        "demo_0: grasp START at 6.1, ...",
+        "left out 2 point events, which last no step",
+        "left out the modifiers of 2 rows: a label is a behavior alone",
+    ]
+
+
 def series(name, start, end):
     return {"start": start, "end": end, "instant": False, "timeserieslabels": [name] if name else []}
 
@@ -174,8 +207,6 @@ def plain(*rows, start="start_s", stop="stop_s"):
     return pd.DataFrame(rows, columns=["demonstration", "label", start, stop]).to_csv(index=False)
 
 
-BORIS_EVENTS = "Observation id,Subject,Behavior,Behavior type,Time\ndemo_1,,reach,START,0.1\ndemo_1,,reach,STOP,0.4\n"
-"""Tabular ones, with a row for each end of a segment."""
 COLUMNS = {"columns": {"start": "start_s", "stop": "stop_s"}}
 REACH = ("demo_1", "reach", 0.1, 0.4)
 
@@ -197,7 +228,7 @@ REACH = ("demo_1", "reach", 0.1, 0.4)
         (plain(REACH, start="start", stop="stop"), {}, "does not say the unit of its times; add --unit seconds, mill"),
         (plain(REACH, stop="stop_ms"), {"columns": {"start": "start_s", "stop": "stop_ms"}},
          "does not say the unit of its times"),
-        (BORIS_EVENTS, {}, "say what they are with --columns start=COLUMN,stop=COLUMN"),
+        (exported(("demo_1", REGIONS)), {}, "does not say the unit of its times"),
         (exported(("demo_1", REGIONS), tag="a/b"), {"unit": "steps"}, "'a/b' cannot be a name of labels"),
         (exported(("demo_1", [series("reach", 0, 3), series("grasp", 2, 5)])), {"unit": "steps"},
          "demo_1: label: grasp and another segment overlap at step 2"),
