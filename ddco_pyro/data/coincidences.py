@@ -144,13 +144,15 @@ class Beside:
 
     @property
     def clock(self) -> bool:
-        """Whether the observation is one number that rises as a clock does."""
+        """Whether the observation is one number that rises as a clock does; one that is called so may step back."""
         if self.seen[0].shape[1] != 1:
             return False
         steps = [np.diff(rows[:LOOKED_AT, 0].astype(np.float64)) for rows in self.seen if len(rows) > 2]
-        named = self.place.rpartition("/")[2] in CLOCKS
-        rise = ((each >= 0).all() and each.any() for each in steps)
-        return bool(steps) and all(rise) and (named or all(np.ptp(each) <= EVEN * np.median(each) for each in steps))
+        if not steps or not all(each.any() for each in steps):
+            return False
+        if self.place.rpartition("/")[2] in CLOCKS:
+            return all(np.median(each) >= 0 for each in steps)
+        return all(each.min() >= 0 and np.ptp(each) <= EVEN * np.median(each) for each in steps)
 
     @property
     def reason(self) -> str:

@@ -7,13 +7,14 @@ import math
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ddco_pyro.data.arrays import LARGEST, NUMBERS, LazyArray, Observed, blocks, is_picture, network_input, usable
-from ddco_pyro.data.coincidences import Beside, Jumps, copies, generated, jumps
+from ddco_pyro.data.coincidences import CLOCKS, Beside, Jumps, copies, generated, jumps
 from ddco_pyro.data.controls import (
     FEWEST,
     MOST_DIMENSIONS,
@@ -33,8 +34,15 @@ from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.labels import UNKNOWN, label_names
 from ddco_pyro.data.likeness import EXCLUDE, Traits, reasons_told, traits_of, unlike
 from ddco_pyro.data.sources import Source, open_source
+from ddco_pyro.data.sources.metadata import clock_fault
 from ddco_pyro.data.tasks import Where, are_several, by_task, task_of
 from ddco_pyro.spec import ControlSpec
+
+GAP = 3.0
+"""A clock among observations has a gap where a step is so many times as long as the median; computers are late."""
+
+SLOWEST = 0.2
+"""Control steps per second, Hz, below which a period may be in milliseconds: dt of 5 and more."""
 
 
 @dataclass
@@ -177,6 +185,8 @@ class Inspection:
     :param relative_to: the observation of which the control is a target; None without one.
     :param excluded: names of demonstrations that were skipped.
     :param unreadable: names of demonstrations that could not be read.
+    :param clocks: a line for the first fault of each clock among observations, and for a rate that may be a period in
+        milliseconds.
     :param turns: the angles and quaternions that jump, by place of the array.
     :param odd: names of demonstrations that are dead, unlike the others, or change the kind of a control dimension, and
         why.
@@ -198,6 +208,7 @@ class Inspection:
     excluded: tuple[str, ...] = ()
     unreadable: list[str] = field(default_factory=list)
     odd: Mapping[str, str] = field(default_factory=dict)
+    clocks: tuple[str, ...] = ()
     turns: dict[str, Jumps] = field(default_factory=dict)
     attributes: dict[str, Mapping[str, Attribute]] = field(default_factory=dict)
     where: Where = field(default_factory=dict)
@@ -218,6 +229,7 @@ class Inspection:
         return [
             *self.exclusions,
             *followed,
+            *self.clocks,
             *notes(self.control),
             *self.coincidences,
             *leaks,
@@ -321,6 +333,7 @@ class _Inspector:
         )
         found.problems = [*kinds, *_problems_of_division(self.source), *_problems(found)]
         self._coincidences(controls)
+        found.clocks = (*_slow(found.frequency), *self._clocks())
 
     def _coincidences(self, controls: Mapping[str, np.ndarray]) -> None:
         """What of the demonstrations coincides, and the control minus what it is a target of."""
@@ -350,6 +363,13 @@ class _Inspector:
                 found.turns[place] = turning
                 lines += turning.notes(place)
         found.coincidences = tuple(lines)
+
+    def _clocks(self) -> Iterator[str]:
+        """A line for the first fault of each clock among observations."""
+        for place, each in self.vectors.items():
+            if place.rpartition("/")[2] in CLOCKS and self.found.fields[place].minimum.shape == (1,):
+                faults = ((name, clock_fault(rows[:, 0].astype(float), GAP)) for name, rows in each.items())
+                yield from islice((f"{place} {fault}, in {name}" for name, fault in faults if fault), 1)
 
     def _odd(self, dimensions: Sequence[ControlDimension], controls: Mapping[str, np.ndarray]) -> dict[str, str]:
         """Names of demonstrations to exclude, and why.
@@ -420,6 +440,13 @@ def _vector(place: str, array: Observed) -> bool:
     """Whether an array is the control, or an observation of few numbers that is read whole."""
     narrow = place == "actions" or math.prod(array.shape[1:]) <= MOST_DIMENSIONS
     return array.dtype.kind in NUMBERS and narrow and not is_picture(array)
+
+
+def _slow(frequency: float | None) -> Iterator[str]:
+    """A line for a rate that may be a period in milliseconds."""
+    if frequency and frequency <= SLOWEST:
+        said = f'if its dt is in milliseconds, write file.attrs["control_frequency"] = {1000 * frequency:.4g}'
+        yield f"a step lasts {1 / frequency:.4g} s by the file: {said}"
 
 
 def _problems_of_division(source: Source) -> Iterator[str]:

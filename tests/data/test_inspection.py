@@ -14,6 +14,7 @@ from odd_files.hdf5 import instead
 from odd_files.kinds import ROWS, twins, write
 from random_demonstrations import demonstrations
 
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.inspection import inspect
 from ddco_pyro.spec import load_spec
 
@@ -265,3 +266,38 @@ def test_an_odd_demonstration_is_named_and_left_out(name: str, spoilt: tuple[int
 def test_what_many_demonstrations_do_is_not_odd(name: str, tmp_path: Path) -> None:
     many = range(0, 20, 2)
     assert not inspect(recorded(tmp_path / "demos.hdf5", ODD[name][0], many)).odd
+
+
+def test_a_period_in_milliseconds_is_asked_about(tmp_path: Path) -> None:
+    path = write(tmp_path / "demos.hdf5")
+    with h5py.File(path, "r+") as file:
+        file.attrs["dt"] = 33
+    line = 'a step lasts 33 s by the file: if its dt is in milliseconds, write file.attrs["control_frequency"] = 30.3'
+    assert line in inspect(path).notes
+    with h5py.File(path, "r+") as file:
+        file.attrs["dt"] = 2
+    assert not [note for note in inspect(path).notes if "a step lasts" in note]
+
+
+CLOCKS = {
+    "a gap": ([0.0, 0.1, 0.2, 0.6, 0.7], "obs/timestamp has a gap before row 3: 0.2, then 0.6, in demo_1"),
+    "a step back": ([0.0, 0.1, 0.2, 0.1, 0.3], "obs/timestamp steps back in row 3: 0.2, then 0.1, in demo_1"),
+    "a repeated stamp": (
+        [0.0, 0.1, 0.1, 0.2, 0.3],
+        "obs/timestamp repeats its stamp in row 2: 0.1, then 0.1, in demo_1",
+    ),
+    "late": ([0.0, 0.1, 0.23, 0.3, 0.4], ""),
+}
+
+
+@pytest.mark.parametrize(("times", "line"), CLOCKS.values(), ids=CLOCKS)
+def test_the_fault_of_a_clock_is_named(times: list[float], line: str, tmp_path: Path) -> None:
+    demos = [
+        Demonstration(f"demo_{number}", {"timestamp": clock, "place": np.eye(5)}, np.eye(5, 2))
+        for number, clock in enumerate(map(np.array, ([0.0, 0.1, 0.2, 0.3, 0.4], times)))
+    ]
+    Demonstrations(tuple(demos)).write(tmp_path / "demos.hdf5")
+    assert "obs/timestamp" in inspect(tmp_path / "demos.hdf5").leaks
+    assert [note for note in inspect(tmp_path / "demos.hdf5").notes if "timestamp" in note and "row" in note] == [
+        line
+    ] * bool(line)

@@ -42,14 +42,14 @@ LONGEST_GAP = 1.5
 """A clock has a gap where a step is longer than LONGEST_GAP × the median step."""
 
 
-def clock_fault(times: np.ndarray) -> str:
+def clock_fault(times: np.ndarray, longest: float = LONGEST_GAP) -> str:
     """The first gap, step back or repeated stamp of a clock [T], in words; empty without any.
 
     >>> clock_fault(np.array([0.0, 0.1, 0.2, 0.5, 0.6]))
     'has a gap before row 3: 0.2, then 0.5'
     """
     steps = np.diff(times)
-    wrong = np.flatnonzero((steps <= 0) | (steps > LONGEST_GAP * np.median(steps)))
+    wrong = np.flatnonzero((steps <= 0) | (steps > longest * np.median(steps)))
     if not len(wrong):
         return ""
     at = int(wrong[0])
