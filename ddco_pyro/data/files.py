@@ -76,7 +76,8 @@ class Output:
 def check_outputs(outputs: Sequence[Output], inputs: Sequence[Path] = ()) -> None:
     """Refuse outputs that cannot be written, before a command starts to work. Nothing is changed.
 
-    :param inputs: files and folders that the command reads; no output may be or lie in one of them.
+    :param inputs: files and folders that the command reads; no output may be or lie in one of them, or in what links in
+        them lead to.
     :raises NotWritable: an output has an impossible name, is of another kind, cannot be written, is an input, or
         coincides with another output.
     :raises NoSpace: the disk is full.
@@ -89,10 +90,11 @@ def check_outputs(outputs: Sequence[Output], inputs: Sequence[Path] = ()) -> Non
             _check_kind(output)
             _check_writable(output)
         for path in inputs:
-            if _same(output.path, path):
-                raise output.refused("is what this command reads")
-            if path.is_dir() and Path(os.path.realpath(path)) in output.place.parents:
-                raise output.refused(f"lies in {path}, which this command reads")
+            for read in _places(path):
+                if _same(output.path, read):
+                    raise output.refused("is what this command reads")
+                if read.is_dir() and read in output.place.parents:
+                    raise output.refused(f"lies in {path}, which this command reads")
         if output.kind == "stream" and _is_hdf5(output.path):
             raise output.refused("is an HDF5 file, which this would replace", "choose another place or remove it first")
         for other in outputs[:number]:
@@ -102,6 +104,16 @@ def check_outputs(outputs: Sequence[Output], inputs: Sequence[Path] = ()) -> Non
                 other.place in output.place.parents or output.place in other.place.parents
             ):
                 raise output.refused(f"and {other.option} {other.path} lie in one another")
+
+
+def _places(path: Path) -> set[Path]:
+    """What a file or folder leads to: itself, and what links in it lead to, with all links resolved."""
+    places, new = set[Path](), {Path(os.path.realpath(path))}
+    while new:
+        places |= new
+        links = {link for place in new for link in place.rglob("*") if link.is_symlink()}
+        new = {Path(os.path.realpath(link)) for link in links} - places
+    return places
 
 
 def _same(one: Path, other: Path) -> bool:

@@ -41,6 +41,9 @@ def inputs(toy_run, tmp_path_factory) -> Path:
         (folder / f"hard-{name}").hardlink_to(folder / name)
     (folder / "link-run").symlink_to(folder / "run")
     (folder / "loop").symlink_to(folder / "loop")
+    (folder / "linked").mkdir()
+    for name in ("file", "folder", "linked"):
+        (folder / "linked" / name).symlink_to(folder / name)
     return folder
 
 
@@ -109,6 +112,14 @@ def test_a_file_of_the_run_is_no_output(inputs: Path, monkeypatch) -> None:
     before = snapshot(inputs)
     for place in ("run/model.safetensors", "run/new", "link-run/spec.yaml"):
         refused(call("segment", "run", "demos.hdf5", "--csv", place), "lies in run, which this command reads")
+    assert snapshot(inputs) == before
+
+
+def test_what_a_link_in_an_input_leads_to_is_no_output(inputs: Path, monkeypatch) -> None:
+    monkeypatch.chdir(inputs)
+    before = snapshot(inputs)
+    for place, says in {"file": READ, "folder/new": "lies in linked, which this command reads"}.items():
+        refused(call("segment", "run", "linked", "--csv", place), says)
     assert snapshot(inputs) == before
 
 
