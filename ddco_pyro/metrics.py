@@ -20,12 +20,13 @@ from pydantic import (
     PlainSerializer,
     TypeAdapter,
     ValidationError,
+    model_validator,
 )
 
 from ddco_pyro.data.controls import ControlDimension
 from ddco_pyro.data.files import Damaged, json_text, write_text
 from ddco_pyro.errors import command
-from ddco_pyro.spec.base import lines
+from ddco_pyro.spec.base import invalid, lines
 
 T = TypeVar("T")
 
@@ -515,6 +516,14 @@ class Confusion(Record):
     options: list[int]
     steps: list[list[Annotated[int, Field(ge=0)]]]
     matched: list[int | None]
+
+    @model_validator(mode="after")
+    def _whole(self) -> Confusion:
+        widths = {len(self.matched), *map(len, self.steps)}
+        whole = widths == {len(self.options)} and len(self.steps) == len(self.labels)
+        if not whole or {*self.matched} - {None, *self.labels}:
+            raise invalid(("", "is no table of labels by options"))
+        return self
 
 
 class Agreement(Record):

@@ -60,11 +60,14 @@ def test_damaged_metrics(run: Path) -> None:
     whole = path.read_text()
     data = json.loads(whole)
     many = whole.replace('"parameters": ', '"parameters": "many", "was": ')
+    (table,) = data["agreement"]["confusion"]
+    tables = {**data["agreement"], "confusion": [{**table, "steps": table["steps"][:-1]}]}
     for content, what in (
         (whole[: len(whole) // 2], "is no JSON: EOF while parsing"),
         ("[]", "must be a mapping (key: value), got []"),
         (many, "comparison.flat.parameters: must be a whole number, got 'many'"),
         (json.dumps(data | {"options": [[*data["options"][0], data["options"][0][-1]]]}), "is not about levels with 2"),
+        (json.dumps(data | {"agreement": tables}), "agreement.confusion.0: is no table of labels by options"),
         ('{"model": NaN}', ""),
     ):
         path.write_text(content)
