@@ -1,4 +1,4 @@
-"""Names of models, options and labels, as people read them."""
+"""Names of models, options and labels, and the colours of options: the same in every figure, frame and film."""
 
 from __future__ import annotations
 
@@ -68,3 +68,25 @@ def choice_names(count: int, named: Sequence[str] = ()) -> tuple[str, ...]:
     :param named: the names of the options; empty where they have none.
     """
     return option_name(0), *(named or map(option_name, range(1, 1 + count)))
+
+
+# --- colours ---------------------------------------------------------------------------------------------------------
+
+CONTROL = "#9a9a9a"
+
+OPTIONS = (
+    "#3f90da", "#e76300", "#332288", "#ecd83c", "#882255", "#7fd8f0", "#5c3317", "#bd1f01", "#a96b59", "#000000",
+)  # fmt: skip
+"""Any two of the first five and the grey of control are more than 23 apart in CIELAB, for normal sight and for readers
+without red, green or blue cones. All ten are more than 18 apart."""
+
+
+def option_colour(choice: int) -> str:
+    """Hex colour of choice 1 to k; control (0) is grey. The ten colours repeat."""
+    return CONTROL if choice == 0 else OPTIONS[(choice - 1) % len(OPTIONS)]
+
+
+def option_rgb(choice: int) -> tuple[int, int, int]:
+    """The colour of a choice as red, green and blue, 0 to 255."""
+    red, green, blue = bytes.fromhex(option_colour(choice)[1:])
+    return red, green, blue

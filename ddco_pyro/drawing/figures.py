@@ -13,10 +13,10 @@ import numpy as np
 from markupsafe import Markup
 
 from ddco_pyro.data.files import write_text
-from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.drawing.page import Drawing
 from ddco_pyro.drawing.shown import LINES, jpeg
 from ddco_pyro.metrics import Difference
+from ddco_pyro.names import option_colour
 
 WIDTH = 900
 """Units across a drawing as wide as the page."""

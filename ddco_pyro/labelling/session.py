@@ -24,7 +24,6 @@ from ddco_pyro.data.likeness import traits
 from ddco_pyro.data.sources import Source, format_of, open_source
 from ddco_pyro.data.sources.metadata import FREQUENCY
 from ddco_pyro.data.tasks import Where, with_task
-from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.drawing.timeline import text
 from ddco_pyro.errors import BadInput, reason
 from ddco_pyro.evaluation.inferred import Inferred, runs, within
@@ -46,7 +45,7 @@ from ddco_pyro.labelling.proposals import (
 )
 from ddco_pyro.labelling.refitting import refit
 from ddco_pyro.labelling.team import Team, agreement, taken
-from ddco_pyro.names import option_name
+from ddco_pyro.names import option_colour, option_name
 from ddco_pyro.segmenting.formats import FORMATS, Asked, check_format, write_format
 from ddco_pyro.segmenting.formats.labels import check_copy, check_labels
 from ddco_pyro.segmenting.segments import Segmented

@@ -9,7 +9,6 @@ from markupsafe import Markup
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.labels import label_names
-from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.drawing.figures import MOST_PATHS, paths_of_options, save
 from ddco_pyro.drawing.page import Block, Cell, Section, Table, Text, footnote, note
 from ddco_pyro.drawing.shown import in_words
@@ -19,7 +18,7 @@ from ddco_pyro.evaluation.agreement import EQUAL, EXPLAINED, agreement_table, to
 from ddco_pyro.evaluation.verdicts import contributions, recogniser
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Confusion, Scores
-from ddco_pyro.names import label_name, numbered_name, option_name
+from ddco_pyro.names import label_name, numbered_name, option_colour, option_name
 from ddco_pyro.report.skills import Shown, agreeing
 from ddco_pyro.segmenting.page import HOW, use_by_task
 from ddco_pyro.segmenting.segments import Segmented

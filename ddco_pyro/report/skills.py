@@ -10,7 +10,6 @@ import numpy as np
 
 from ddco_pyro.data.arrays import Observed
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.drawing.colours import option_colour, option_rgb
 from ddco_pyro.drawing.figures import curves, data_uri, picture, transition_graph, typical_paths
 from ddco_pyro.drawing.page import (
     Block,
@@ -30,7 +29,7 @@ from ddco_pyro.drawing.words import duration, number, percent
 from ddco_pyro.evaluation.options import diagnose
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Alike, NamedByLabel, Use
-from ddco_pyro.names import numbered_name, option_name
+from ddco_pyro.names import numbered_name, option_colour, option_name, option_rgb
 from ddco_pyro.report.inputs import deciding
 from ddco_pyro.segmenting.segments import Segmented
 from ddco_pyro.simulation.film import encoded

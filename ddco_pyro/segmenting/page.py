@@ -15,13 +15,12 @@ from ddco_pyro.data.arrays import Observed
 from ddco_pyro.data.demonstrations import Demonstration
 from ddco_pyro.data.files import write_text
 from ddco_pyro.data.labels import BOUNDARY, SOURCE, SOURCES, UNKNOWN
-from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.drawing.page import Block, Cell, Page, Section, Table, Text, footnote, note
 from ddco_pyro.drawing.timeline import Timelines, coded, following
 from ddco_pyro.drawing.words import NAT, duration, number, percent
 from ddco_pyro.evaluation.agreement import EXPLAINED, agreement_table, tolerances
 from ddco_pyro.evaluation.options import on_paths
-from ddco_pyro.names import label_name, numbered_name, option_name
+from ddco_pyro.names import label_name, numbered_name, option_colour, option_name
 from ddco_pyro.segmenting.segments import Segmented, Segments
 from ddco_pyro.spec import PathSpec
 

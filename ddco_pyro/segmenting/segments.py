@@ -19,13 +19,13 @@ from ddco_pyro.data.labels import BOUNDARY, SOURCE, label_names
 from ddco_pyro.data.likeness import Traits, traits
 from ddco_pyro.data.sources import Source, open_source
 from ddco_pyro.data.tasks import are_several, of_tasks, with_task
-from ddco_pyro.drawing.colours import option_colour
 from ddco_pyro.evaluation.agreement import EQUAL, of_equal_lengths
 from ddco_pyro.evaluation.agreement import agreement as scores_of
 from ddco_pyro.evaluation.inferred import Inferred, runs
 from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Scores
+from ddco_pyro.names import option_colour
 
 
 @dataclass(frozen=True)

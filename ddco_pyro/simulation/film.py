@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ddco_pyro.data.files import whole_file
-from ddco_pyro.drawing.colours import option_rgb
-from ddco_pyro.names import option_name
+from ddco_pyro.names import option_name, option_rgb
 from ddco_pyro.simulation.episodes import Episode
 
 FRAMES_PER_SECOND = 3

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from ddco_pyro.data.demonstrations import Demonstration
-from ddco_pyro.drawing.colours import CONTROL, OPTIONS, option_rgb
 from ddco_pyro.drawing.figures import transition_graph, typical_paths
 from ddco_pyro.drawing.shown import projection
+from ddco_pyro.names import CONTROL, OPTIONS, option_rgb
 from ddco_pyro.report.skills import Instance, film_of, instances, sheet_of, transitions
 from ddco_pyro.segmenting.segments import LevelLabels, Segmented, Segments
 from ddco_pyro.simulation.episodes import Episode
