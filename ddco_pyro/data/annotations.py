@@ -57,6 +57,9 @@ def labels_of_table(table: LabelTable, source: Source) -> tuple[Labelled, dict[s
     names, found = label_names(source.attributes), Labelled()
     try:
         rows, unit, notes = _segments(_read(table.path), table.columns)
+        rows = rows[rows["label"].str.strip() != ""]
+        if rows.empty:
+            raise BadInput("; ".join(("names no segment", *notes)))
         rows = _in_steps(rows, table.unit or unit, source.frequency)
         rows["demonstration"] = [_demonstration(name, source.names) for name in rows["demonstration"]]
         for labels, of_labels in rows.groupby("labels", sort=False):
@@ -158,7 +161,7 @@ def _aggregated(table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
     alone = events[~starts & ~stops]
     states = events.assign(**{"Stop (s)": of_behavior["Stop (s)"].shift(-1), "Behavior type": "STATE"})[starts]
     named = alone["Observation id"] + ": " + alone["Behavior"] + " " + alone[kind] + " at " + alone["Time"]
-    notes = [f"left out {len(alone)} events without a partner: {few([*named])}"] if len(alone) else []
+    notes = [f"left out events without a partner ({len(alone)}): {few([*named])}"] if len(alone) else []
     return pd.concat([states, table.drop(events.index)]).sort_index(), notes
 
 
@@ -206,10 +209,7 @@ REGIONS = ("timeserieslabels", "timelinelabels", "labels")
 
 
 def _in_steps(rows: pd.DataFrame, unit: str | None, rate: float | None) -> pd.DataFrame:
-    """The segments that have a label, in whole steps; ``stop`` is exclusive."""
-    rows = rows[rows["label"].str.strip() != ""]
-    if rows.empty:
-        raise BadInput("names no segment")
+    """The segments in whole steps; ``stop`` is exclusive."""
     if unit is None:
         raise BadInput("does not say the unit of its times; add --unit seconds, milliseconds or steps")
     if unit != "steps" and rate is None:

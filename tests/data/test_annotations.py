@@ -158,7 +158,7 @@ def test_boris_events_are_pairs_by_behavior(tmp_path, kind):
         expected = ["", "", "", *["reach"] * 5, *["grasp"] * 3, "", "grasp", *[""] * 3][:steps]
         assert found[name]["behavior"] == expected
     assert notes == [
-        "left out 6 events without a partner: demo_0: reach STOP at 5.2, demo_1: reach STOP at 5.2, "
+        "left out events without a partner (6): demo_0: reach STOP at 5.2, demo_1: reach STOP at 5.2, "
         "demo_0: grasp START at 6.1, ...",
         "left out 2 point events, which last no step",
         "left out the modifiers of 2 rows: a label is a behavior alone",
@@ -222,6 +222,8 @@ REACH = ("demo_1", "reach", 0.1, 0.4)
         (plain(("demo_1", "grasp", 0.4, 0.41)), COLUMNS, "grasp at step 4 is shorter than a step; remove or lengthen"),
         (plain(("demo_1", "grasp", 0.4, "00:01")), COLUMNS, "row 1: the stop '00:01' is no number; correct it"),
         (plain(("demo_1", "", 0, 1)), COLUMNS, "names no segment"),
+        ("Observation id,Subject,Behavior,Behavior type,Time\ndemo_1,,reach,STOP,0.4\n", {},
+         "names no segment; left out events without a partner (1): demo_1: reach STOP at 0.4"),
         (plain(REACH), {}, "its columns are demonstration, label, start_s, stop_s; say what they are with --columns "
          "start=COLUMN,stop=COLUMN"),
         (plain(REACH), {"columns": {"label": "skil"}}, "has no column 'skil'; there is: demonstration, label, start_s"),
