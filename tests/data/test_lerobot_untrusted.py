@@ -63,6 +63,7 @@ def test_the_hubs_cache_is_read_and_copied(tmp_path: Path, run: Path) -> None:
     for number, path in enumerate(path for path in sorted(dataset.rglob("*")) if path.is_file()):
         path.rename(hub / "blobs" / str(number))
         path.symlink_to(hub / "blobs" / str(number))
+    (dataset / "loop").symlink_to(dataset)
     before = snapshot(tmp_path)
     assert call("import", dataset, "--out", tmp_path / "demos.hdf5").status == 0
     assert Demonstrations.read(tmp_path / "demos.hdf5").lengths == (5, 6, 7, 8)

@@ -90,10 +90,15 @@ def test_a_copy_has_the_labels_in_its_language_with_source_and_annotator(begin, 
     assert ("demo_3" in table, "demo_2" in table) == (True, False)
 
 
-def test_in_place_keeps_videos_and_anyone_goes_on_with_the_labels(begin, dataset):
+def test_in_place_keeps_videos_and_what_links_lead_to_and_anyone_goes_on_with_the_labels(begin, dataset):
+    for name in ("data", "meta"):
+        (dataset / name).rename(dataset.with_name(name))
+        (dataset / name).symlink_to(dataset.with_name(name))
+    linked = [contents(dataset.with_name(name)) for name in ("data", "meta")]
     videos = [path.stat().st_ino for path in dataset.rglob("*.mp4")]
     session = begin(dataset)
     labelled(session)
+    assert [contents(dataset.with_name(name)) for name in ("data", "meta")] == linked
     assert [path.stat().st_ino for path in dataset.rglob("*.mp4")] == videos
     assert session.state()["warnings"] == []
     session.journal.close()

@@ -78,7 +78,9 @@ def _copied(asked: Asked, segmented: Segmented) -> Iterator[tuple[LeRobot, dict[
     """
     with whole_folder(asked.out) as temporary:
         folder = LeRobot(asked.demos).folder
-        shutil.copytree(folder, temporary, dirs_exist_ok=True, copy_function=_link, ignore_dangling_symlinks=True)
+        shutil.copytree(
+            folder, temporary, ignore=_loops, copy_function=_link, ignore_dangling_symlinks=True, dirs_exist_ok=True
+        )
         runs = {int(demo.name.removeprefix("demo_")): (demo, asked.runs(demo)) for demo in segmented.segments}
         yield LeRobot(temporary), runs
 
@@ -207,6 +209,12 @@ def write_stages(asked: Asked, segmented: Segmented) -> str:
         path = dataset.folder / "meta" / "temporal_proportions_dense.json"
         write_text(path, json.dumps(proportions, indent=2, ensure_ascii=False) + "\n")
     return str(asked.out)
+
+
+def _loops(folder: str, names: list[str]) -> list[str]:
+    """The links to a folder around them, which a copy would follow without end."""
+    here = Path(os.path.realpath(folder))
+    return [name for name in names if Path(os.path.realpath(here / name)) in (here, *here.parents)]
 
 
 def _link(source: str, target: str) -> None:
