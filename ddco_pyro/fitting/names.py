@@ -71,6 +71,15 @@ def read_names(folder: Path, spec: Spec) -> Named | None:
         raise BadInput(f"{path}: {error}") from None
 
 
+def proposed_by_library(spec: Spec) -> Named:
+    """The names that the run of a spec's library has now; empty without a library, its run or names.
+
+    :raises BadInput: the names do not fit the spec.
+    """
+    library = spec.training.library
+    return (read_names(Path(library.run), spec) or {}) if library else {}
+
+
 def write_names(folder: Path, named: Named) -> None:
     """Write ``names.yaml``."""
     text = "# The names of options 1 to k of each level, to be edited by hand; ddco-pyro report shows them.\n"

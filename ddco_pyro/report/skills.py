@@ -28,6 +28,7 @@ from ddco_pyro.drawing.shown import frames, in_words, positions, projection
 from ddco_pyro.drawing.words import duration, number, percent
 from ddco_pyro.evaluation.options import diagnose
 from ddco_pyro.fitting.fitted import Fit
+from ddco_pyro.fitting.names import proposed_by_library
 from ddco_pyro.metrics import Alike, NamedByLabel, Use
 from ddco_pyro.names import numbered_name, option_colour, option_name, option_rgb
 from ddco_pyro.report.inputs import deciding
@@ -182,6 +183,7 @@ def section(fit: Fit, every: Sequence[Skill], shown: Shown, segmented: Segmented
     """Every option of every level, the highest level first, then the order of the options."""
     reads = deciding(fit, shown.demos)
     blocks: list[Block] = [note(shown.explained())]
+    tasks, proposed = sorted({demo.task for demo in segmented.segments}), proposed_by_library(fit.spec)
     whole = {
         (one.level, one.choice): one
         for one in diagnose(fit.metrics.options, segments=fit.metrics.segments)
@@ -201,7 +203,11 @@ def section(fit: Fit, every: Sequence[Skill], shown: Shown, segmented: Segmented
                 "Comes after": _frequent(counts[:, choice], [*names, "start"]),
                 "Comes before": _frequent(counts[choice], [*names, "end"]),
             }
+            if len(tasks) > 1:
+                facts["Tasks"] = _frequent(np.array([_steps_in(one, segmented, task) for task in tasks]), tasks)
             facts |= {f"Label {labels}, agreement": told for labels, told in one.labels.items()}
+            if choice and level not in fit.named and (known := proposed.get(level)):
+                facts["Name in the library, a proposal"] = known[choice - 1]
             if near := _nearest(choice, fit.metrics.divergences[place], names):
                 facts["Most like"] = near
             if finding := whole.get((1 + place, choice)):
@@ -235,8 +241,13 @@ def _nearest(choice: int, pairs: Sequence[Alike], names: Sequence[str]) -> str:
     return f"{option_name(first if second == choice else second, names)}, {number(apart)} nats per step apart"
 
 
+def _steps_in(skill: Skill, segmented: Segmented, task: str) -> int:
+    """Steps of an option in the demonstrations of a task."""
+    return sum(len(one) for one in skill.found if segmented.segments[one.row].task == task)
+
+
 def _frequent(counts: np.ndarray, names: Sequence[str]) -> str:
-    """The two most frequent neighbours with their shares."""
+    """The two most frequent ones with their shares."""
     first = np.argsort(-counts, kind="stable")[:2]
     return ", ".join(f"{names[place]} {percent(counts[place] / counts.sum())}" for place in first if counts[place])
 

@@ -14,6 +14,7 @@ import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.planted import pick_and_place
 from ddco_pyro.fitting.library import STRENGTHS
+from ddco_pyro.fitting.names import write_names
 from ddco_pyro.training import prior
 
 LINEAR = {"network": "linear"}
@@ -67,6 +68,12 @@ def test_one_demonstration_and_a_library_are_enough(library, tmp_path):
     assert adapted.spec.hierarchy == run.spec.hierarchy
     for name, value in run.hierarchy.encoder.state_dict().items():
         assert (adapted.hierarchy.encoder.state_dict()[name] == value).all()
+    write_names(library / "run", {"option": ("reach", "grasp", "carry")})
+    assert call("report", tmp_path / "run").status == 0
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert [name for name in ("reach", "grasp", "carry") if f">{name}<" in page]
+    assert not (tmp_path / "run" / "names.yaml").exists()  # they are proposed alone
+    (library / "run" / "names.yaml").unlink()
     others = Demonstrations(tuple(task(5, 6)[1:]))
     assert adapted.log_likelihood(others).sum() > run.log_likelihood(others).sum()
 
