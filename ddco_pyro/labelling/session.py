@@ -316,6 +316,7 @@ class Session:
             demos = [
                 {
                     "name": name,
+                    "task": task,
                     "steps": document.lengths[name],
                     "accepted": name in document.accepted,
                     "labelled": int(document.said(name).sum()),
@@ -329,7 +330,7 @@ class Session:
                     "done_by": [other for other, own in others.items() if name in own.accepted],
                     "strip": [[own.start, own.option, own.source] for own in self.segments[name]],
                 }
-                for place, name in enumerate(names)
+                for place, (name, task) in enumerate(zip(names, self.demos.tasks, strict=True))
             ]
             return {
                 "title": self.path.name,

@@ -290,6 +290,21 @@ window.fetch = async (...asked) => {
 SHUFFLED = "let seed = 1; window.wait = () => (seed = seed * 16807 % 2147483647) % 100"
 
 
+def test_demonstrations_are_found_by_their_task(tabs, run, tmp_path):
+    path = tmp_path / "demos.hdf5"
+    tasks = ("push", "open", "push", "close", "push")
+    demos = (replace(demo, attributes={"task": task}) for demo, task in zip(pick_and_place(5), tasks, strict=True))
+    Demonstrations(tuple(demos)).write(path)
+    session = Session(replace(run, named={}), path, tmp_path / "labels.hdf5")
+    with served(session) as address:
+        tab = tabs(address)
+        tab.get_by_label("Find a demonstration").fill("push")
+        found = tab.locator("#list [role=option]:not([hidden]) strong")
+        playwright.expect(found).to_have_count(3)
+        assert {*found.all_text_contents()} == {"demo_0", "demo_2", "demo_4"}
+    session.close()
+
+
 def test_an_answer_that_comes_late_changes_nothing(tabs, session):
     with served(session) as address:
         tab = tabs(address, LATE)

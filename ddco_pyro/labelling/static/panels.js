@@ -35,7 +35,7 @@ export class List {  // all demonstrations, the most informative first, each wit
       all: () => true, left: one => !one.accepted && !one.marks.exclude, mine: one => !one.people.length || one.people.includes(annotator),
       two: one => one.accepted && one.done_by.length, flag: one => one.marks.flag, note: one => one.marks.note, exclude: one => one.marks.exclude,
     };
-    this.rows.forEach(({ row, name }, index) => { row.hidden = !(name.textContent.toLowerCase().includes(words) && kinds[this.only.value](demos[index])); });
+    this.rows.forEach(({ row }, index) => { row.hidden = !(`${demos[index].name} ${demos[index].task}`.toLowerCase().includes(words) && kinds[this.only.value](demos[index])); });
     this.draw();
   }
   show(state, active, keep) {  // keep: the order stays until another demonstration is opened
