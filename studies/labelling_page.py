@@ -107,7 +107,7 @@ class Person:
         ):
             act()
         self.waited += time.monotonic() - before
-        self.edits += bool(edit.value.json()["done"])
+        self.edits += bool(edit.value.json().get("done"))  # what the page refused, the person does again
 
     def go(self, step: int, steps: int) -> None:
         """Set the cursor by a click, and correct it by keys."""
