@@ -30,8 +30,6 @@ from ddco_pyro.spec.spec import MODEL
 ROOT = Path(__file__).parents[2]
 MOST = 111
 """105, and those of tasks and libraries: ``where``, ``minus``, ``library`` with ``run``, ``ridge`` and ``spread``."""
-MOST = 112
-"""106, and those of tasks and libraries: ``where``, ``minus``, ``library`` with ``run``, ``ridge`` and ``spread``."""
 PATH = re.compile(r"([a-z_]+(?:\.[a-z_0-9{}]+)*)(?:=(.*))?", re.DOTALL)
 """A key path, or ``path=value`` of ``--set``."""
 
