@@ -91,7 +91,7 @@ class PeopleCell(Cell):
             return {"scores": {name: scored(own, kinds[name], truth) for name, own in named.items()}}
         given = {"level": "option", "from": KNOWN}
         own = with_labels(demos, train, len(train) if self.labelled == ALL else int(self.labelled))
-        found = fit(with_overrides(spec, {"training.labels": given | {"recogniser": {"cross_validated": True}}}), own)
+        found = fit(with_overrides(spec, {"training.labels": given | {"recogniser": "cross_validated"}}), own)
         alone = [row[:steps].numpy() for piece in found.infer(valid) for row, steps in recognised(piece)]
         kinds = {"options": list(found.segment(valid)[0]), "recogniser": alone}
         if self.fold == "last":

@@ -235,7 +235,7 @@ def _contains(spec: Spec, baseline: Spec) -> bool:
 def _shares_recogniser(baseline: Spec) -> bool:
     """Whether a baseline takes what cross-validation chooses for the model, rather than doing the same itself."""
     labels = baseline.training.labels
-    return labels is not None and labels.recogniser is not None and labels.recogniser.cross_validated
+    return labels is not None and labels.recogniser == "cross_validated"
 
 
 def _with_recogniser(baseline: Spec, chosen: Mapping[str, Any]) -> Spec:
@@ -243,9 +243,8 @@ def _with_recogniser(baseline: Spec, chosen: Mapping[str, Any]) -> Spec:
 
     :param chosen: of :class:`~ddco_pyro.metrics.Recogniser`.
     """
-    recogniser = {"weight": chosen["weight"], "ridge": chosen["ridge"], "cross_validated": False}
-    values = {f"training.labels.recogniser.{key}": value for key, value in recogniser.items()}
-    return with_overrides(baseline, {"control.power": chosen["power"]} | values)
+    recogniser = {"weight": chosen["weight"], "ridge": chosen["ridge"]}
+    return with_overrides(baseline, {"control.power": chosen["power"], "training.labels.recogniser": recogniser})
 
 
 def _versions() -> dict[str, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Literal
 
 from pydantic import ConfigDict, Field
@@ -49,9 +50,12 @@ class RecogniserSpec(Model):
     """γ: how many times log r(h | window) − log p(h) counts, beside the control's log-density (``control.power``)."""
     ridge: Positive = 50.0
     """Precision of a normal prior on the weights of standardised features."""
-    cross_validated: bool = False
-    """Whether ``weight``, ``ridge`` and ``control.power`` are chosen by leaving out labelled demonstrations in turn, or
-    parts of a single one: the best mean of accuracy and edit score."""
+
+
+RecogniserOf = Annotated[
+    RecogniserSpec | Literal["cross_validated"] | None,
+    nested((Mapping,), RecogniserSpec, "a mapping with weight and ridge, or cross_validated", ("cross_validated",)),
+]
 
 
 class LabelsSpec(Model):
@@ -63,8 +67,10 @@ class LabelsSpec(Model):
     """Name of the level."""
     source: Text = Field(alias="from")
     """Name of the integer labels in the file; the sorted labels from 0 on are the options 1, 2, ..."""
-    recogniser: RecogniserSpec | None = None
-    """A recogniser that the labelled steps train, for steps without labels and for other demonstrations; null: none."""
+    recogniser: RecogniserOf = None
+    """A recogniser that the labelled steps train, for steps without labels and for other demonstrations; null: none.
+    ``cross_validated``: ``weight``, ``ridge`` and ``control.power`` are chosen by leaving out labelled demonstrations
+    in turn, or parts of a single one: the best mean of accuracy and edit score."""
 
 
 class LibrarySpec(Model):

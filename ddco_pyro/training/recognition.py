@@ -18,6 +18,7 @@ from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.recogniser import Windows
 from ddco_pyro.model.tables import Tables
 from ddco_pyro.spec import with_overrides
+from ddco_pyro.spec.training import RecogniserSpec
 from ddco_pyro.statistics import edit_score
 from ddco_pyro.training.checkpoint import Progress, Restart, TrainingData
 from ddco_pyro.training.em import Expectation
@@ -60,7 +61,7 @@ def recognise(model: Hierarchy, data: TrainingData, demos: Demonstrations) -> tu
     """
     labels, own, recogniser = data.labels, data.spec.training.labels, model.recogniser
     assert labels and own and own.recogniser and recogniser  # noqa: PT018
-    asked = own.recogniser
+    asked = RecogniserSpec() if own.recogniser == "cross_validated" else own.recogniser
     batch = encode(demos, model.encoder, model.scaling)
     options = choices(demos, own.source, labels.values, labels.demonstrations)
     widths = _widths(options)
@@ -69,7 +70,7 @@ def recognise(model: Hierarchy, data: TrainingData, demos: Demonstrations) -> tu
         windows.widths.copy_(torch.tensor(widths))
         features[windows] = windows.features(batch.inputs, batch.actions, batch.lengths)
     power, weight, ridge, tried = data.spec.control.power, asked.weight, asked.ridge, list[Candidate]()
-    if asked.cross_validated:
+    if own.recogniser == "cross_validated":
         tried = _tried(data, recogniser.around, features[recogniser.around], batch, options, demos.names)
         power, weight, ridge = chosen(tried)
     for windows, rows in features.items():

@@ -28,8 +28,8 @@ from ddco_pyro.spec.networks import SETTINGS, Network, UserNetworkSpec
 from ddco_pyro.spec.spec import MODEL
 
 ROOT = Path(__file__).parents[2]
-MOST = 111
-"""105, and those of tasks and libraries: ``where``, ``minus``, ``library`` with ``run``, ``ridge`` and ``spread``."""
+MOST = 110
+"""104, and those of tasks and libraries: ``where``, ``minus``, ``library`` with ``run``, ``ridge`` and ``spread``."""
 PATH = re.compile(r"([a-z_]+(?:\.[a-z_0-9{}]+)*)(?:=(.*))?", re.DOTALL)
 """A key path, or ``path=value`` of ``--set``."""
 

@@ -267,7 +267,7 @@ def test_a_recogniser_places_what_labels_alone_do_not(tmp_path):
     demos = numbered(one(number) for number in range(14))
     train, held_out = demos.select(demos.names[:10]), demos.select(demos.names[10:])
     found = {}
-    for name, own in {"clamped": None, "recogniser": {"cross_validated": True}}.items():
+    for name, own in {"clamped": None, "recogniser": "cross_validated"}.items():
         labels = {"level": "level-1", "from": "known", **({"recogniser": own} if own else {})}
         training = {"optimizer": {"name": "em"}, "labels": labels, "epochs": 40}
         read = {"path": "unused.hdf5", "labels": "phase"}
@@ -287,7 +287,6 @@ def test_a_recogniser_places_what_labels_alone_do_not(tmp_path):
         np.testing.assert_array_equal(own, other)
     mixture = again.baselines["mixture"]
     shared = mixture.spec.training.labels.recogniser
-    assert not shared.cross_validated
     assert (mixture.spec.control.power, shared.weight, shared.ridge) == (chosen.power, chosen.weight, chosen.ridge)
     assert float(mixture.hierarchy.recogniser.gamma) == chosen.weight
     said = contributions(again.metrics.training)

@@ -192,7 +192,7 @@ def test_after_another_process_is_killed_one_process_goes_on_to_the_same_bits(wh
     assert_same_run(tmp_path / "run", run)
 
 
-LABELS = {"level": "level-1", "from": "phase", "count": 3, "recogniser": {"cross_validated": True}}
+LABELS = {"level": "level-1", "from": "phase", "count": 3, "recogniser": "cross_validated"}
 MOMENTUM = {"optimizer": {"name": "momentum"}, "average": 0.9}
 
 
