@@ -28,6 +28,7 @@ import torch
 import yaml
 from measuring import Row, of_pairs, seconds, side_by_side, table
 from provenance import is_kept, record, sentence, text
+from scipy.signal import lfilter
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.events import EpochEnded, Event
@@ -336,13 +337,20 @@ def initial_spec(folder: Path) -> Path:
     return spec
 
 
-def made(path: Path, number: int = 50, steps: int = 60, controls: int = 4) -> None:
-    """Write made-up demonstrations of four skills of equal length, each a linear policy."""
-    gains = np.random.default_rng(1).normal(size=(4, 12, controls), scale=0.5)
+def made(
+    path: Path, number: int = 50, steps: int = 60, controls: int = 4, scale: float = 0.5, kept: float = 1.0
+) -> None:
+    """Write made-up demonstrations of four skills of equal length, each a linear policy.
+
+    :param scale: of the policies' weights.
+    :param kept: the share of a state that is left a step later; below 1, states stay near 0 in demonstrations of any
+        length.
+    """
+    gains = np.random.default_rng(1).normal(size=(4, 12, controls), scale=scale)
     random = np.random.default_rng(0)
     with h5py.File(path, "w") as file:
         for demo in range(number):
-            state = random.normal(size=(steps, 12)).cumsum(0) / 8
+            state = lfilter([1 / 8], [1, -kept], random.normal(size=(steps, 12)), axis=0)
             mean = np.einsum("tf,tfa->ta", state, gains[np.repeat(np.arange(4), steps // 4)])
             group = file.create_group(f"data/demo_{demo}")
             group["obs/state"] = state
@@ -388,7 +396,7 @@ def large() -> Iterator[Row]:
     """``init`` and ``fit`` from the shell of as much as a robot with two arms records, with three baselines."""
     with tempfile.TemporaryDirectory() as name:
         path, spec = Path(name) / "made.hdf5", Path(name) / "init.yaml"
-        made(path, *LARGE)
+        made(path, *LARGE, scale=0.2, kept=0.99)  # a tenth of the controls are on a bound
         cpu, peak = 0.0, 0.0
         for arguments in (["init", path, "--out", spec], ["fit", spec, "--out", Path(name) / "run"]):
             child = subprocess.Popen([COMMAND, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
