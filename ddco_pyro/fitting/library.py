@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from ddco_pyro.data.demonstrations import Demonstrations, with_tasks
 from ddco_pyro.data.files import json_text, write_text
@@ -17,7 +18,10 @@ from ddco_pyro.data.tasks import by_task, known_tasks
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.inferred import infer
 from ddco_pyro.fitting.fitted import Fit, load
+from ddco_pyro.inference.paths import predicted
 from ddco_pyro.jobs import Workers, run_all
+from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.tables import joint_density
 from ddco_pyro.spec import TASK, Spec, SpecError, load_spec, user_code, with_overrides
 from ddco_pyro.spec.yaml import dump_yaml, read_mapping
 from ddco_pyro.training.data import dimensions, train_and_valid
@@ -25,7 +29,7 @@ from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.prior import Prior
 from ddco_pyro.training.restarts import train_model
 
-STRENGTHS = (3.0, 10.0, 30.0, 100.0, 300.0)
+STRENGTHS = (1.0, 3.0, 10.0, 30.0, 100.0)
 """The ridges among which the tasks of a library choose."""
 
 MOST_TASKS = 5
@@ -119,10 +123,11 @@ def _leaves(data: Mapping[str, Any], place: str = "") -> Iterable[tuple[str, Any
 
 
 def _strength(library: Fit, spread: float, workers: Workers) -> float:
-    """The ridge with which a task that is left out is predicted best from one demonstration, kept with the library.
+    """The ridge with which a task that is left out is imitated best from one demonstration, kept with the library.
 
     For each of :data:`MOST_TASKS` tasks the model is fitted without it, from the first of its starts. Each of
-    :data:`STRENGTHS` then adapts that model to the task's first demonstration, and its others are predicted.
+    :data:`STRENGTHS` then adapts that model to the task's first demonstration, and the controls of the others are
+    expected. Their error decides: the likelihood would judge σ, too, of which one demonstration says little.
 
     :raises BadInput: the demonstrations are of a single task.
     """
@@ -133,9 +138,9 @@ def _strength(library: Fit, spread: float, workers: Workers) -> float:
     chosen = list(tasks)[:: math.ceil(len(tasks) / MOST_TASKS)]
     calls = {task: partial(_predicted, library.spec, demos, tasks[task], spread) for task in chosen}
     with run_all(calls, workers, "trained without a task") as found:
-        nats = np.mean([values for _, values in found], axis=0)
-    ridge = STRENGTHS[int(np.argmax(nats))]
-    about = {"ridge": ridge, "tasks": chosen, "nats_per_step": dict(zip(map(str, STRENGTHS), nats, strict=True))}
+        errors = np.mean([values for _, values in found], axis=0)
+    ridge = STRENGTHS[int(np.argmin(errors))]
+    about = {"ridge": ridge, "tasks": chosen, "error": dict(zip(map(str, STRENGTHS), errors, strict=True))}
     write_text(kept, json_text(about))
     return ridge
 
@@ -155,7 +160,7 @@ def _several_tasks(library: Fit) -> tuple[Demonstrations, dict[str, list[str]]]:
 
 
 def _predicted(spec: Spec, demos: Demonstrations, names: Sequence[str], spread: float) -> list[float]:
-    """log p(ξ) per step of a task's demonstrations but the first, by a library without the task, for each strength."""
+    """:func:`imitation_error` in a task's demonstrations but the first, by a library without it, for each strength."""
     others = demos.select(name for name in demos.names if name not in names)
     if spec.sees_task:
         others = with_tasks(others)
@@ -169,6 +174,25 @@ def _predicted(spec: Spec, demos: Demonstrations, names: Sequence[str], spread: 
         given = {"training.library": {"run": "the other tasks", "ridge": ridge}, "training.tune_fraction": 0}
         prior = Prior(model, ridge, spread)
         adapted = train_model(with_overrides(spec, given), size, first, library=prior).hierarchy
-        total = sum(float(piece.log_likelihood.sum()) for piece in infer(adapted, rest))
-        found.append(total / sum(rest.lengths))
+        found.append(imitation_error(adapted, rest))
     return found
+
+
+def imitation_error(model: Hierarchy, demos: Demonstrations) -> float:
+    """|E[a_t | s_0..t, a_0..t-1] - a_t|, the mean over steps and control dimensions, in scaled units.
+
+    The expectation is over options; each stands for its most likely control.
+    """
+    total, number = 0.0, 0
+    for piece in infer(model, demos):
+        actions, lengths = piece.batch.actions, piece.batch.lengths
+        tables = piece.outputs.tables(actions)
+        belief = predicted(tables, lengths).exp() if tables.depth else torch.ones(())
+        for dim in range(actions.shape[-1]):
+            pairs = zip(piece.outputs.emissions, tables.control, strict=True)
+            modes = [torch.zeros_like(own) if each is None else each.mode[..., dim] for each, own in pairs]
+            joint = torch.where(belief > 0, belief * joint_density(modes), 0.0)
+            error = (joint.flatten(2).sum(-1) if tables.depth else joint) - actions[..., dim]
+            total += float(error[piece.batch.inputs.time < lengths[:, None]].abs().sum())
+        number += int(lengths.sum()) * actions.shape[-1]
+    return total / number

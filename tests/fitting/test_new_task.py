@@ -13,7 +13,8 @@ from command_line import call
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.planted import pick_and_place
-from ddco_pyro.fitting.library import STRENGTHS
+from ddco_pyro.evaluation.inferred import infer
+from ddco_pyro.fitting.library import STRENGTHS, imitation_error
 from ddco_pyro.fitting.names import write_names
 from ddco_pyro.training import prior
 
@@ -53,13 +54,27 @@ def library(tmp_path_factory):
     return folder
 
 
+def test_controls_are_expected_by_the_belief_of_a_monitor(library):
+    """The error is that of an online filter of another implementation, step by step."""
+    run, demos = ddco_pyro.load(library / "run"), Demonstrations(tuple(task(5, 3)))
+    errors = []
+    for demo in demos:
+        monitor, (piece,) = run.monitor(), infer(run.hierarchy, [demo])
+        for t in range(len(demo)):
+            seen = {key: values[t] for key, values in demo.observations.items()}
+            monitor.step(seen, demo.actions[t - 1] if t else None)
+            expected = monitor.belief[0][0, 1:] @ piece.outputs.emissions[0].mode[0, t].double()
+            errors.append((expected - piece.batch.actions[0, t]).abs().numpy())
+    assert imitation_error(run.hierarchy, demos) == pytest.approx(np.mean(errors), rel=1e-5)
+
+
 def test_one_demonstration_and_a_library_are_enough(library, tmp_path):
     """The strength is chosen once, is kept with the library and said; the model is that of the library, adapted."""
     ended = call("fit", library / "new.yaml", "--library", library / "run", "--out", tmp_path / "run", "--jobs", 1)
     assert ended.status == 0, ended.err
     kept = json.loads((library / "run" / "library.json").read_text())
     assert kept["ridge"] in STRENGTHS
-    assert kept["ridge"] == STRENGTHS[int(np.argmax([*kept["nats_per_step"].values()]))]
+    assert kept["ridge"] == STRENGTHS[int(np.argmin([*kept["error"].values()]))]
     assert kept["tasks"] == ["task 0", "task 1", "task 2"]
     assert f"by a ridge of {kept['ridge']:g}, which its own tasks chose" in ended.err + ended.out
     run, adapted = ddco_pyro.load(library / "run"), ddco_pyro.load(tmp_path / "run")
