@@ -16,7 +16,7 @@ from ddco_pyro.data.arrays import refuse_too_much
 from ddco_pyro.data.demonstration import NOTHING, Attribute, Demonstration, check, needed
 from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.hdf5 import natural
-from ddco_pyro.data.labels import BOUNDARY, LABEL_NAMES, SOURCE, label_names
+from ddco_pyro.data.labels import LABEL_NAMES, label_names
 from ddco_pyro.data.sources import narrowed, open_source, refuse_foreign
 from ddco_pyro.data.sources.robomimic import frequency_of, robomimic_file, write_demonstration
 from ddco_pyro.data.tasks import (
@@ -24,7 +24,6 @@ from ddco_pyro.data.tasks import (
     TASKS,
     Known,
     Where,
-    are_several,
     by_task,
     by_value,
     of_tasks,
@@ -203,16 +202,11 @@ def with_tasks(demos: Demonstrations, tasks: Sequence[str] = ()) -> Demonstratio
 def with_labels_of_tasks(demos: Demonstrations) -> Demonstrations:
     """Demonstrations of several tasks with labels that differ between tasks, unless the file names them."""
     known = label_names(demos.attributes)
-    labels = [key for key in demos[0].labels if key not in known and not key.endswith((BOUNDARY, SOURCE))]
-    if not labels or not are_several(demos.tasks):
+    each, names = of_tasks(demos.tasks, [demo.labels for demo in demos], known)
+    if names == known:
         return demos
-    each, names = [dict(demo.labels) for demo in demos], dict[str, list[str]]()
-    for key in labels:
-        values, names[key] = of_tasks(demos.tasks, [demo.labels[key] for demo in demos])
-        each = [{**own, key: new} for own, new in zip(each, values, strict=True)]
     parts = tuple(Demonstration.stored(**{**vars(demo), "labels": own}) for demo, own in zip(demos, each, strict=True))
-    about = {**demos.attributes, LABEL_NAMES: json.dumps(known | names)}
-    return replace(demos, demonstrations=parts, attributes=about)
+    return replace(demos, demonstrations=parts, attributes={**demos.attributes, LABEL_NAMES: json.dumps(names)})
 
 
 def not_demonstrations(given: object) -> DemonstrationsError:

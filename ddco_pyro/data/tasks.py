@@ -9,7 +9,7 @@ import numpy as np
 
 from ddco_pyro.data.demonstration import Attribute, Demonstration
 from ddco_pyro.data.errors import DemonstrationsError
-from ddco_pyro.data.labels import UNKNOWN
+from ddco_pyro.data.labels import BOUNDARY, SOURCE, UNKNOWN
 from ddco_pyro.errors import nearest
 from ddco_pyro.spec import TASK
 
@@ -81,21 +81,27 @@ def are_several(tasks: Sequence[str]) -> bool:
     return 1 < len({*tasks}) <= len(tasks) / 2
 
 
-def of_tasks(tasks: Sequence[str], labels: Sequence[np.ndarray]) -> tuple[list[np.ndarray], list[str]]:
-    """Labels [T] without names, numbered so that those of two tasks differ, and the names of their numbers.
+def of_tasks(
+    tasks: Sequence[str], labels: Sequence[Mapping[str, np.ndarray]], known: Mapping[str, Sequence[str]]
+) -> tuple[list[dict[str, np.ndarray]], dict[str, Sequence[str]]]:
+    """Labels [T] by name, numbered so that those of several tasks differ unless the file names them, and all names.
 
-    >>> of_tasks(["push", "reach"], [np.array([0, 0, 2]), np.array([2, -1, 2])])
-    ([array([0, 0, 1]), array([ 2, -1,  2])], ['push: 0', 'push: 2', 'reach: 2'])
+    >>> of_tasks(["push", "push", "reach", "reach"], [{"phase": np.array([0, 2])}] * 4, {})[1]
+    {'phase': ['push: 0', 'push: 2', 'reach: 0', 'reach: 2']}
 
     :param tasks: of each demonstration.
+    :param known: by name of labels, the names of labels 0, 1, ... that the file has.
     """
-    each = [(task, np.unique(values[values != UNKNOWN]).tolist()) for task, values in zip(tasks, labels, strict=True)]
-    known = sorted({(task, value) for task, there in each for value in there})
-    numbered = [np.full(len(values), UNKNOWN) for values in labels]
-    for own, values, (task, there) in zip(numbered, labels, each, strict=True):
-        for value in there:
-            own[values == value] = known.index((task, value))
-    return numbered, [f"{task}: {value}" for task, value in known]
+    numbered, names = [dict(own) for own in labels], dict(known)
+    every = dict.fromkeys(key for own in labels for key in own if not key.endswith((BOUNDARY, SOURCE)))
+    for key in (key for key in every if key not in known and are_several(tasks)):
+        having = [(task, own) for task, own in zip(tasks, numbered, strict=True) if key in own]
+        values = sorted({(task, value) for task, own in having for value in own[key].tolist() if value != UNKNOWN})
+        number = {value: place for place, value in enumerate(values)}
+        for task, own in having:
+            own[key] = np.array([number.get((task, value), UNKNOWN) for value in own[key].tolist()], int)
+        names[key] = [f"{task}: {value}" for task, value in values]
+    return numbered, names
 
 
 TASKS = "tasks"
