@@ -10,17 +10,14 @@ from ddco_pyro.errors import BadInput, Failed
 
 
 class DemonstrationsError(BadInput):
-    """Unusable demonstrations: one line with the file, the demonstration and the key.
-
-    :param located: whether the line names the file already.
-    """
-
-    def __init__(self, text: str, located: bool = False) -> None:
-        super().__init__(text)
-        self.located = located
+    """Unusable demonstrations: one line with the file, the demonstration and the key."""
 
     def __str__(self) -> str:
         return printable(super().__str__())
+
+
+class Located(DemonstrationsError):
+    """An error whose line names the file already."""
 
 
 def printable(text: str) -> str:
@@ -40,7 +37,7 @@ def reading(path: Path, where: str = "") -> Iterator[None]:
     """Tell what a library raises about a damaged file as one line.
 
     :param where: the part of the file; may be empty.
-    :raises DemonstrationsError: the block raises one of :data:`DAMAGE`.
+    :raises Located: the block raises one of :data:`DAMAGE`.
     """
     try:
         yield
@@ -49,4 +46,4 @@ def reading(path: Path, where: str = "") -> Iterator[None]:
     except DAMAGE as error:
         text = " ".join(str(error).split()) or type(error).__name__
         place = f"{path}: {where}" if where else path
-        raise DemonstrationsError(f"{place}: cannot be read, or is damaged: {text}", located=True) from error
+        raise Located(f"{place}: cannot be read, or is damaged: {text}") from error

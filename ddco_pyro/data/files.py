@@ -20,6 +20,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import h5py
+
 from ddco_pyro.errors import BadInput, Failed
 
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
@@ -27,14 +29,6 @@ _FORBIDDEN = {
     errno.EACCES, errno.EBUSY, errno.EPERM, errno.EROFS, errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENOTEMPTY,
     errno.ENAMETOOLONG, errno.ELOOP,
 }  # fmt: skip
-
-
-class NoSpace(Failed):
-    """The disk is full; existing files are unchanged."""
-
-
-class NotWritable(BadInput):
-    """A place that cannot be written."""
 
 
 class Damaged(BadInput):
@@ -69,8 +63,8 @@ class Output:
         """The path with all links resolved."""
         return Path(os.path.realpath(self.path))
 
-    def refused(self, why: str, remedy: str = "choose another place") -> NotWritable:
-        return NotWritable(f"{self.option} {self.path}: {why}; {remedy}")
+    def refused(self, why: str, remedy: str = "choose another place") -> BadInput:
+        return BadInput(f"{self.option} {self.path}: {why}; {remedy}")
 
 
 def check_outputs(outputs: Sequence[Output], inputs: Sequence[Path] = ()) -> None:
@@ -78,14 +72,14 @@ def check_outputs(outputs: Sequence[Output], inputs: Sequence[Path] = ()) -> Non
 
     :param inputs: files and folders that the command reads; no output may be or lie in one of them, or in what links in
         them lead to.
-    :raises NotWritable: an output has an impossible name, is of another kind, cannot be written, is an input, or
+    :raises BadInput: an output has an impossible name, is of another kind, cannot be written, is an input, or
         coincides with another output.
-    :raises NoSpace: the disk is full.
+    :raises Failed: the disk is full.
     """
     for number, output in enumerate(outputs):
         name = str(output.path)
         if any(unicodedata.category(character) in ("Cc", "Cs") for character in name):
-            raise NotWritable(f"{output.option} {name!r}: is no name for a file; leave control characters out")
+            raise BadInput(f"{output.option} {name!r}: is no name for a file; leave control characters out")
         with _explained(output.path):
             _check_kind(output)
             _check_writable(output)
@@ -95,7 +89,7 @@ def check_outputs(outputs: Sequence[Output], inputs: Sequence[Path] = ()) -> Non
                     raise output.refused("is what this command reads")
                 if read.is_dir() and read in output.place.parents:
                     raise output.refused(f"lies in {path}, which this command reads")
-        if output.kind == "stream" and _is_hdf5(output.path):
+        if output.kind == "stream" and h5py.is_hdf5(output.path):
             raise output.refused("is an HDF5 file, which this would replace", "choose another place or remove it first")
         for other in outputs[:number]:
             if _same(output.path, other.path):
@@ -123,10 +117,6 @@ def _same(one: Path, other: Path) -> bool:
     return os.path.realpath(one) == os.path.realpath(other)
 
 
-_HDF5 = b"\x89HDF\r\n\x1a\n"
-"""The signature of HDF5 files."""
-
-
 def _check_kind(output: Output) -> None:
     """Refuse an existing file or folder that the output cannot replace."""
     try:
@@ -140,13 +130,6 @@ def _check_kind(output: Output) -> None:
         raise output.refused("is a folder", "name a file")
     elif not stat.S_ISREG(mode):
         raise output.refused("is no regular file")
-
-
-def _is_hdf5(path: Path) -> bool:
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return file.read(len(_HDF5)) == _HDF5
 
 
 def _check_writable(output: Output) -> None:
@@ -175,8 +158,8 @@ def whole_file(path: Path) -> Iterator[Path]:
 
     Behind a link, the target is replaced.
 
-    :raises NoSpace: the disk is full.
-    :raises NotWritable: nothing may be written there.
+    :raises Failed: the disk is full.
+    :raises BadInput: nothing may be written there.
     """
     if path.exists() and not path.is_file():
         raise Output("", path).refused("is no regular file")
@@ -241,10 +224,10 @@ def _explained(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         if error.errno in _FULL:
-            raise NoSpace(f"{path}: there is no room to write it; free some space, then do the same again") from error
+            raise Failed(f"{path}: there is no room to write it; free some space, then do the same again") from error
         if error.errno in _FORBIDDEN:
             text = os.strerror(error.errno)
-            raise NotWritable(f"{path}: cannot be written: {text}; choose another place or change this one") from error
+            raise BadInput(f"{path}: cannot be written: {text}; choose another place or change this one") from error
         raise
 
 
@@ -256,7 +239,7 @@ def only_one(folder: Path, wait: bool = False) -> Iterator[None]:
 
     :param wait: wait for another process rather than refuse.
     :raises Busy: another process holds the lock.
-    :raises NotWritable: the folder cannot be made.
+    :raises BadInput: the folder cannot be made.
     """
     while True:
         with _explained(folder):

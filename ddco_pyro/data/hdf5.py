@@ -18,7 +18,7 @@ import numpy as np
 
 from ddco_pyro.data.arrays import LazyArray, block_steps, channels_last, refuse_too_much, turned
 from ddco_pyro.data.demonstration import Attribute
-from ddco_pyro.data.errors import DAMAGE, DemonstrationsError, reading
+from ddco_pyro.data.errors import DAMAGE, DemonstrationsError, Located, reading
 from ddco_pyro.errors import nearest
 
 
@@ -28,16 +28,17 @@ def opened(path: str | Path) -> Iterator[h5py.File]:
 
     :raises DemonstrationsError: the file is missing, not HDF5, or damaged.
     """
+    if not os.path.exists(path):
+        raise Located(f"{path}: there is no such file; check the path")
     if not os.path.isfile(path):
-        why = (
-            "is no regular file; name an HDF5 file" if os.path.exists(path) else "there is no such file; check the path"
-        )
-        raise DemonstrationsError(f"{path}: {why}", located=True)
+        raise Located(f"{path}: is no regular file; name an HDF5 file")
     try:
         with reading(Path(path)), h5py.File(path, "r") as file:
             yield file
+    except Located:
+        raise
     except DemonstrationsError as error:
-        raise error if error.located else DemonstrationsError(f"{path}: {error}", located=True) from None
+        raise Located(f"{path}: {error}") from None
 
 
 class _Disk(io.FileIO):

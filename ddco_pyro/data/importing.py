@@ -170,7 +170,7 @@ def _refuse(left_out: Mapping[str, DemonstrationsError], names: Sequence[str], c
     if left_out and not choice.skip_broken:
         advice = "; or leave such ones out with --skip-broken" if len(left_out) < len(names) else ""
         error = next(iter(left_out.values()))
-        raise DemonstrationsError(f"{error}{advice}", error.located)
+        raise type(error)(f"{error}{advice}")
 
 
 def _names(source: Source, choice: Choice) -> Sequence[str]:

@@ -17,8 +17,9 @@ from command_line import call
 from killing import HANGS
 from random_demonstrations import demonstrations
 
-from ddco_pyro.data.files import NotWritable, only_one, whole_file, whole_folder, write_text
+from ddco_pyro.data.files import only_one, whole_file, whole_folder, write_text
 from ddco_pyro.data.tensors import read_tensors, write_tensors
+from ddco_pyro.errors import BadInput
 from ddco_pyro.training.data import demonstrations as of
 
 NOBODY = 65534
@@ -83,7 +84,7 @@ def test_a_read_only_folder(tmp_path: Path) -> None:
             os.setuid(NOBODY)
         said = []
         for attempt in (lambda: write_text(folder / "file", "x"), lambda: only_one(folder / "run").__enter__()):
-            with pytest.raises(NotWritable) as refused:
+            with pytest.raises(BadInput) as refused:
                 attempt()
             said.append(str(refused.value))
         return said
