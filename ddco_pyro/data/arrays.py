@@ -80,14 +80,13 @@ Observed = np.ndarray | LazyArray
 """An observation of a demonstration [T, ...], in memory or lazy."""
 
 
-def blocks(array: Observed) -> Iterator[np.ndarray]:
-    """An array [T, ...] in blocks of consecutive steps."""
+def blocks(array: Observed, steps: slice = slice(None)) -> Iterator[np.ndarray]:
+    """Consecutive steps of an array [T, ...] in blocks."""
+    start, stop, _ = steps.indices(len(array))
     if isinstance(array, LazyArray):
-        yield from array.read(0, len(array))
-        return
+        return array.read(start, stop)
     at_once = block_steps(array.shape[1:], array.dtype)
-    for first in range(0, len(array), at_once):
-        yield array[first : first + at_once]
+    return (array[first : min(first + at_once, stop)] for first in range(start, stop, at_once))
 
 
 def block_steps(shape: tuple[int, ...], dtype: np.dtype[Any]) -> int:

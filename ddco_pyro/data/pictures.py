@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ddco_pyro.data.arrays import PICTURE_DIMENSIONS, Observed, block_steps
+from ddco_pyro.data.arrays import PICTURE_DIMENSIONS, Observed, blocks
 from ddco_pyro.errors import BadInput
 
 
@@ -48,15 +48,6 @@ class Transform(NamedTuple):
             height, width = size
         return *(self.resize or (height, width)), colours
 
-    def seen(self, array: Observed, steps: slice) -> Iterator[np.ndarray]:
-        """Preprocessed pictures of consecutive steps, [steps, H', W', C], block by block.
-
-        :raises DemonstrationsError: a file cannot be read.
-        """
-        last, at_once = min(steps.stop, len(array)), block_steps(array.shape[1:], array.dtype)
-        for first in range(steps.start, last, at_once):
-            yield self(array[first : min(first + at_once, last)])
-
     def __call__(self, frames: np.ndarray) -> np.ndarray:
         """Pictures [T, H, W, C] to [T, H', W', C]."""
         if self.crop is not None:
@@ -91,7 +82,7 @@ def padded(
     whole = np.zeros((len(frames), steps.stop - steps.start, *shape), frames[0].dtype)
     for row, array in enumerate(frames):
         at = 0
-        for seen in transform.seen(array, steps):
+        for seen in map(transform, blocks(array, steps)):
             target = whole[row, at : at + len(seen)]
             shift_into(target, seen, *((0, 0) if shifts is None else shifts[row].tolist()))
             at += len(seen)

@@ -12,17 +12,12 @@ import numpy as np
 from ddco_pyro.data.errors import DemonstrationsError
 
 
-def frames(path: Path, start: float = 0.0) -> Iterator[np.ndarray]:
-    """The frames of a video from ``start`` seconds on, uint8 [H, W, 3].
+def frames(path: Path, start: float = 0.0) -> Iterator[tuple[float, np.ndarray]]:
+    """The time of each frame of a video from ``start`` seconds on, and the frame, uint8 [H, W, 3].
 
     :raises av.FFmpegError: the video cannot be decoded.
     :raises IndexError: the file has no video stream.
     """
-    return (frame for _, frame in timed_frames(path, start))
-
-
-def timed_frames(path: Path, start: float) -> Iterator[tuple[float, np.ndarray]]:
-    """The time of each frame in seconds, and the frame; otherwise as :func:`frames`."""
     with av.open(path) as video:
         stream = video.streams.video[0]
         stream.thread_type = "AUTO"
@@ -49,7 +44,7 @@ def frames_of_steps(
         raise DemonstrationsError(f"{name}: {path}: the video is missing; leave its observation out with --observation")
     seen = 0
     try:
-        for time, frame in islice(timed_frames(path, max(start - 0.5 / frequency, 0)), steps):
+        for time, frame in islice(frames(path, max(start - 0.5 / frequency, 0)), steps):
             if frame.shape[:2] != size:
                 actual, expected = (" x ".join(map(str, shape)) for shape in (frame.shape[:2], size))
                 raise DemonstrationsError(f"{name}: {path}: is {actual}, and meta/info.json says {expected}")
