@@ -10,7 +10,7 @@ from typing import NamedTuple
 class Format(NamedTuple):
     """A format of demonstrations.
 
-    :param reader: opens a :class:`~ddco_pyro.data.sources.Source`, a context manager ``module:function`` in
+    :param reader: yields one open :class:`~ddco_pyro.data.sources.Source`, ``module:function`` in
         :mod:`ddco_pyro.data.sources`. A module imports its own library, which need not be installed for other formats.
     :param fits: whether a path has the format; also given the names at the top of an HDF5 file, else none.
     :param text: the path in words, such as ``the folder of a Minari dataset``.

@@ -15,10 +15,10 @@ from ddco_pyro.data.arrays import INFERENCE, refuse_too_much
 from ddco_pyro.data.demonstration import check_fitted, needed
 from ddco_pyro.data.demonstrations import Demonstration
 from ddco_pyro.data.errors import DemonstrationsError
-from ddco_pyro.data.labels import BOUNDARY, SOURCE, label_names
+from ddco_pyro.data.labels import label_names
 from ddco_pyro.data.likeness import Traits, traits
 from ddco_pyro.data.sources import Source, open_source
-from ddco_pyro.data.tasks import are_several, of_tasks, with_task
+from ddco_pyro.data.tasks import of_tasks, with_task
 from ddco_pyro.evaluation.agreement import EQUAL, of_equal_lengths
 from ddco_pyro.evaluation.agreement import agreement as scores_of
 from ddco_pyro.evaluation.inferred import Inferred, runs
@@ -165,27 +165,11 @@ def segments(fit: Fit, source: Source, on_event: OnEvent = ignore, intervals: bo
     for piece in fit.infer(_demonstrations(source, chosen, fit, labels, compared)):
         segmented += (replace(one, task=compared[one.name].task) for one in of_piece(fit, piece, labels, intervals))
         on_event(DemonstrationsDone(len(segmented), len(chosen)))
-    segmented, named = _labels_of_tasks(segmented, known)
+    each, known = of_tasks([demo.task for demo in segmented], [demo.labels for demo in segmented], known)
+    segmented = [replace(demo, labels=own) for demo, own in zip(segmented, each, strict=True)]
     nats = {demo.name: demo.log_likelihood for demo in segmented}
     unlike = fit.unlike([*compared.values()], nats, source.frequency)
-    return replace(of_run(fit, segmented, source.frequency, named), unlike=unlike)
-
-
-def _labels_of_tasks(
-    segmented: list[Segments], known: Mapping[str, Sequence[str]]
-) -> tuple[list[Segments], Mapping[str, Sequence[str]]]:
-    """Segments whose labels differ between several tasks, unless the file names them, and the names of all labels."""
-    if not are_several([demo.task for demo in segmented]):
-        return segmented, known
-    names = dict(known)
-    unnamed = {key for demo in segmented for key in demo.labels if not key.endswith((BOUNDARY, SOURCE))} - {*known}
-    for key in sorted(unnamed):
-        having = [row for row, demo in enumerate(segmented) if key in demo.labels]
-        tasks, labels = zip(*((segmented[row].task, segmented[row].labels[key]) for row in having), strict=True)
-        values, names[key] = of_tasks(tasks, labels)
-        for row, own in zip(having, values, strict=True):
-            segmented[row] = replace(segmented[row], labels={**segmented[row].labels, key: own})
-    return segmented, names
+    return replace(of_run(fit, segmented, source.frequency, known), unlike=unlike)
 
 
 def of_run(
@@ -213,7 +197,7 @@ def recorded(segmented: Segmented, fit: Fit, source: Source) -> Iterator[Demonst
 def chosen_names(source: Source, fit: Fit) -> list[str]:
     """The demonstrations to segment: all except those that the spec excludes from its file."""
     known = fit.spec.demonstrations
-    same = known.path is not None and Path(known.path).resolve() == source.files[0].resolve()
+    same = known.path is not None and Path(known.path).resolve() == source.path.resolve()
     return [name for name in source.names if not (same and name in known.exclude)]
 
 

@@ -53,12 +53,10 @@ class Squared(nn.Module):
 
 NPZ = '''
 """Demonstrations of equal length in an .npz file: ``place`` [N, T, D] and ``actions`` [N, T, A]."""
-from contextlib import contextmanager
 import numpy as np
 from ddco_pyro.data.demonstration import Demonstration
 from ddco_pyro.data.sources import Source
 
-@contextmanager
 def open_npz(path):
     with np.load(path) as arrays:
         each = dict(enumerate(zip(arrays["place"], arrays["actions"])))
@@ -67,7 +65,7 @@ def open_npz(path):
         place, actions = each[int(name.removeprefix("demo_"))]
         return Demonstration.stored(name, {"place": place}, actions)
 
-    yield Source(tuple(f"demo_{n}" for n in each), read, (path,))
+    yield Source(tuple(f"demo_{n}" for n in each), read)
 '''
 
 COUNTS = '''

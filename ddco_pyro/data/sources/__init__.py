@@ -12,7 +12,7 @@ from shlex import quote
 import h5py
 
 from ddco_pyro.data.demonstration import NOTHING, Attribute, Demonstration
-from ddco_pyro.data.errors import DemonstrationsError
+from ddco_pyro.data.errors import DemonstrationsError, Located
 from ddco_pyro.data.formats import FORMATS, LAYOUTS
 from ddco_pyro.data.tasks import Where, chosen
 from ddco_pyro.errors import command, nearest, path_of
@@ -26,22 +26,21 @@ class Source:
 
     :param names: of the demonstrations, in order.
     :param read: a demonstration by its name, as it is stored; lazy arrays can be read while the source is open.
-    :param files: the files of the source, whose sizes and times identify its contents.
     :param masks: name of each mask (robomimic: filter key) to names of demonstrations.
     :param frequency: control steps per second, Hz; None if unknown.
     :param attributes: facts about the whole source.
     :param given: the names that the source gives to observations with another key, and their keys.
-    :param format: the name of its format.
+    :param format: the name of its format, and ``path`` the file or folder, once it is open.
     """
 
     names: tuple[str, ...]
     read: Callable[..., Demonstration]
-    files: tuple[Path, ...]
     masks: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     frequency: float | None = None
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
     given: Mapping[str, str] = field(default_factory=dict)
     format: str = ""
+    path: Path = Path()
 
 
 @contextmanager
@@ -68,11 +67,11 @@ def open_source(
     if actions and not FORMATS[form].parts:
         several = " or ".join(about.text for about in FORMATS.values() if about.parts)
         raise DemonstrationsError(f"{path}: has the format {form}, with one control; --action is for {several}")
-    reader = resolve_name(f"{__name__}.{FORMATS[form].reader}")
+    reader = contextmanager(resolve_name(f"{__name__}.{FORMATS[form].reader}"))
     with reader(path, actions) if FORMATS[form].parts else reader(path) as source:
         if not source.names:
-            raise DemonstrationsError(f"{path}: holds no demonstrations; at least one is needed", located=True)
-        yield narrowed(replace(source, format=form), where, exclude)
+            raise Located(f"{path}: holds no demonstrations; at least one is needed")
+        yield narrowed(replace(source, format=form, path=path), where, exclude)
 
 
 def narrowed(source: Source, where: Where, exclude: Sequence[str] = ()) -> Source:

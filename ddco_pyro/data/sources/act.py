@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -24,7 +23,6 @@ AT_ONCE = 32
 """Pictures that are decoded together."""
 
 
-@contextmanager
 def open_act(path: Path) -> Iterator[Source]:
     """Files ``episode_0.hdf5``, ... with ``action`` [T, A] and ``observations/<key>`` [T, ...], or one of them.
 
@@ -56,7 +54,7 @@ def open_act(path: Path) -> Iterator[Source]:
             observations = {key: _observation(file, key, name) for key in keys}
             return Demonstration.stored(name, observations, joined(control, name))
 
-    yield Source(tuple(episodes), read, tuple(episodes.values()))
+    yield Source(tuple(episodes), read)
 
 
 def _observation(file: h5py.File, key: str, name: str) -> Observed:

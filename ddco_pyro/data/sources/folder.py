@@ -18,7 +18,6 @@ from ddco_pyro.data.tasks import Where, task_of
 from ddco_pyro.spec import TASK
 
 
-@contextmanager
 def open_folder(path: Path) -> Iterator[Source]:
     """The files ``*.hdf5`` and ``*.h5`` of a folder, each of any format, pooled.
 
@@ -85,6 +84,5 @@ def open_pooled(
                 masks[mask] = (*masks.get(mask, ()), *(f"{stem}_{name}" for name in members))
         rates = {source.frequency for source in each.values()}
         rate = rates.pop() if len(rates) == 1 else None
-        files = tuple(file for source in each.values() for file in source.files)
         attributes: dict[str, Attribute] = {LABEL_NAMES: json.dumps(called)} if called else {}
-        yield narrowed(Source(tuple(parts), read, files, masks, rate, attributes, format="folder"), where)
+        yield narrowed(Source(tuple(parts), read, masks, rate, attributes, format="folder"), where)

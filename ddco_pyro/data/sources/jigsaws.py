@@ -15,7 +15,6 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +36,6 @@ PARTS = {"position": slice(3), "rotation": slice(3, 12), "gripper": slice(18, 19
 TRIAL = re.compile(r".*_(?P<surgeon>[A-Z])(?P<trial>\d{3})")
 
 
-@contextmanager
 def open_jigsaws(path: Path) -> Iterator[Source]:
     """The trials of one task.
 
@@ -75,8 +73,7 @@ def open_jigsaws(path: Path) -> Iterator[Source]:
             facts |= {"skill": said[0], "rating": float(said[1])}
         return Demonstration.stored(name, observations, control, {"gesture": gesture} if gestures else {}, facts)
 
-    files = (*trials.values(), *(place for place in transcriptions if place.is_file()), *described)
-    yield Source(tuple(trials), read, files, {}, 30.0, {LABEL_NAMES: json.dumps({"gesture": gestures})})
+    yield Source(tuple(trials), read, {}, 30.0, {LABEL_NAMES: json.dumps({"gesture": gestures})})
 
 
 def _arms(trial: Path, name: str) -> np.ndarray:

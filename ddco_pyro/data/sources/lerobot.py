@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -106,7 +105,7 @@ class LeRobot:
         self.data_files = tuple(sorted(path.relative_to(folder) for path in files))
 
     def source(self) -> Source:
-        folder, robot = self.folder, self.info.get("robot_type")
+        robot = self.info.get("robot_type")
         about: dict[str, Attribute] = {"robot_type": robot} if isinstance(robot, str) else {}
         if self._names:
             about[LABEL_NAMES] = json.dumps(self._names)
@@ -114,12 +113,9 @@ class LeRobot:
         named = {key: _dimensions(self.features[feature]) for feature, key in keys.items()}
         about[DIMENSION_NAMES] = json.dumps({key: each for key, each in named.items() if each})
         left_out = tuple(f"demo_{index}" for index, noted in self._noted.items() if noted.get(EXCLUDE))
-        meta = sorted((folder / "meta").rglob("*.parquet"))
-        more = (folder / path for path in (ANNOTATIONS, *self.data_files))
-        files = (folder / "meta" / "info.json", *meta, *(path for path in more if path.is_file()))
         names = tuple(f"demo_{index}" for index in self._episodes)
         masks = {EXCLUDE: left_out} if left_out else {}
-        return Source(names, self._read, files, masks, self._frequency, about, self.keys)
+        return Source(names, self._read, masks, self._frequency, about, self.keys)
 
     def _check_actions(self) -> None:
         types = {name: about.get("dtype") if isinstance(about, dict) else None for name, about in self.features.items()}
@@ -336,7 +332,6 @@ def _info(path: Path) -> dict[str, Any]:
     return info
 
 
-@contextmanager
 def open_lerobot(path: Path, actions: Sequence[str] = ()) -> Iterator[Source]:
     """Open a dataset.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from shlex import quote
 
@@ -19,7 +18,6 @@ BARE = "state"
 """Key of an observation array without a name."""
 
 
-@contextmanager
 def open_maniskill(path: Path) -> Iterator[Source]:
     """Groups ``traj_0``, ... with ``actions`` [T, A] and ``obs``, one array or a tree of arrays [T + 1, ...].
 
@@ -45,7 +43,7 @@ def open_maniskill(path: Path) -> Iterator[Source]:
                 observations[key] = lazy(dataset, where, steps)
             return Demonstration.stored(name, observations, actions)
 
-        yield Source(tuple(name.replace("traj", "demo") for name in names), read, (path,))
+        yield Source(tuple(name.replace("traj", "demo") for name in names), read)
 
 
 def _observed(group: h5py.Group, name: str) -> dict[str, str]:

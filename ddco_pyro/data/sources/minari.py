@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,6 @@ BARE = "observation"
 MAIN = "main_data.hdf5"
 
 
-@contextmanager
 def open_minari(path: Path, actions: Sequence[str] = ()) -> Iterator[Source]:
     """Open a dataset's folder, its folder ``data``, or the file ``main_data.hdf5``.
 
@@ -68,13 +66,8 @@ def open_minari(path: Path, actions: Sequence[str] = ()) -> Iterator[Source]:
         seed: dict[str, Attribute] = {} if facts.get("seed") is None else {"seed": int(facts["seed"])}
         return Demonstration.stored(name, observations, control, {}, {"episode_index": index, **seed})
 
-    files = tuple(sorted(path for path in folder.rglob("*") if path.is_file()))
-    yield Source(
-        tuple(f"demo_{index}" for index in sorted(stored)),
-        read,
-        files,
-        attributes={"dataset_id": str(storage.metadata.get("dataset_id", ""))},
-    )
+    names = tuple(f"demo_{index}" for index in sorted(stored))
+    yield Source(names, read, attributes={"dataset_id": str(storage.metadata.get("dataset_id", ""))})
 
 
 def _control(folder: Path, nested: Any, chosen: Sequence[str], where: str) -> np.ndarray:

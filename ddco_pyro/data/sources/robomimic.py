@@ -39,7 +39,6 @@ SIGNALS = ("datagen_info/subtask_term_signals", "obs/datagen_info/subtask_term_s
 # --- reading ----------------------------------------------------------------------------------------------------------
 
 
-@contextmanager
 def open_robomimic(path: Path) -> Iterator[Source]:
     """Open a file. Its source's ``read`` also takes the keys of observations and the names of labels; all if None.
 
@@ -66,7 +65,7 @@ def open_robomimic(path: Path) -> Iterator[Source]:
         ) -> Demonstration:
             return _read(member(data, name, h5py.Group, ""), name, observations, labels, order)
 
-        yield Source(names, read, (path,), {name: _mask(masks, name) for name in masks}, frequency, attributes)
+        yield Source(names, read, {name: _mask(masks, name) for name in masks}, frequency, attributes)
 
 
 def _ends(group: h5py.Group, name: str) -> dict[str, int]:
