@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jinja2
 import numpy as np
@@ -116,42 +116,81 @@ def starting_spec(
     :param hold_out_by: the attribute of demonstrations whose values are not to be on both sides of the split.
     :raises DemonstrationsError: nothing can be fitted to the demonstrations, or the attribute cannot divide them.
     """
+    facts, reasons = _usable_part(inspection)
+    observed, masks = facts.observations, [] if hold_out_by not in (None, EACH) else list(facts.masks)
+    vectors, images = (
+        [field for field in observed if field.image is image and not _left_out(facts, field)] for image in (False, True)
+    )
+    if not (vectors or images):
+        why = next((f": {field.place} {_left_out(facts, field)}" for field in observed), "")
+        look = command("inspect", facts.path)
+        raise DemonstrationsError(f"{facts.path}: no observation can be used{why}; see all with: {look}")
+    labels = _fullest_first([field for field in facts.labels if not _unusable(facts, field)])
+    count, many = _options(facts, labels[0]) if labels else (0, "")
+    counted = 1 < count <= MOST_OPTIONS * max(1, len(facts.tasks) * facts.several)
+    count, many = (count, many) if counted else (OPTIONS, "")
+    apart = _held_out(facts, hold_out_by) if hold_out_by not in (None, EACH) else ""
+    lengths, small = list(facts.lengths.values()), decided or Decided()
+    recipe, em = VECTORS if vectors else PICTURES, bool(vectors) and not images
+    batch = int(np.clip(round(recipe.batch_steps / np.mean(lengths)), 1, max(1, len(lengths) // 2)))
+    epochs = round(recipe.gradient_steps / np.ceil(len(lengths) / batch), -1)
+    few = em and len(lengths) < FEW and not {"train", "valid"} & set(masks) and not apart
+    text = ENVIRONMENT.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
+        facts=facts,
+        path=str(path),
+        lengths=lengths,
+        reasons=reasons,
+        by=hold_out_by if apart else None,
+        apart=apart,
+        each=hold_out_by == EACH or few,
+        masks=[name for name in ("train", "valid") if name in masks],
+        other_masks=[name for name in masks if name not in ("train", "valid")],
+        valid_fraction=_valid_fraction(len(lengths)),
+        labels=labels,
+        unusable_labels=[(field.key, why) for field in facts.labels if (why := _unusable(facts, field))],
+        count=count,
+        many=many,
+        vectors=vectors,
+        images=images,
+        tasks=facts.tasks if facts.several and em else {},
+        relative=_relative(vectors),
+        left_out=[(field, why) for field in observed if (why := _left_out(facts, field))],
+        batch=batch,
+        small=small,
+        starts=("windows", *STARTS) if small.window else STARTS,
+        margin=MARGIN,
+        em=em,
+        epochs=max(int(np.clip(epochs, recipe.epochs, MOST_EPOCHS)), EXACT_EPOCHS if em else 0),
+    )
+    parse_spec(read_yaml(text))  # the text is a valid spec
+    said = [decided.why, "heavy tails: " + HEAVY if decided.heavy else ""] if decided else []
+    tasks = f"{len(facts.tasks)} tasks: terminations and the meta-policy see which, policies do not"
+    notes = [f"{count} options, {many}" if many else "", tasks if facts.several else "", apart, *said]
+    return Starting(text, [note for note in notes if note])
+
+
+def _usable_part(inspection: Inspection) -> tuple[Inspection, list[str]]:
+    """What is left without the excluded demonstrations, and why odd ones are excluded.
+
+    :raises DemonstrationsError: nothing can be fitted to it.
+    """
     odd = list(inspection.odd) if _divides(inspection, inspection.odd) else []
     left_out = inspection.masks.get(EXCLUDE, ())
     excluded = sorted({*inspection.unreadable, *_few_affected(inspection), *odd, *left_out}, key=natural)
     reasons = [printable(line) for line in inspection.exclusions if odd]
     if excluded:
         inspection = inspect(inspection.path, exclude=excluded, where=inspection.where)
+    actions = inspection.actions
     try:
         check_division(tuple(inspection.lengths), inspection.masks)
+        if wrong := _unusable(inspection, actions) if actions else "is missing":
+            look = command("inspect", inspection.path)
+            raise DemonstrationsError(f"actions {wrong}; repair them first ({look})")
+        if all(dimension.constant for dimension in inspection.control):
+            raise DemonstrationsError(all_constant(inspection.control))
     except DemonstrationsError as error:
         raise DemonstrationsError(f"{inspection.path}: {error}") from None
-    actions = inspection.actions
-    wrong = _unusable(inspection, actions) if actions else "is missing"
-    look = command("inspect", inspection.path)
-    if wrong:
-        raise DemonstrationsError(f"{inspection.path}: actions {wrong}; repair them first ({look})")
-    if all(dimension.constant for dimension in inspection.control):
-        raise DemonstrationsError(f"{inspection.path}: {all_constant(inspection.control)}")
-    observed = inspection.observations
-    used = [field for field in observed if not _left_out(inspection, field)]
-    if not used:
-        why = next((f": {field.place} {_left_out(inspection, field)}" for field in observed), "")
-        raise DemonstrationsError(f"{inspection.path}: no observation can be used{why}; see all with: {look}")
-    labels = _fullest_first([field for field in inspection.labels if not _unusable(inspection, field)])
-    count, many = _options(inspection, labels[0]) if labels else (0, "")
-    counted = 1 < count <= MOST_OPTIONS * max(1, len(inspection.tasks) * inspection.several)
-    count, many = (count, many) if counted else (OPTIONS, "")
-    each = hold_out_by == EACH
-    apart = _held_out(inspection, hold_out_by) if hold_out_by and not each else ""
-    filled = {"labels": labels, "count": count, "many": many}
-    filled |= {"by": hold_out_by if apart else None, "each": each, "apart": apart, "small": decided or Decided()}
-    text = _filled(inspection, str(path), observed, used, reasons, filled)
-    parse_spec(read_yaml(text))  # the text is a valid spec
-    said = [decided.why, "heavy tails: " + HEAVY if decided.heavy else ""] if decided else []
-    tasks = f"{len(inspection.tasks)} tasks: terminations and the meta-policy see which, policies do not"
-    notes = [f"{count} options, {many}" if many else "", tasks if inspection.several else "", apart, *said]
-    return Starting(text, [note for note in notes if note])
+    return inspection, reasons
 
 
 def _options(inspection: Inspection, labels: Field) -> tuple[int, str]:
@@ -185,61 +224,6 @@ def _held_out(inspection: Inspection, attribute: str) -> str:
     return printable(f"held out: {attribute} {', '.join(found)}, {number} of {len(inspection.lengths)} demonstrations")
 
 
-def _filled(
-    inspection: Inspection,
-    path: str,
-    observed: Sequence[Field],
-    used: Sequence[Field],
-    reasons: Sequence[str],
-    decided: Mapping[str, Any],
-) -> str:
-    environment = jinja2.Environment(
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    environment.filters |= {"yaml": _text, "seen": _seen, "printable": printable}
-    lengths, masks = list(inspection.lengths.values()), [] if decided["by"] else list(inspection.masks)
-    vectors, images = ([field for field in used if field.image is image] for image in (False, True))
-    recipe = VECTORS if vectors else PICTURES
-    batch = int(np.clip(round(recipe.batch_steps / np.mean(lengths)), 1, max(1, len(lengths) // 2)))
-    epochs = round(recipe.gradient_steps / np.ceil(len(lengths) / batch), -1)
-    em = bool(vectors) and not images
-    few = em and len(lengths) < FEW and not {"train", "valid"} & set(masks) and not decided["by"]
-    unusable_labels = [(field.key, why) for field in inspection.labels if (why := _unusable(inspection, field))]
-    return environment.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
-        path=path,
-        lengths=lengths,
-        excluded=inspection.excluded,
-        reasons=reasons,
-        masks=[name for name in ("train", "valid") if name in masks],
-        other_masks=[name for name in masks if name not in ("train", "valid")],
-        valid_fraction=_valid_fraction(len(lengths)),
-        steps=sum(lengths),
-        unusable_labels=unusable_labels,
-        vectors=vectors,
-        tasks=inspection.tasks if inspection.several and vectors and not images else {},
-        where={name: list(values) for name, values in inspection.where.items()},
-        relative=_relative(vectors),
-        turns={
-            place: {"angles": one.angles["2π"], "quaternions": one.quaternions}
-            for place, one in inspection.turns.items()
-        },
-        relative_to=inspection.relative_to,
-        images=images,
-        pictures=not vectors,
-        left_out=[(field, why) for field in observed if (why := _left_out(inspection, field))],
-        notes=[printable(note) for note in inspection.notes],
-        batch=batch,
-        starts=("windows", *STARTS) if decided["small"].window else STARTS,
-        margin=MARGIN,
-        em=em,
-        epochs=max(int(np.clip(epochs, recipe.epochs, MOST_EPOCHS)), EXACT_EPOCHS if em else 0),
-        **{**decided, "each": decided["each"] or few},
-    )
-
-
 def _fullest_first(labels: Sequence[Field]) -> list[Field]:
     """Labels with the fewest unknown steps first, named ones of equals; constant ones, and ``segment``'s, are last."""
     keys = {field.key for field in labels}
@@ -262,6 +246,12 @@ def _seen(shape: Sequence[int]) -> tuple[list[int] | None, int]:
     scale = min(1.0, LONGEST / max(shape[:2]))
     size = [max(1, round(side * scale)) for side in shape[:2]]
     return size if scale < 1 else None, max(size) // SHIFT
+
+
+ENVIRONMENT = jinja2.Environment(
+    undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
+)
+ENVIRONMENT.filters |= {"yaml": _text, "seen": _seen, "printable": printable}
 
 
 def _valid_fraction(number: int) -> float:
