@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from contextlib import suppress
 from pathlib import Path
 
@@ -105,7 +105,10 @@ def write(asked: Asked, segmented: Segmented) -> str:
                     if mark in marks:
                         file["data"][name].attrs[mark] = marks[mark]
             if segmented.marks:
-                _write_mask(file, [name for name, marks in segmented.marks.items() if EXCLUDE in marks])
+                file.pop(f"mask/{EXCLUDE}", None)
+                leave_out(file, left_out := [name for name, marks in segmented.marks.items() if EXCLUDE in marks])
+                if left_out:
+                    file[f"mask/{EXCLUDE}"] = np.array(left_out, "S")
             if (names := _names(segmented)) != label_names(attributes_of(file["data"]) | attributes_of(file)):
                 holder = file if LABEL_NAMES in file.attrs else file["data"]
                 holder.attrs[LABEL_NAMES] = json.dumps(names)
@@ -114,17 +117,14 @@ def write(asked: Asked, segmented: Segmented) -> str:
     return f"{asked.out}: labels/{', labels/'.join(segmented.counts)}"
 
 
-def _write_mask(file: h5py.File, left_out: list[str]) -> None:
-    """Write the mask of the demonstrations that a person leaves out, and take them out of other masks."""
-    masks = file.get("mask", {})
-    members = {mask: [name.decode() for name in masks[mask][()]] for mask in masks if mask != EXCLUDE}
-    kept = {mask: [name for name in own if name not in left_out] for mask, own in members.items()}
-    changed = {mask: own for mask, own in kept.items() if own != members[mask]}
-    for mask, own in {**changed, EXCLUDE: left_out}.items():
-        if mask in masks:
+def leave_out(file: h5py.File, names: Collection[str]) -> None:
+    """Take demonstrations out of all masks; one without others goes."""
+    for mask, members in [*file.get("mask", {}).items()]:
+        kept = [name for name in members[()] if name.decode() not in names]
+        if len(kept) < len(members):
             del file[f"mask/{mask}"]
-        if own:
-            file[f"mask/{mask}"] = np.array(own, "S")
+            if kept:
+                file[f"mask/{mask}"] = np.array(kept, "S")
 
 
 def _names(segmented: Segmented) -> dict[str, list[str]]:

@@ -20,7 +20,7 @@ from ddco_pyro.data.labels import SOURCE, SOURCES, UNKNOWN
 from ddco_pyro.data.sources.lerobot import ANNOTATIONS, SUBTASK, WHO, LeRobot
 from ddco_pyro.data.sources.metadata import inside
 from ddco_pyro.errors import BadInput
-from ddco_pyro.segmenting.formats import Asked, Run
+from ddco_pyro.segmenting.formats import Asked
 from ddco_pyro.segmenting.segments import Segmented, Segments
 
 PERSISTENT, EVENTS = "language_persistent", "language_events"
@@ -71,8 +71,8 @@ def _origin(folder: Path) -> str:
 
 
 @contextmanager
-def _copied(asked: Asked, segmented: Segmented) -> Iterator[tuple[LeRobot, dict[int, tuple[Segments, list[Run]]]]]:
-    """A copy that the block adds to, and each episode with its subtasks, by its index.
+def _copied(asked: Asked, segmented: Segmented) -> Iterator[tuple[LeRobot, dict[int, Segments]]]:
+    """A copy that the block adds to, and the segments of each episode by its index.
 
     Videos are hard links where the file system has them, else copies.
     """
@@ -81,8 +81,7 @@ def _copied(asked: Asked, segmented: Segmented) -> Iterator[tuple[LeRobot, dict[
         shutil.copytree(
             folder, temporary, ignore=_loops, copy_function=_link, ignore_dangling_symlinks=True, dirs_exist_ok=True
         )
-        runs = {int(demo.name.removeprefix("demo_")): (demo, asked.runs(demo)) for demo in segmented.segments}
-        yield LeRobot(temporary), runs
+        yield LeRobot(temporary), {int(demo.name.removeprefix("demo_")): demo for demo in segmented.segments}
 
 
 def write_subtasks(asked: Asked, segmented: Segmented) -> str:
@@ -101,15 +100,13 @@ def write_subtasks(asked: Asked, segmented: Segmented) -> str:
             file.unlink()  # it may be a link
             writer = None
             for episode, rows in _episodes(table, subtasks):
-                demo, runs = subtasks[episode]
-                for name, values in _columns(asked, rows, demo, runs).items():
-                    rows = rows.drop_columns([name] if name in rows.column_names else []).append_column(name, values)
+                rows = _with(rows, _columns(asked, rows, subtasks[episode]))
                 rows = rows.drop_columns([SUBTASK] if SUBTASK in rows.column_names else [])
                 writer = writer or parquet.ParquetWriter(file, rows.schema)
                 writer.write_table(rows)
                 features = {name: about for name, about in {**FEATURES, **PEOPLE}.items() if name in rows.column_names}
                 atoms = [atom for atom in rows[PERSISTENT][0].as_py() if atom["style"] == "subtask"]
-                marks = segmented.marks.get(demo.name, {})
+                marks = segmented.marks.get(subtasks[episode].name, {})
                 episodes[str(episode)] = {"atoms": [{key: atom[key] for key in ATOM} for atom in atoms], **marks}
             assert writer is not None  # a file of a dataset holds an episode
             writer.close()
@@ -121,9 +118,14 @@ def write_subtasks(asked: Asked, segmented: Segmented) -> str:
     return str(asked.out)
 
 
-def _episodes(
-    table: pyarrow.Table, subtasks: Mapping[int, tuple[Segments, list[Run]]]
-) -> Iterator[tuple[int, pyarrow.Table]]:
+def _with(table: pyarrow.Table, columns: Mapping[str, Any]) -> pyarrow.Table:
+    """A table with columns, in place of those of the same name."""
+    for name, values in columns.items():
+        table = table.drop_columns([name] if name in table.column_names else []).append_column(name, values)
+    return table
+
+
+def _episodes(table: pyarrow.Table, subtasks: Mapping[int, Segments]) -> Iterator[tuple[int, pyarrow.Table]]:
     """The rows of each episode in a data file."""
     if "timestamp" not in table.column_names:
         raise BadInput("the data files have no column timestamp; subtasks begin at times of frames")
@@ -131,22 +133,14 @@ def _episodes(
     bounds = [0, *(np.flatnonzero(np.diff(index)) + 1).tolist(), len(index)]
     for start, stop in pairwise(bounds):
         rows, episode = table.slice(start, stop - start), int(index[start])
-        if episode not in subtasks or len(subtasks[episode][0]) != len(rows):
+        if episode not in subtasks or len(subtasks[episode]) != len(rows):
             raise BadInput(f"the data files have rows of episode {episode} that meta/episodes does not name")
         yield episode, rows
 
 
-def _options(runs: list[Run], steps: int) -> np.ndarray:
-    """The option of each frame of an episode [T], -1 for none."""
-    options = np.full(steps, UNKNOWN)
-    for option, start, stop in runs:
-        options[start:stop] = option
-    return options
-
-
-def _columns(asked: Asked, rows: pyarrow.Table, demo: Segments, runs: list[Run]) -> dict[str, Any]:
+def _columns(asked: Asked, rows: pyarrow.Table, demo: Segments) -> dict[str, Any]:
     """The new columns of an episode: the same list of language on each row, no events, and who says so."""
-    options, times, there = _options(runs, len(rows)), rows["timestamp"].to_pylist(), PERSISTENT in rows.column_names
+    options, times = demo.levels[asked.level].options, rows["timestamp"].to_pylist()
     starts = np.flatnonzero(np.diff(options, prepend=UNKNOWN)).tolist()
     entries: list[dict[str, Any]] = [
         {
@@ -162,7 +156,7 @@ def _columns(asked: Asked, rows: pyarrow.Table, demo: Segments, runs: list[Run])
     text, clock = pyarrow.string(), rows["timestamp"].type
     fields = {"role": text, "content": text, "style": text, "timestamp": clock, "camera": text}
     kind = pyarrow.struct({**fields, "tool_calls": pyarrow.list_(text)}.items())
-    if there:
+    if PERSISTENT in rows.column_names:
         kind = rows.schema.field(PERSISTENT).type.value_type
         entries += [entry for entry in rows[PERSISTENT][0].as_py() if entry["style"] != "subtask"]
         entries.sort(key=lambda entry: float(entry["timestamp"]))
@@ -190,20 +184,17 @@ def write_stages(asked: Asked, segmented: Segmented) -> str:
     with _copied(asked, segmented) as (dataset, subtasks):
         for file in sorted((dataset.folder / "meta" / "episodes").rglob("*.parquet")):
             table = parquet.read_table(file)
-            runs = [subtasks[episode][1] for episode in table["episode_index"].to_pylist()]
+            runs = [asked.runs(subtasks[episode]) for episode in table["episode_index"].to_pylist()]
             columns = {
-                "names": pyarrow.array([[asked.names[option] for option, _, _ in each] for each in runs]),
-                "start_frames": pyarrow.array([[start for _, start, _ in each] for each in runs]),
-                "end_frames": pyarrow.array([[stop - 1 for _, _, stop in each] for each in runs]),
+                "names": [[asked.names[option] for option, _, _ in each] for each in runs],
+                "start_frames": [[start for _, start, _ in each] for each in runs],
+                "end_frames": [[stop - 1 for _, _, stop in each] for each in runs],
             }
-            for name, values in columns.items():
-                if (column := f"dense_subtask_{name}") in table.column_names:
-                    table = table.drop_columns([column])
-                table = table.append_column(column, values)
+            table = _with(table, {f"dense_subtask_{name}": pyarrow.array(values) for name, values in columns.items()})
             known = {key: value for key, value in (table.schema.metadata or {}).items() if key != b"huggingface"}
             file.unlink()  # it may be a link
             parquet.write_table(table.replace_schema_metadata(known), file)
-        every = [_options(runs, len(demo)) for demo, runs in subtasks.values()]
+        every = [demo.levels[asked.level].options for demo in segmented.segments]
         shares = {option: np.mean([np.mean(each == option) for each in every]) for option in asked.order(segmented)}
         proportions = {asked.names[option]: float(share) for option, share in shares.items()}
         path = dataset.folder / "meta" / "temporal_proportions_dense.json"

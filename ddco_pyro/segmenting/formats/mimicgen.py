@@ -7,13 +7,13 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import h5py
 import numpy as np
 
 from ddco_pyro.data.files import whole_file
 from ddco_pyro.data.hdf5 import opened, written
 from ddco_pyro.errors import BadInput
 from ddco_pyro.segmenting.formats import Asked, Run
+from ddco_pyro.segmenting.formats.labels import leave_out
 from ddco_pyro.segmenting.segments import Segmented, chosen_names
 
 
@@ -72,8 +72,9 @@ def write(asked: Asked, segmented: Segmented) -> str:
             left_out = [name for name in file["data"] if name not in runs]
             for name in left_out:
                 del file[f"data/{name}"]
-            if left_out:
-                _forget(file, set(left_out))
+            leave_out(file, left_out)
+            if left_out and "total" in file["data"].attrs:
+                file["data"].attrs["total"] = sum(len(demo["actions"]) for demo in file["data"].values())
             for name, each in runs.items():
                 group = file[f"data/{name}"].require_group(TOOLS[asked.option].place)
                 steps = np.arange(len(file[f"data/{name}/actions"]))
@@ -115,13 +116,3 @@ def _one_order(asked: Asked, segmented: Segmented) -> tuple[list[str], dict[str,
         for place, name in enumerate(common)
     ]
     return names, {name: each for name, each in runs.items() if name not in problems}
-
-
-def _forget(file: h5py.File, names: set[str]) -> None:
-    """Remove demonstrations from masks, and from the number of all steps where the file has it."""
-    for name, members in file.get("mask", {}).items():
-        kept = [member for member in members[()] if member.decode() not in names]
-        del file[f"mask/{name}"]
-        file[f"mask/{name}"] = np.array(kept, dtype="S")
-    if "total" in file["data"].attrs:
-        file["data"].attrs["total"] = sum(len(demo["actions"]) for demo in file["data"].values())
