@@ -79,11 +79,17 @@ class View:
         if do == "drop":
             return self._drop(self._option(command, 1), self._option(command, 0, "into"))
         if do == "colour":
-            return [("colour", names[self._option(command, 1) - 1], _colour(command))]
+            colour = command.get("colour")
+            if not isinstance(colour, str) or not re.fullmatch("#[0-9a-f]{6}", colour):
+                raise BadInput("colour: write it as #rrggbb")
+            return [("colour", names[self._option(command, 1) - 1], colour)]
         if name is None:
             raise BadInput(f"{do}: names no demonstration, or is no command")
         if do == "mark":
-            return [("mark", name, *_mark(command))]
+            mark, value = command.get("mark"), command.get("value")
+            if mark not in MARKS or not isinstance(value, str if mark == "note" else bool):
+                raise BadInput(f"mark: give one of {', '.join(MARKS)}, and a value")
+            return [("mark", name, mark, value or None)]
         if do == "accept":
             return [] if name in self.document.accepted else self._accept(name, command.get("segments"))
         if do == "reopen":
@@ -211,21 +217,6 @@ class View:
         if not name or len(name) > LONGEST or not name.isprintable() or name in ("control", *others):
             raise BadInput(f"a name is one line of at most {LONGEST} characters that no other option has")
         return name
-
-
-def _mark(command: Mapping[str, Any]) -> tuple[str, Any]:
-    """A mark and its value; None takes it back."""
-    mark, value = command.get("mark"), command.get("value")
-    if mark not in MARKS or not isinstance(value, str if mark == "note" else bool):
-        raise BadInput(f"mark: give one of {', '.join(MARKS)}, and a value")
-    return str(mark), value or None
-
-
-def _colour(command: Mapping[str, Any]) -> str:
-    colour = command.get("colour")
-    if not isinstance(colour, str) or not re.fullmatch("#[0-9a-f]{6}", colour):
-        raise BadInput("colour: write it as #rrggbb")
-    return colour
 
 
 def whole(command: Mapping[str, Any], key: str) -> int:

@@ -240,27 +240,17 @@ class Journal:
             self._append({"labels": labels, "names": list(document.names)})
         self.at()
 
-    def edit(self, changes: Sequence[Change]) -> None:
-        """Make an edit of the document, once it is on disk."""
-        self._write([list(change) for change in changes])
+    def write(self, entry: str | Sequence[Change]) -> None:
+        """Edit the document, once that is on disk.
 
-    def undo(self) -> None:
-        """Take the last edit back.
-
-        :raises BadInput: there is none.
+        :param entry: changes, :data:`UNDO`, :data:`REDO`, or :data:`SAVED` where all edits are in the file of labels.
+        :raises BadInput: there is nothing to undo or to redo.
         """
-        if not self.document.done:
-            raise BadInput("nothing to undo")
-        self._write(UNDO)
-
-    def redo(self) -> None:
-        """Make the edit again that was taken back last.
-
-        :raises BadInput: there is none.
-        """
-        if not self.document.undone:
-            raise BadInput("nothing to redo")
-        self._write(REDO)
+        if entry in (UNDO, REDO) and not (self.document.done if entry == UNDO else self.document.undone):
+            raise BadInput(f"nothing to {entry}")
+        now = datetime.now(UTC).isoformat(timespec="seconds")
+        self._append({"by": self.annotator, "at": now, "edit": entry})
+        self.saved = _apply(self.document, entry)
 
     def at(self, address: str = "") -> None:
         """Say who has the file, and where it can be edited, for processes that are refused."""
@@ -290,15 +280,6 @@ class Journal:
         """Leave the file to other processes."""
         self.file.close()
         self._lock.unlink(missing_ok=True)
-
-    def save(self) -> None:
-        """Say that all edits are in the file of labels."""
-        self._write(SAVED)
-
-    def _write(self, entry: Any) -> None:
-        now = datetime.now(UTC).isoformat(timespec="seconds")
-        self._append({"by": self.annotator, "at": now, "edit": entry})
-        self.saved = _apply(self.document, entry)
 
     def _append(self, entry: Any) -> None:
         line = json.dumps(entry, separators=(",", ":")).encode() + b"\n"

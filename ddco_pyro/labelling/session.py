@@ -30,7 +30,7 @@ from ddco_pyro.evaluation.inferred import Inferred, runs, within
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.labelling.background import Background
 from ddco_pyro.labelling.commands import Segment, View, whole
-from ddco_pyro.labelling.document import FREE, SUFFIX, Change, Document, Journal, digest, version
+from ddco_pyro.labelling.document import FREE, SAVED, SUFFIX, Change, Document, Journal, digest, version
 from ddco_pyro.labelling.following import Following
 from ddco_pyro.labelling.proposals import (
     Proposals,
@@ -119,8 +119,7 @@ class Session:
             self.demos = replace(self.demos, demonstrations=tuple(with_task(demo, tasks) for demo in self.demos))
         self.form, self.in_place = format_of(path), out.exists() and out.samefile(path)
         self._check_out()
-        with open_source(path, where=where) as source:
-            self.files = source.files
+        self.files = [file for file in (path, *path.rglob("*")) if file.is_file()]
         self.version, self.frequency = version(self.files), self.demos.frequency
         known = [*skills, *fit.names[self.level][1 + len(skills) :]]
         self.document = Document({demo.name: len(demo) for demo in self.demos}, tuple(known))
@@ -130,8 +129,8 @@ class Session:
         if not (self.document.done or self.document.undone):
             there = read(out, where=where) if out.exists() and not self.in_place else self.demos
             if said := said_in(there, self.level, self.document.names, self.form == "lerobot", first is None):
-                self.journal.edit(said)
-                self.journal.save()
+                self.journal.write(said)
+                self.journal.write(SAVED)
         self.lock: threading.RLock = first.lock if first else threading.RLock()
         self.revision, self.edits, self.changed = 0, 0, set[int]()
         self.behind, self.inferring, self.inferred = False, False, dict.fromkeys(self.demos.names, 0)
@@ -533,13 +532,13 @@ class Session:
             if do == "mark" and self.first is not self:
                 return self.first.edit(command)
             if do in ("undo", "redo"):
-                getattr(self.journal, do)()
+                self.journal.write(str(do))
             else:
                 asked = self._taken(name, command) if do == "take" else self.view.changes(str(do), name, command)
                 changes = list(filter(document.alters, asked))
                 if not changes:
                     return {"revision": self.revision, "demo": index, "done": False}
-                self.journal.edit(changes)
+                self.journal.write(changes)
             touched = document.touched((document.undone if do == "undo" else document.done)[-1])
             if do in ("undo", "redo"):
                 index = self.demos.names.index(touched[0]) if touched else None
@@ -681,7 +680,7 @@ class Session:
                 for own in every:
                     own.version = version(self.files)
             for own in every:
-                own.journal.save()
+                own.journal.write(SAVED)
             steps = sum(int(self.document.said(name).sum()) for name in self.demos.names)
             what = f"labels/{self.level}" if self.form == "robomimic" else "subtasks"
             return f"{self.out}: {what}, {steps} of {sum(self.document.lengths.values())} steps"

@@ -46,7 +46,10 @@ def said(document):
 
 def act(labels, action):
     """One action of a document or a journal."""
-    getattr(labels, action)() if isinstance(action, str) else labels.edit(action)
+    if isinstance(labels, Journal):
+        labels.write(action)
+    else:
+        getattr(labels, action)() if isinstance(action, str) else labels.edit(action)
 
 
 def painted(changes, labels):
@@ -108,7 +111,7 @@ def test_a_journal_torn_at_any_byte_gives_the_state_after_its_whole_lines(tmp_pa
     again = empty()
     journal = Journal(path, again, "option")
     assert said(again) == next((states[at] for at in sorted(states, reverse=True) if at <= size), said(empty()))
-    journal.edit([("paint", "demo_1", 0, 3, 1)])  # what follows a torn line is kept whole
+    journal.write([("paint", "demo_1", 0, 3, 1)])  # what follows a torn line is kept whole
     journal.close()
     third = empty()
     Journal(path, third, "option").close()
@@ -132,7 +135,7 @@ def recorded(lengths=LENGTHS, control=0.0):
 def test_edits_of_something_else_are_refused_and_kept(tmp_path, other):
     path, ours = tmp_path / "labels.journal", digest(recorded(), "option")
     journal = Journal(path, empty(), ours)
-    journal.edit([("paint", "demo_0", 0, 6, 1)])
+    journal.write([("paint", "demo_0", 0, 6, 1)])
     journal.close()
     content = path.read_bytes()
     with pytest.raises(BadInput, match="edits of other demonstrations or of another level; give another --out"):
@@ -173,7 +176,7 @@ def test_an_edit_that_a_full_disk_cuts_is_not_made(tmp_path):
     resource.setrlimit(resource.RLIMIT_FSIZE, (len(content) + 20, before[1]))
     try:
         with pytest.raises(OSError, match="No space left on device"):
-            journal.edit([("paint", "demo_0", 0, 6, 2)])
+            journal.write([("paint", "demo_0", 0, 6, 2)])
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert path.read_bytes() == content
