@@ -13,7 +13,6 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
-from ddco_pyro.data.arrays import LARGEST
 from ddco_pyro.data.controls import described, few, notes
 from ddco_pyro.data.errors import printable
 from ddco_pyro.drawing import words
@@ -391,10 +390,7 @@ def _range(field: Field) -> str:
 
 def _notes(field: Field) -> str:
     notes = ["video" if field.video else "image"] if field.image else []
-    if field.nan or field.infinite:
-        notes.append(f"{field.nan} NaN, {field.infinite} infinite")
-    if field.huge:
-        notes.append(f"{field.huge} beyond ±{LARGEST:g}")
+    notes += [field.unusable] if field.unusable else []
     if field.names:
         notes.append(", ".join(f"{value}: {name}" for value, name in enumerate(field.names)))
     if field.unknown:

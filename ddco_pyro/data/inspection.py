@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import re
+from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import islice
@@ -22,6 +23,7 @@ from ddco_pyro.data.controls import (
     control_dimensions,
     control_parts,
     described,
+    few,
     most_few,
     notes,
     rounding,
@@ -165,10 +167,8 @@ class Field:
             for name in ("minimum", "maximum")
         }
         shown: dict[str, Any] = {"dtype": str(self.dtype), "shape": [*self.shape], "values": sorted(self.values)}
-        shown |= {
-            "demonstrations": self.demonstrations,
-            "of_tasks": {t: sorted(own) for t, own in self.of_tasks.items()},
-        }
+        of_tasks = {task: sorted(own) for task, own in self.of_tasks.items()}
+        shown |= {"demonstrations": self.demonstrations, "of_tasks": of_tasks}
         return asdict(self) | ends | shown | {"constant": self.constant, "rounding": self.rounding}
 
 
@@ -305,7 +305,7 @@ class _Inspector:
 
     def __init__(self, source: Source, found: Inspection) -> None:
         self.source, self.found = source, found
-        self.problems: dict[tuple[str, str], list[str]] = {}  # messages by kind and subject
+        self.problems = defaultdict[tuple[str, str], list[str]](list)  # messages by kind and subject
         self.vectors: dict[str, dict[str, np.ndarray]] = {}  # controls and narrow observations, by place and name
         self.digests: dict[str, bytes] = {}
         self.traits: list[Traits] = []
@@ -317,12 +317,17 @@ class _Inspector:
             try:
                 places[name] = self._read(name)
             except DemonstrationsError as error:
-                self._problem("unreadable", str(error), re.sub(r"\d+", "", str(error).removeprefix(name)))
+                self.problems["unreadable", re.sub(r"\d+", "", str(error).removeprefix(name))].append(str(error))
                 found.unreadable.append(name)
         for name, there in places.items():
             for place in (place for place in fields if place not in there):
-                self._problem("missing", f"{name}: {place} is missing", place)
-        self._name_labels()
+                self.problems["missing", place].append(f"{name}: {place} is missing")
+        try:
+            for key, names in label_names(self.source.attributes).items():
+                if array := fields.get(f"labels/{key}"):
+                    array.names = names
+        except DemonstrationsError as error:
+            self.problems["names", "labels"].append(str(error))
         controls = self.vectors.get("actions", {})
         found.control = control_dimensions(controls)
         odd = unlike(self.traits) | self._odd(found.control, controls)
@@ -333,7 +338,7 @@ class _Inspector:
         )
         found.problems = [*kinds, *_problems_of_division(self.source), *_problems(found)]
         self._coincidences(controls)
-        found.clocks = (*_slow(found.frequency), *self._clocks())
+        found.clocks = tuple(self._clocks())
 
     def _coincidences(self, controls: Mapping[str, np.ndarray]) -> None:
         """What of the demonstrations coincides, and the control minus what it is a target of."""
@@ -365,7 +370,10 @@ class _Inspector:
         found.coincidences = tuple(lines)
 
     def _clocks(self) -> Iterator[str]:
-        """A line for the first fault of each clock among observations."""
+        """A line for a rate that may be a period in milliseconds, and for the first fault of each observed clock."""
+        if (rate := self.found.frequency) and rate <= SLOWEST:
+            said = f'if its dt is in milliseconds, write file.attrs["control_frequency"] = {1000 * rate:.4g}'
+            yield f"a step lasts {1 / rate:.4g} s by the file: {said}"
         for place, each in self.vectors.items():
             if place.rpartition("/")[2] in CLOCKS and self.found.fields[place].minimum.shape == (1,):
                 faults = ((name, clock_fault(rows[:, 0].astype(float), GAP)) for name, rows in each.items())
@@ -390,14 +398,6 @@ class _Inspector:
             reasons = {**dict.fromkeys(() if dimension.values else dimension.exceptions, why), **reasons}
         return reasons
 
-    def _name_labels(self) -> None:
-        try:
-            for name, names in label_names(self.source.attributes).items():
-                if array := self.found.fields.get(f"labels/{name}"):
-                    array.names = names
-        except DemonstrationsError as error:
-            self._problem("names", str(error), "labels")
-
     def _read(self, name: str) -> Collection[str]:
         """Read a demonstration, vectors whole and pictures in blocks; the places of its arrays."""
         demo = self.source.read(name)
@@ -409,7 +409,7 @@ class _Inspector:
         for place, array in arrays.items():
             field = self.found.fields.get(place) or Field(place, array.shape[1:], array.dtype, np.zeros(0), np.zeros(0))
             if problem := different(array, len(demo), field.shape, "the first"):
-                self._problem("shape", f"{name}: {place} {problem}", place)
+                self.problems["shape", place].append(f"{name}: {place} {problem}")
                 continue
             self.found.fields[place] = field
             field.having.append(name)
@@ -432,21 +432,11 @@ class _Inspector:
         self.traits += [traits_of(name, task, vectors)] if "actions" in vectors else []
         return arrays.keys()
 
-    def _problem(self, kind: str, message: str, about: str) -> None:
-        self.problems.setdefault((kind, about), []).append(message)
-
 
 def _vector(place: str, array: Observed) -> bool:
     """Whether an array is the control, or an observation of few numbers that is read whole."""
     narrow = place == "actions" or math.prod(array.shape[1:]) <= MOST_DIMENSIONS
     return array.dtype.kind in NUMBERS and narrow and not is_picture(array)
-
-
-def _slow(frequency: float | None) -> Iterator[str]:
-    """A line for a rate that may be a period in milliseconds."""
-    if frequency and frequency <= SLOWEST:
-        said = f'if its dt is in milliseconds, write file.attrs["control_frequency"] = {1000 * frequency:.4g}'
-        yield f"a step lasts {1 / frequency:.4g} s by the file: {said}"
 
 
 def _problems_of_division(source: Source) -> Iterator[str]:
@@ -470,6 +460,5 @@ def _problems(found: Inspection) -> Iterator[str]:
                 f"{array.place} has {array.unusable}, the first in {name} at step {step}; "
                 f"{affected} of {array.demonstrations} demonstrations {'is' if affected == 1 else 'are'} affected"
             )
-    empty = [name for name, steps in found.lengths.items() if steps == 0]
-    if empty:
-        yield f"{', '.join(empty[:3])}{' ...' if len(empty) > 3 else ''}: no steps"
+    if empty := [name for name, steps in found.lengths.items() if steps == 0]:
+        yield f"{few(empty)}: no steps"

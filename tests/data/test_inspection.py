@@ -112,7 +112,7 @@ def test_values_that_cannot_be_used_have_a_place(path: Path) -> None:
         "obs/pose has 1 NaN and 0 infinite values and 4 beyond ±1e+30, the first in demo_3 at step 2; 2 of 5 "
         "demonstrations are affected",
     ]
-    assert "1 NaN, 0 infinite; 4 beyond ±1e+30" in call("inspect", path).out
+    assert "1 NaN and 0 infinite values and 4 beyond ±1e+30" in call("inspect", path).out
     assert inspect(path, exclude=["demo_3", "demo_4"]).problems == []
 
 
