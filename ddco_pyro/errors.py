@@ -46,6 +46,18 @@ def path_of(given: Any, what: str) -> Path:
     return Path(given)
 
 
+def refuse_unknown(
+    what: str, given: str, known: Iterable[str], error: type[BadInput] = BadInput, place: str = ""
+) -> None:
+    """Refuse a name that is none of the known ones.
+
+    :raises BadInput: it is none, as ``error``.
+    """
+    if given not in (names := list(known)):
+        there = ", ".join(names) or "none"
+        raise error(f"{place}there is no {what} {given!r}{nearest(given, names)}; there is: {there}")
+
+
 def command(*words: object) -> str:
     """A command of this program, quoted for the shell.
 

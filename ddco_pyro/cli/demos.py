@@ -233,7 +233,6 @@ def import_(
     from ddco_pyro.cli import console
     from ddco_pyro.data.annotations import LabelTable
     from ddco_pyro.data.importing import Choice, import_demonstrations
-    from ddco_pyro.events import DemonstrationsDone
 
     if labels is None and (fps or columns or unit):
         raise BadInput("--fps, --columns and --unit are about the table of --labels; give it, or --hz for another rate")
@@ -242,7 +241,7 @@ def import_(
     where = where_of(wheres)
     choice = Choice(tuple(observations), mask, videos, size, hz, skip_broken, tuple(actions), table, where)
     with console.Progress("importing") as progress:
-        imported = import_demonstrations(sources, out, form, choice, lambda *done: progress(DemonstrationsDone(*done)))
+        imported = import_demonstrations(sources, out, form, choice, progress)
     for name, reason in imported.left_out.items():
         print(f"left out {name}: {reason}", file=sys.stderr)
     for line in imported.notes:

@@ -13,7 +13,7 @@ import typer
 
 from ddco_pyro.cli import BRACKET, AllowCode, Overrides, RunPath, Wheres, where_of, written
 from ddco_pyro.data.files import Output, check_outputs
-from ddco_pyro.errors import BadInput
+from ddco_pyro.errors import BadInput, refuse_unknown
 from ddco_pyro.segmenting.formats import FORMATS, Asked, check_format, write_format
 
 if TYPE_CHECKING:
@@ -168,11 +168,11 @@ def segment(
     from ddco_pyro.segmenting.segments import segments
 
     fit = load(run, allow_code)
-    if level is not None and fit.names and level not in fit.names:
-        raise BadInput(f"--level: there is no level {level!r} (there is: {', '.join(fit.names)})")
+    if level is not None and fit.names:
+        refuse_unknown("level", level, fit.names, place="--level: ")
     with open_source(demos, where=where_of(wheres)) as source, console.Progress("segmenting") as progress:
         subtasks = level or next(iter(fit.names), "")
-        asked = [Asked(option, path, fit, run, demos, source, subtasks, same_order) for option, path in places.items()]
+        asked = [Asked(option, path, fit, source, subtasks, same_order) for option, path in places.items()]
         if fit.names:  # without options, segments() refuses the run
             for each in asked:
                 check_format(each)

@@ -23,7 +23,8 @@ from ddco_pyro.data.sources.folder import open_pooled
 from ddco_pyro.data.sources.metadata import FREQUENCY
 from ddco_pyro.data.sources.robomimic import robomimic_file, write_demonstration
 from ddco_pyro.data.tasks import Where, task_of
-from ddco_pyro.errors import BadInput, nearest
+from ddco_pyro.errors import BadInput, refuse_unknown
+from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,7 @@ def import_demonstrations(
     out: Path,
     form: str | None = None,
     choice: Choice = Choice(),
-    on_demonstration: Callable[[int, int], None] = lambda done, total: None,
+    on_event: OnEvent = ignore,
 ) -> Imported:
     """Write the demonstrations of a file or folder, or of several that are pooled, into ``out``, whole or not at all.
 
@@ -97,14 +98,16 @@ def import_demonstrations(
             labels, label_names, notes = labels_of_table(choice.labels, whole)
             whole = replace(whole, read=partial(_labelled, whole, labels))
             about[LABEL_NAMES] = json.dumps(label_names)
-        names, masks, rate = _names(whole, choice), dict[str, tuple[str, ...]](), choice.hz or whole.frequency
+        if choice.mask is not None:
+            refuse_unknown("mask", choice.mask, whole.masks, DemonstrationsError)
+        names = [name for name in whole.names if choice.mask is None or name in whole.masks[choice.mask]]
+        masks, rate = dict[str, tuple[str, ...]](), choice.hz or whole.frequency
         about = {**whole.attributes, **({FREQUENCY: rate} if rate else {}), **about}
         about |= {"source": ", ".join(path.name for path in paths), "source_format": whole.format}
         alone = _of_some_tasks(whole, names)
         chosen = partial(_chosen, whole, choice=choice, alone=alone)
         left_out = _unusable(names, chosen)  # before pictures are decoded
         _refuse(left_out, names, choice)
-        first: Demonstration | None = None
         with robomimic_file(out, about, masks) as data:
             for number, name in enumerate(names):
                 if name not in left_out:
@@ -115,16 +118,14 @@ def import_demonstrations(
                     except DemonstrationsError as error:
                         left_out[name] = error
                         _refuse(left_out, names, choice)
-                    else:
-                        notes = notes if first else [*_unread(whole.read(name), demo.observations, alone), *notes]
-                        first = first or demo
-                on_demonstration(number + 1, len(names))
-            if first is None:
+                on_event(DemonstrationsDone(number + 1, len(names)))
+            written = tuple(name for name in whole.names if name in data)
+            if not written:
                 why = next(iter(left_out.values()), "there is none")
                 raise DemonstrationsError(f"{paths[0]}: none of its demonstrations can be used: {why}")
-            written = tuple(name for name in whole.names if name in data)
             kept = {mask: tuple(name for name in members if name in data) for mask, members in whole.masks.items()}
             masks |= {mask: members for mask, members in kept.items() if members}
+        notes = [*_unread(whole.read(written[0]), chosen(written[0]).observations, alone), *notes]
     reasons = {name: str(error) for name, error in left_out.items()}
     return Imported(out, written, reasons, tuple(notes), {key: len(each) for key, each in labels.items()})
 
@@ -173,18 +174,6 @@ def _refuse(left_out: Mapping[str, DemonstrationsError], names: Sequence[str], c
         raise type(error)(f"{error}{advice}")
 
 
-def _names(source: Source, choice: Choice) -> Sequence[str]:
-    if choice.mask is None:
-        return source.names
-    if choice.mask not in source.masks:
-        known = ", ".join(source.masks) or "none"
-        raise DemonstrationsError(
-            f"there is no mask {choice.mask!r}{nearest(choice.mask, source.masks)}; there is: {known}"
-        )
-    members = set(source.masks[choice.mask])
-    return tuple(name for name in source.names if name in members)
-
-
 def _labelled(source: Source, labels: Mapping[str, Mapping[str, np.ndarray]], name: str) -> Demonstration:
     """A demonstration with the labels of a table, in place of those of the same name."""
     demo = source.read(name)
@@ -213,10 +202,7 @@ def _chosen(source: Source, name: str, choice: Choice, alone: Mapping[str, str])
     known = demo.observations
     keys = {**dict.fromkeys(known), **{given: key for given, key in source.given.items() if key in known}}
     for key in choice.observations:
-        if key not in keys:
-            raise DemonstrationsError(
-                f"{name}: there is no observation {key!r}{nearest(key, keys)}; there is: {', '.join(known)}"
-            )
+        refuse_unknown("observation", key, keys, DemonstrationsError, f"{name}: ")
     videos = {key for key, array in known.items() if isinstance(array, LazyArray) and array.video}
     without = {*alone, *(() if choice.videos else videos)}
     usual = [key for key in known if known[key].dtype.kind in NUMBERS and key not in without]

@@ -82,7 +82,7 @@ def padded(
     whole = np.zeros((len(frames), steps.stop - steps.start, *shape), frames[0].dtype)
     for row, array in enumerate(frames):
         at = 0
-        for seen in map(transform, blocks(array, steps)):
+        for seen in (transform(block) for block in blocks(array, steps)):
             target = whole[row, at : at + len(seen)]
             shift_into(target, seen, *((0, 0) if shifts is None else shifts[row].tolist()))
             at += len(seen)

@@ -83,7 +83,7 @@ def are_several(tasks: Sequence[str]) -> bool:
 
 def of_tasks(
     tasks: Sequence[str], labels: Sequence[Mapping[str, np.ndarray]], known: Mapping[str, Sequence[str]]
-) -> tuple[list[dict[str, np.ndarray]], dict[str, Sequence[str]]]:
+) -> tuple[list[dict[str, np.ndarray]], dict[str, list[str]]]:
     """Labels [T] by name, numbered so that those of several tasks differ unless the file names them, and all names.
 
     >>> of_tasks(["push", "push", "reach", "reach"], [{"phase": np.array([0, 2])}] * 4, {})[1]
@@ -92,7 +92,7 @@ def of_tasks(
     :param tasks: of each demonstration.
     :param known: by name of labels, the names of labels 0, 1, ... that the file has.
     """
-    numbered, names = [dict(own) for own in labels], dict(known)
+    numbered, names = [dict(own) for own in labels], {key: [*own] for key, own in known.items()}
     every = dict.fromkeys(key for own in labels for key in own if not key.endswith((BOUNDARY, SOURCE)))
     for key in (key for key in every if key not in known and are_several(tasks)):
         having = [(task, own) for task, own in zip(tasks, numbered, strict=True) if key in own]

@@ -25,7 +25,7 @@ from ddco_pyro.data.sources import Source, format_of, open_source
 from ddco_pyro.data.sources.metadata import FREQUENCY
 from ddco_pyro.data.tasks import Where, with_task
 from ddco_pyro.drawing.timeline import text
-from ddco_pyro.errors import BadInput, reason
+from ddco_pyro.errors import BadInput, reason, refuse_unknown
 from ddco_pyro.evaluation.inferred import Inferred, runs, within
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.labelling.background import Background
@@ -111,8 +111,7 @@ class Session:
         self.where = where
         self.run, self.fit, self.path, self.out = fit, fit, path, out
         self.level, self.team, self.first = level or next(iter(fit.names)), team or Team(), first or self
-        if self.level not in fit.names:
-            raise BadInput(f"--level: there is no level {self.level!r} (there is: {', '.join(fit.names)})")
+        refuse_unknown("level", self.level, fit.names, place="--level: ")
         self.beside = list[Session]()
         self.demos: Demonstrations = first.demos if first else read(path, fit.hierarchy.encoder.shapes, where)
         if (tasks := fit.hierarchy.encoder.tasks) and not first:
@@ -687,17 +686,8 @@ class Session:
 
     def _write(self, option: str, place: Path, source: Source, segmented: Segmented, level: str) -> str:
         names = {own.level: own.document.names for own in (self, *self.beside)}
-        named = replace(self.fit, named={**self.fit.named, **names})
-        asked = Asked(
-            option,
-            place,
-            named,
-            self.run.folder or Path(),
-            self.path,
-            source,
-            level,
-            annotator=self.journal.annotator,
-        )
+        named = replace(self.fit, named={**self.fit.named, **names}, folder=self.run.folder)
+        asked = Asked(option, place, named, source, level, annotator=self.journal.annotator)
         if place != self.out:
             check_format(asked)
         return write_format(asked, segmented)
@@ -713,8 +703,7 @@ class Session:
         :returns: the file or folder that was written.
         :raises BadInput: there is no such format, or it does not fit the demonstrations.
         """
-        if form not in self.formats:
-            raise BadInput(f"there is no format {form!r}; there is: {', '.join(self.formats)}")
+        refuse_unknown("format", form, self.formats)
         about = FORMATS[f"--{form}"]
         place = folder / f"segments{'' if about.kind == 'folder' else about.suffix or f'.{form}'}"
         with open_source(self.path, where=self.where) as source:

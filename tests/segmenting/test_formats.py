@@ -74,10 +74,10 @@ class Planted:
     def write(self, option, name, demos=None, **more):
         """What is written in a format, checked as the command checks it before."""
         spec = SimpleNamespace(demonstrations=SimpleNamespace(path=None, exclude=()))
-        fit = SimpleNamespace(names={"skill": NAMES}, spec=spec)
+        fit = SimpleNamespace(names={"skill": NAMES}, spec=spec, place="run")
         out, demos = self.folder / name, demos or self.file
         with open_source(demos) as source:
-            asked = Asked(option, out, fit, self.folder / "run", demos, source, "skill", **more)
+            asked = Asked(option, out, fit, source, "skill", **more)
             check_format(asked)
             self.said = write_format(asked, self.segmented)
         return out

@@ -310,7 +310,7 @@ def test_subtasks_are_written_as_lerobot_writes_them(tmp_path):
     )
     with open_source(LEROBOT) as source:
         fit = SimpleNamespace(names={"skill": ("control", "option 1", "option 2")})
-        write_subtasks(Asked("--lerobot", tmp_path / "out", fit, tmp_path, LEROBOT, source, "skill"), found)
+        write_subtasks(Asked("--lerobot", tmp_path / "out", fit, source, "skill"), found)
     ours, theirs = rows_of(tmp_path / "out"), parquet.read_table(LANGUAGE / "data.parquet")
     assert ours.column_names == theirs.column_names
     assert ours.to_pylist() == theirs.to_pylist()
@@ -344,7 +344,7 @@ def test_a_copy_with_subtasks(lerobot_run, tmp_path):
 
 def test_what_cannot_be_written_of_a_lerobot_dataset(lerobot_run, tmp_path):
     out = tmp_path / "out"
-    message = "there is no level 'skil' (there is: skill"
+    message = "there is no level 'skil' (did you mean 'skill'?); there is: skill"
     refused(message, lerobot_run.folder, LEROBOT, "--lerobot", out, "--level", "skil")
     message = "is no HDF5 file in robomimic's layout, which --out needs; name another format"
     refused(message, lerobot_run.folder, LEROBOT, "--html", tmp_path / "page", "--out", out)

@@ -15,7 +15,7 @@ from ddco_pyro.data.demonstration import NOTHING, Attribute, Demonstration
 from ddco_pyro.data.errors import DemonstrationsError, Located
 from ddco_pyro.data.formats import FORMATS, LAYOUTS
 from ddco_pyro.data.tasks import Where, chosen
-from ddco_pyro.errors import command, nearest, path_of
+from ddco_pyro.errors import command, path_of, refuse_unknown
 
 __all__ = ["Source", "narrowed", "open_source", "refuse_foreign"]
 
@@ -61,9 +61,7 @@ def open_source(
     """
     path = path_of(path, "demonstrations")
     form = form or format_of(path)
-    if form not in FORMATS:
-        known = ", ".join(FORMATS)
-        raise DemonstrationsError(f"{path}: there is no format {form!r}{nearest(form, FORMATS)}; there is: {known}")
+    refuse_unknown("format", form, FORMATS, DemonstrationsError, f"{path}: ")
     if actions and not FORMATS[form].parts:
         several = " or ".join(about.text for about in FORMATS.values() if about.parts)
         raise DemonstrationsError(f"{path}: has the format {form}, with one control; --action is for {several}")

@@ -76,7 +76,10 @@ class LeRobot:
 
     def __init__(self, folder: Path, actions: Sequence[str] = ()) -> None:
         self.folder = folder
-        self.info = _info(folder / "meta" / "info.json")
+        with reading(path := folder / "meta" / "info.json"):
+            self.info: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+            if not isinstance(self.info.get("features"), dict):
+                raise DemonstrationsError(f"{path}: says nothing of features; is it LeRobot's?")
         version = str(self.info.get("codebase_version", "of no version"))
         if not version.startswith(VERSION):
             raise DemonstrationsError(
@@ -322,14 +325,6 @@ def _dimensions(feature: dict[str, Any]) -> list[str]:
     if isinstance(names, dict):
         names = next((each for each in names.values() if isinstance(each, list)), None)
     return [str(name) for name in names or ()] if len(feature["shape"]) == 1 else []
-
-
-def _info(path: Path) -> dict[str, Any]:
-    with reading(path):
-        info = json.loads(path.read_text(encoding="utf-8"))
-        if not isinstance(info.get("features"), dict):
-            raise DemonstrationsError(f"{path}: says nothing of features; is it LeRobot's?")
-    return info
 
 
 def open_lerobot(path: Path, actions: Sequence[str] = ()) -> Iterator[Source]:

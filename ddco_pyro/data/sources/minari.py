@@ -14,7 +14,7 @@ from ddco_pyro.data.errors import DemonstrationsError, reading
 from ddco_pyro.data.hdf5 import dataset_at, datasets, member, opened
 from ddco_pyro.data.sources import Source
 from ddco_pyro.data.sources.metadata import check_count, joined, stored_keys
-from ddco_pyro.errors import nearest
+from ddco_pyro.errors import refuse_unknown
 
 BARE = "observation"
 """Key of an observation array without a name."""
@@ -74,10 +74,7 @@ def _control(folder: Path, nested: Any, chosen: Sequence[str], where: str) -> np
     """The chosen actions [T, A] of an episode."""
     parts = _flat(folder, nested, "actions")
     for key in chosen:
-        if key not in parts:
-            raise DemonstrationsError(
-                f"{where}: there is no action {key!r}{nearest(key, parts)}; there is: {', '.join(parts)}"
-            )
+        refuse_unknown("action", key, parts, DemonstrationsError, f"{where}: ")
     return joined({key: parts[key] for key in chosen or parts}, where)
 
 

@@ -53,12 +53,11 @@ def open_robomimic(path: Path) -> Iterator[Source]:
         frequency, order = frequency_of(attributes), list[str]()
         if names:
             with suppress(DemonstrationsError):  # reading it tells
-                order = list(_ends(member(data, names[0], h5py.Group, ""), names[0]))
-                known_names = label_names(attributes) if order else {}
-                attributes |= {LABEL_NAMES: json.dumps({SUBTASK: [*order, "last"], **known_names})} if order else {}
-        if frequency is None and names:
-            with suppress(DemonstrationsError):  # reading it tells
-                frequency = rate(attributes_of(member(data, names[0], h5py.Group, "")))
+                first = member(data, names[0], h5py.Group, "")
+                frequency = frequency or rate(attributes_of(first))
+                if order := list(_ends(first, names[0])):
+                    named = {SUBTASK: [*order, "last"], **label_names(attributes)}
+                    attributes[LABEL_NAMES] = json.dumps(named)
 
         def read(
             name: str, observations: Sequence[str] | None = None, labels: Sequence[str] | None = None

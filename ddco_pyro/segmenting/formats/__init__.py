@@ -33,7 +33,7 @@ class Asked:
 
     :param option: the option of ``segment`` that asks for the format, such as ``--csv``.
     :param out: the file or folder to write.
-    :param demos: the path of the demonstrations; ``source`` is the same, open.
+    :param source: the demonstrations.
     :param level: the level whose options are subtasks.
     :param annotator: who labelled; empty where no one did.
     :param same_order: leave out demonstrations whose options follow another order than most, rather than refuse.
@@ -42,8 +42,6 @@ class Asked:
     option: str
     out: Path
     fit: Fit
-    run: Path
-    demos: Path
     source: Source
     level: str
     same_order: bool = False
@@ -153,10 +151,8 @@ def check_format(asked: Asked) -> None:
     """
     form = format_of(asked.option)
     if form.takes not in ("", asked.source.format):
-        raise BadInput(
-            f"{asked.demos}: is no {TAKEN[form.takes]}, which {asked.option} needs; name another format, such as --csv "
-            "or --html"
-        )
+        needs = f"is no {TAKEN[form.takes]}, which {asked.option} needs"
+        raise BadInput(f"{asked.source.path}: {needs}; name another format, such as --csv or --html")
     if form.extra and find_spec(PACKAGES[form.extra]) is None:
         remedy = f"install it with: pip install 'ddco-pyro[{form.extra}]'"
         raise BadInput(f"{asked.option} needs {PACKAGES[form.extra]}; {remedy}")

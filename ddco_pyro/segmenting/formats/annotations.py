@@ -101,7 +101,7 @@ def _task(asked: Asked, demo: Segments) -> dict[str, Any]:
     score = min((region["score"] for region in found), default=0.0)
     return {
         "data": {"series": series, DEMO: demo.name},
-        "predictions": [{"model_version": str(asked.run), "score": score, "result": found}],
+        "predictions": [{"model_version": asked.fit.place, "score": score, "result": found}],
     }
 
 

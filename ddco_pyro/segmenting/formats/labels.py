@@ -50,9 +50,9 @@ def check(asked: Asked) -> None:
 
     :raises BadInput: the copy's place is taken, or a demonstration has labels of that name from another source.
     """
-    if not _same(asked.out, asked.demos):
-        check_copy(asked.demos, asked.out)
-    check_labels(asked.demos, asked.fit.names, chosen_names(asked.source, asked.fit))
+    if not _same(asked.out, asked.source.path):
+        check_copy(asked.source.path, asked.out)
+    check_labels(asked.source.path, asked.fit.names, chosen_names(asked.source, asked.fit))
 
 
 def check_labels(path: Path, given: Iterable[str], names: Iterable[str]) -> None:
@@ -88,7 +88,7 @@ def write(asked: Asked, segmented: Segmented) -> str:
     Labels of the same name are replaced. The names of options become names of their labels.
     """
     with whole_file(asked.out) as temporary:
-        shutil.copyfile(asked.demos, temporary)
+        shutil.copyfile(asked.source.path, temporary)
         with written(temporary, "r+") as file:
             for demo in segmented.segments:
                 group = file["data"][demo.name].require_group("labels")
@@ -112,8 +112,8 @@ def write(asked: Asked, segmented: Segmented) -> str:
             if (names := _names(segmented)) != label_names(attributes_of(file["data"]) | attributes_of(file)):
                 holder = file if LABEL_NAMES in file.attrs else file["data"]
                 holder.attrs[LABEL_NAMES] = json.dumps(names)
-            if not _same(asked.out, asked.demos):
-                file.attrs[COPIED] = _digest(asked.demos)
+            if not _same(asked.out, asked.source.path):
+                file.attrs[COPIED] = _digest(asked.source.path)
     return f"{asked.out}: labels/{', labels/'.join(segmented.counts)}"
 
 

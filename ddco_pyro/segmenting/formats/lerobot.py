@@ -54,8 +54,8 @@ def check_bare(asked: Asked) -> None:
 
     :raises BadInput: it has.
     """
-    if {SUBTASK, PERSISTENT} & LeRobot(asked.demos).features.keys():
-        raise BadInput(f"{asked.demos}: has subtasks already; name a dataset without them")
+    if {SUBTASK, PERSISTENT} & LeRobot(asked.source.path).features.keys():
+        raise BadInput(f"{asked.source.path}: has subtasks already; name a dataset without them")
     check(asked)
 
 
@@ -77,7 +77,7 @@ def _copied(asked: Asked, segmented: Segmented) -> Iterator[tuple[LeRobot, dict[
     Videos are hard links where the file system has them, else copies.
     """
     with whole_folder(asked.out) as temporary:
-        folder = LeRobot(asked.demos).folder
+        folder = LeRobot(asked.source.path).folder
         shutil.copytree(
             folder, temporary, ignore=_loops, copy_function=_link, ignore_dangling_symlinks=True, dirs_exist_ok=True
         )
@@ -110,7 +110,8 @@ def write_subtasks(asked: Asked, segmented: Segmented) -> str:
                 episodes[str(episode)] = {"atoms": [{key: atom[key] for key in ATOM} for atom in atoms], **marks}
             assert writer is not None  # a file of a dataset holds an episode
             writer.close()
-        about = {"version": 2, "episodes": episodes, COPIED: _origin(dataset.folder) or str(asked.demos.resolve())}
+        origin = _origin(dataset.folder) or str(asked.source.path.resolve())
+        about = {"version": 2, "episodes": episodes, COPIED: origin}
         write_text(dataset.folder / ANNOTATIONS, json.dumps(about, indent=1) + "\n")
         before = {name: feature for name, feature in dataset.features.items() if name != SUBTASK}
         info = {**dataset.info, "features": {**before, **features}}

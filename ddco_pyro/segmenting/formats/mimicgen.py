@@ -49,13 +49,13 @@ def check(asked: Asked) -> None:
     :raises BadInput: it has not.
     """
     tool = TOOLS[asked.option]
-    with opened(asked.demos) as file:
+    with opened(asked.source.path) as file:
         for name in chosen_names(asked.source, asked.fit):
             there = file[f"data/{name}"].get(tool.place, {})
             if missing := [key for key in tool.prepared if key not in there]:
                 raise BadInput(
-                    f"{asked.demos}: {name}: has no {tool.place}/{missing[0]}, so the file is not prepared for "
-                    f"{asked.option}; first: {tool.script.format(asked.demos)}"
+                    f"{asked.source.path}: {name}: has no {tool.place}/{missing[0]}, so the file is not prepared for "
+                    f"{asked.option}; first: {tool.script.format(asked.source.path)}"
                 )
 
 
@@ -67,7 +67,7 @@ def write(asked: Asked, segmented: Segmented) -> str:
     """
     names, runs = _one_order(asked, segmented)
     with whole_file(asked.out) as temporary:
-        shutil.copyfile(asked.demos, temporary)
+        shutil.copyfile(asked.source.path, temporary)
         with written(temporary, "r+") as file:
             left_out = [name for name in file["data"] if name not in runs]
             for name in left_out:

@@ -66,5 +66,5 @@ def write_html(asked: Asked, segmented: Segmented) -> str:
     pictures = stored_pictures(asked.source, {demo.name: len(demo) for demo in segmented.segments})
     demos = recorded(segmented, asked.fit, asked.source)
     drawn = timelines(segmented, demos, pictures, asked.fit.spec.report.trajectory or ())
-    write_page(asked.out, segmented, str(asked.run), str(asked.demos), drawn)
+    write_page(asked.out, segmented, asked.fit.place, str(asked.source.path), drawn)
     return str(asked.out)
