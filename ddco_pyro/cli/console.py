@@ -349,14 +349,8 @@ def _tasks(facts: Inspection) -> None:
     for task, names in facts.tasks.items():
         steps = [facts.lengths[name] for name in names]
         has = [field.place for field in partial if {*names} <= {*field.having}]
-        row = [
-            task or "none",
-            str(len(names)),
-            f"{min(steps)} to {max(steps)}",
-            f"{np.median(steps):g}",
-            ", ".join(has),
-        ]
-        rows.append(list(map(printable, row)))
+        lengths = [str(len(names)), f"{min(steps)} to {max(steps)}", f"{np.median(steps):g}"]
+        rows.append([printable(task or "none"), *lengths, printable(", ".join(has))])
     head = ["task", "demonstrations", "steps", "median", "only some have"]
     show(Table(head, rows, {0, 4}))
 

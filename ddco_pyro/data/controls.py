@@ -105,11 +105,6 @@ class ControlDimension:
     exceptions: tuple[str, ...] = ()
 
     @property
-    def whole(self) -> bool:
-        """Whether the values are few whole numbers from 0 on."""
-        return bool(self.distinct) and self.minimum >= 0 and all(value.is_integer() for value in self.distinct)
-
-    @property
     def discrete(self) -> bool:
         """Whether the values are few and of an integer type."""
         return self.integer and bool(self.distinct)
@@ -177,13 +172,13 @@ def few(names: Sequence[str]) -> str:
 
 
 class _Steps:
-    """The values of one dimension over all steps [T]; ``starts`` [N] are the first steps of the demonstrations.
+    """The values of one dimension over all steps [T]; ``starts`` [N] are the first steps of demonstrations by name.
 
     ``low``, ``high``, ``at_low``, ``at_high`` and ``steps`` are the statistics of each demonstration, [N].
     """
 
-    def __init__(self, values: np.ndarray, starts: np.ndarray) -> None:
-        self.values, self.starts = values, starts
+    def __init__(self, values: np.ndarray, starts: np.ndarray, names: Sequence[str]) -> None:
+        self.values, self.starts, self.names = values, starts, names
         finite = np.isfinite(values)
         self.low = np.minimum.reduceat(np.where(finite, values, np.inf), starts)
         self.high = np.maximum.reduceat(np.where(finite, values, -np.inf), starts)
@@ -199,21 +194,20 @@ class _Steps:
         """Number of steps at a value in each demonstration [N]."""
         return self._count(same(self.values, value))
 
-    def made_by(self, value: float, often: float, least: int) -> np.ndarray:
+    def made_by(self, value: float, often: float, least: int) -> tuple[str, ...]:
         """The few demonstrations without which a value is rare.
 
         :param often: share of the steps from which on the value is common.
         :param least: steps with which a demonstration has the value by more than chance.
-        :returns: their places; empty where the value is rare with them, or common without them.
+        :returns: their names; empty where the value is rare with them, or common without them.
         """
         at = self.at(value)
         makes = at >= least
-        rare = at.sum() < max(2, often * self.steps.sum()) or at[~makes].sum() >= often * max(
-            self.steps[~makes].sum(), 1
-        )
-        return np.flatnonzero(makes) if not rare and makes.sum() <= most_few(len(at)) else np.empty(0, dtype=int)
+        common = at.sum() >= max(2, often * self.steps.sum()) and makes.sum() <= most_few(len(at))
+        made = common and at[~makes].sum() < often * max(self.steps[~makes].sum(), 1)
+        return tuple(self.names[place] for place in np.flatnonzero(makes & made).tolist())
 
-    def exceptions(self) -> np.ndarray:
+    def exceptions(self) -> tuple[str, ...]:
         """The few demonstrations without which the dimension would be constant or a switch."""
         two = (self.at_low + self.at_high == self.steps) | same(self.low, self.high)
         values, times = np.unique(np.concatenate([self.low[two], self.high[two]]), return_counts=True)
@@ -222,15 +216,15 @@ class _Steps:
             ends = [np.any([same(end, value) for value in commonest[:count]], axis=0) for end in (self.low, self.high)]
             outside = np.flatnonzero(~(two & np.all(ends, 0)) & (self.steps > 0))
             if len(commonest) >= count and len(outside) <= most_few(len(self.steps)):
-                return outside
-        return np.empty(0, dtype=int)
+                return tuple(self.names[place] for place in outside.tolist())
+        return ()
 
     def inside(self) -> float | None:
         """The commonest value between the extremes; one that few demonstrations make comes last."""
         often = self.times >= max(FEWEST, ATOM * len(self.values))
         ends = np.array([self.low.min(), self.high.max()])
         values = [value for value in (self.distinct[often] + 0.0).tolist() if not same(ends, value).any()]  # no minus 0
-        key = {value: (len(self.made_by(value, ATOM, FEWEST)) > 0, -int(self.at(value).sum())) for value in values}
+        key = {value: (bool(self.made_by(value, ATOM, FEWEST)), -int(self.at(value).sum())) for value in values}
         return min(values, key=key.__getitem__, default=None)
 
 
@@ -248,14 +242,14 @@ def control_dimensions(controls: Mapping[str, np.ndarray]) -> tuple[ControlDimen
     dimensions: dict[int, ControlDimension] = {}
     rests: dict[int, np.ndarray] = {}
     for index, values in enumerate(rows.T):
-        steps = _Steps(np.ascontiguousarray(values), starts[:-1])
+        steps = _Steps(np.ascontiguousarray(values), starts[:-1], names)
         if not steps.steps.any():
             continue
         low, high = float(steps.low.min()), float(steps.high.max())
         inside = steps.inside() if rows.shape[1] <= MOST_DIMENSIONS else None
-        places = {"minimum": steps.made_by(low, OFTEN, 1), "maximum": steps.made_by(high, OFTEN, 1)}
+        made = {"minimum": steps.made_by(low, OFTEN, 1), "maximum": steps.made_by(high, OFTEN, 1)}
         if inside is not None:
-            places["inside"] = steps.made_by(inside, ATOM, FEWEST)
+            made["inside"] = steps.made_by(inside, ATOM, FEWEST)
             rests[index] = same(values, inside)
         dimensions[index] = ControlDimension(
             index,
@@ -268,8 +262,8 @@ def control_dimensions(controls: Mapping[str, np.ndarray]) -> tuple[ControlDimen
             inside=inside,
             at_inside=int(rests[index].sum()) if index in rests else 0,
             integer=integer,
-            made_by={end: tuple(names[place] for place in makers) for end, makers in places.items() if len(makers)},
-            exceptions=tuple(names[place] for place in steps.exceptions()),
+            made_by={end: makers for end, makers in made.items() if makers},
+            exceptions=steps.exceptions(),
         )
     for index, rest in rests.items():
         together = (
@@ -470,10 +464,10 @@ def _kind(dim: ControlDimension, declared: str, alone: bool) -> tuple[str, str]:
         return declared, f"as declared{warning}"
     kind, why = "gaussian", "varies freely"
     if dim.values:
-        kind, why = "binary", f"takes two values, {number(dim.minimum)} and {number(dim.maximum)}"
+        kind, why = "binary", dim.note
     elif dim.discrete:
         kind, why = "categorical", f"takes {len(dim.distinct)} values of an integer type"
-    elif alone and dim.whole:
+    elif alone and dim.distinct and dim.minimum >= 0 and all(value.is_integer() for value in dim.distinct):
         kind, why = "categorical", f"takes {len(dim.distinct)} whole numbers and is the only dimension"
     elif dim.atom:
         kind, why = "hurdle", dim.atom + ("; often at an extreme" if dim.extremes else "")

@@ -12,16 +12,17 @@ class Format(NamedTuple):
 
     :param reader: yields one open :class:`~ddco_pyro.data.sources.Source`, ``module:function`` in
         :mod:`ddco_pyro.data.sources`. A module imports its own library, which need not be installed for other formats.
-    :param fits: whether a path has the format; also given the names at the top of an HDF5 file, else none.
     :param text: the path in words, such as ``the folder of a Minari dataset``.
-    :param sign: what tells a folder of this format, in words.
+    :param sign: a file or folder that tells a folder of this format.
+    :param fits: whether a path has the format, if the sign alone does not tell; also given the names at the top of an
+        HDF5 file, else none.
     :param parts: whether the control may have parts, whose names are the reader's argument ``actions``.
     """
 
     reader: str
-    fits: Callable[[Path, Collection[str]], bool]
     text: str
     sign: str = ""
+    fits: Callable[[Path, Collection[str]], bool] | None = None
     parts: bool = False
 
 
@@ -30,49 +31,27 @@ def _minari(path: Path, names: Collection[str]) -> bool:
     return any((folder / "metadata.json").is_file() for folder in folders)
 
 
+def _maniskill(path: Path, names: Collection[str]) -> bool:
+    return any(name.startswith("traj_") for name in names)
+
+
 def _act(path: Path, names: Collection[str]) -> bool:
-    return {"action", "observations"} <= {*names} or any(
-        one.suffix in (".hdf5", ".h5") for one in path.glob("episode_*")
-    )
+    return {"action", "observations"} <= {*names} or _folder(path, names, "episode_*")
+
+
+def _folder(path: Path, names: Collection[str], files: str = "*") -> bool:
+    return any(one.suffix in (".hdf5", ".h5") for one in path.glob(files))
 
 
 FORMATS = {
-    "lerobot": Format(
-        "lerobot:open_lerobot",
-        lambda path, names: (path / "meta" / "info.json").is_file(),
-        "the folder of a LeRobot dataset",
-        "meta/info.json",
-        parts=True,
-    ),
-    "minari": Format(
-        "minari:open_minari",
-        _minari,
-        "the folder of a Minari dataset",
-        "data/metadata.json",
-        parts=True,
-    ),
-    "maniskill": Format(
-        "maniskill:open_maniskill",
-        lambda path, names: any(name.startswith("traj_") for name in names),
-        "an HDF5 file of ManiSkill",
-    ),
-    "act": Format("act:open_act", _act, "the folder of ACT's episodes", "episode_0.hdf5"),
-    "jigsaws": Format(
-        "jigsaws:open_jigsaws",
-        lambda path, names: (path / "kinematics" / "AllGestures").is_dir(),
-        "the folder of a task of JIGSAWS",
-        "kinematics/AllGestures",
-    ),
-    "folder": Format(
-        "folder:open_folder",
-        lambda path, names: path.is_dir() and any(one.suffix in (".hdf5", ".h5") for one in path.iterdir()),
-        "a folder of HDF5 files, such as one for each task",
-        "TASK.hdf5",
-    ),
+    "lerobot": Format("lerobot:open_lerobot", "the folder of a LeRobot dataset", "meta/info.json", parts=True),
+    "minari": Format("minari:open_minari", "the folder of a Minari dataset", "data/metadata.json", _minari, parts=True),
+    "maniskill": Format("maniskill:open_maniskill", "an HDF5 file of ManiSkill", fits=_maniskill),
+    "act": Format("act:open_act", "the folder of ACT's episodes", "episode_0.hdf5", _act),
+    "jigsaws": Format("jigsaws:open_jigsaws", "the folder of a task of JIGSAWS", "kinematics/AllGestures"),
+    "folder": Format("folder:open_folder", "a folder of HDF5 files, such as one for each task", "TASK.hdf5", _folder),
     "robomimic": Format(
-        "robomimic:open_robomimic",
-        lambda path, names: path.is_file(),
-        "an HDF5 file of robomimic's layout",
+        "robomimic:open_robomimic", "an HDF5 file of robomimic's layout", fits=lambda path, names: path.is_file()
     ),
 }
 """By name, in the order in which they are recognised; the reader of robomimic's files reports what is no HDF5 file."""

@@ -705,7 +705,8 @@ class Session:
         """
         refuse_unknown("format", form, self.formats)
         about = FORMATS[f"--{form}"]
-        place = folder / f"segments{'' if about.kind == 'folder' else about.suffix or f'.{form}'}"
+        end = "" if about.kind == "folder" else ".hdf5" if about.takes == "robomimic" else f".{form}"
+        place = folder / f"segments{end}"
         with open_source(self.path, where=self.where) as source:
             with self.lock:
                 segmented = shown_segments(self.fit, source, self.level, self.shown, self.document)

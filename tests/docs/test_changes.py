@@ -86,7 +86,7 @@ CHANGES = {
         {
             "data/formats.py": (
                 "FORMATS = {",
-                'FORMATS = {"npz": Format("npz:open_npz", lambda path, names: path.suffix == ".npz", ".npz"),',
+                'FORMATS = {"npz": Format("npz:open_npz", ".npz", fits=lambda path, names: path.suffix == ".npz"),',
             )
         },
     ),

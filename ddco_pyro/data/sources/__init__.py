@@ -101,7 +101,11 @@ def format_of(path: Path) -> str:
     if not (path.is_file() or path.is_dir()):
         raise DemonstrationsError(f"{path}: is neither a regular file nor a folder; name an HDF5 file")
     names = _top_names(path) if path.is_file() else ()
-    form = next((form for form, about in FORMATS.items() if about.fits(path, names)), "")
+    told = (
+        form for form, about in FORMATS.items()
+        if (about.fits(path, names) if about.fits else (path / about.sign).exists())
+    )  # fmt: skip
+    form = next(told, "")
     inside = [path] if path.is_file() else [*path.glob("*"), *path.glob("*/*")]
     suffixes = (one.suffix.partition("-")[0] for one in inside)  # of x.tfrecord-00000-of-00001
     here = {*names, *suffixes, *(one.name for one in inside if one != path)}

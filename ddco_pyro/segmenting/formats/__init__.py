@@ -1,7 +1,7 @@
 """The formats of segments, a row each: a function that writes, in a module of its own.
 
 ``write(asked, segmented)`` writes a file or folder, whole or not at all, and returns in words what was written.
-``check(asked)`` of some formats refuses demonstrations or an existing place before anything is segmented.
+``check(asked)`` of formats that copy demonstrations refuses these or an existing place before anything is segmented.
 """
 
 from __future__ import annotations
@@ -85,19 +85,16 @@ class Format(NamedTuple):
 
     :param write: its function in this package, ``module:function``.
     :param text: what is written, in words.
-    :param takes: the format of demonstrations that it copies; empty where it takes any.
-    :param check: the function that refuses demonstrations and places; empty where none does.
+    :param takes: the format of demonstrations that it copies, which ``check`` of its module looks at; empty where it
+        takes any.
     :param extra: of this project, where the format needs a package: a key of :data:`PACKAGES`.
-    :param suffix: of a file whose option does not name it.
     """
 
     kind: Literal["file", "folder", "stream"]
     write: str
     text: str
     takes: Literal["", "robomimic", "lerobot"] = ""
-    check: str = ""
     extra: str = ""
-    suffix: str = ""
 
 
 PACKAGES = {"lerobot": "pyarrow", "rerun": "rerun"}
@@ -106,30 +103,11 @@ FORMATS = {
     "--html": Format("stream", "tables:write_html", "A page with the timeline of every demonstration."),
     "--csv": Format("stream", "tables:write_csv", "A table with a row for each step."),
     "--parquet": Format("stream", "tables:write_parquet", "The same table as Parquet.", extra="lerobot"),
-    "--out": Format(
-        "file", "labels:write", "A copy of the HDF5 file with labels for each step.", "robomimic", "labels:check"
-    ),
-    "--lerobot": Format(
-        "folder",
-        "lerobot:write_subtasks",
-        "A copy of a LeRobot dataset with subtasks.",
-        "lerobot",
-        "lerobot:check_bare",
-    ),
-    "--sarm": Format(
-        "folder", "lerobot:write_stages", "The same with the stages of SARM's reward model.", "lerobot", "lerobot:check"
-    ),
-    "--mimicgen": Format(
-        "file",
-        "mimicgen:write",
-        "A copy of a prepared file with MimicGen's signals.",
-        "robomimic",
-        "mimicgen:check",
-        suffix=".hdf5",
-    ),
-    "--isaac": Format(
-        "file", "mimicgen:write", "The same for Isaac Lab Mimic.", "robomimic", "mimicgen:check", suffix=".hdf5"
-    ),
+    "--out": Format("file", "labels:write", "A copy of the HDF5 file with labels for each step.", "robomimic"),
+    "--lerobot": Format("folder", "lerobot:write_subtasks", "A copy of a LeRobot dataset with subtasks.", "lerobot"),
+    "--sarm": Format("folder", "lerobot:write_stages", "The same with the stages of SARM's reward model.", "lerobot"),
+    "--mimicgen": Format("file", "mimicgen:write", "A copy of a prepared file with MimicGen's signals.", "robomimic"),
+    "--isaac": Format("file", "mimicgen:write", "The same for Isaac Lab Mimic.", "robomimic"),
     "--label-studio": Format("folder", "annotations:write_label_studio", "Predictions for Label Studio."),
     "--elan": Format("folder", "annotations:write_elan", "ELAN's .eaf of each demonstration."),
     "--rerun": Format("folder", "annotations:write_rerun", "Rerun's .rrd of each demonstration.", extra="rerun"),
@@ -156,8 +134,8 @@ def check_format(asked: Asked) -> None:
     if form.extra and find_spec(PACKAGES[form.extra]) is None:
         remedy = f"install it with: pip install 'ddco-pyro[{form.extra}]'"
         raise BadInput(f"{asked.option} needs {PACKAGES[form.extra]}; {remedy}")
-    if form.check:
-        resolve_name(f"{__name__}.{form.check}")(asked)
+    if form.takes:
+        resolve_name(f"{__name__}.{form.write.partition(':')[0]}:check")(asked)
 
 
 def write_format(asked: Asked, segmented: Segmented) -> str:

@@ -6,7 +6,6 @@ import json
 import re
 from datetime import UTC, datetime
 from typing import Any
-from xml.etree import ElementTree
 
 import jinja2
 import numpy as np
@@ -30,9 +29,6 @@ def write_elan(asked: Asked, segmented: Segmented) -> str:
     A controlled vocabulary has the names of all choices of a level.
     """
     milliseconds = 1000 / segmented.frequency if segmented.frequency else STEP
-    loader = jinja2.PackageLoader("ddco_pyro.segmenting.formats", ".")
-    environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    template = environment.get_template("elan.eaf.j2")
     when = datetime.now(UTC).isoformat(timespec="seconds")
     names = {level: asked.names_of(level) for level in segmented.counts} | {asked.level + SOURCE: SOURCES}
     with whole_folder(asked.out) as folder:
@@ -40,10 +36,17 @@ def write_elan(asked: Asked, segmented: Segmented) -> str:
             tiers = _tiers(asked, demo)
             steps = {0, len(demo)}.union(*(run[1:] for tier in tiers.values() for run in tier))
             times = {step: round(step * milliseconds) for step in sorted(steps)}
-            text = template.render(when=when, times=times, tiers=tiers, vocabularies=names)
-            write_text(folder / f"{demo.name}.eaf", text + "\n")
+            text = _xml("elan.eaf", when=when, times=times, tiers=tiers, vocabularies=names)
+            write_text(folder / f"{demo.name}.eaf", text)
     unit = "" if segmented.frequency else "; a step is one second, since the demonstrations have no frequency"
     return f"{asked.out}: {len(segmented)} files{unit}"
+
+
+def _xml(template: str, **values: Any) -> str:
+    """The text of a template of this folder, filled."""
+    loader = jinja2.PackageLoader("ddco_pyro.segmenting.formats", ".")
+    environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    return environment.get_template(f"{template}.j2").render(values) + "\n"
 
 
 def _tiers(asked: Asked, demo: Segments) -> dict[str, list[tuple[str, int, int]]]:
@@ -80,7 +83,9 @@ def write_label_studio(asked: Asked, segmented: Segmented) -> str:
     with whole_folder(asked.out) as folder:
         write_text(folder / "tasks.json", json.dumps(tasks, ensure_ascii=False) + "\n")
         channels = [name for name in tasks[0]["data"]["series"] if name != "step"]
-        write_text(folder / "config.xml", _config(asked, asked.order(segmented), channels))
+        labels = {asked.names[option]: option_colour(option) for option in asked.order(segmented)}
+        config = _xml("label_studio.xml", demo=DEMO, level=asked.level, labels=labels, channels=channels)
+        write_text(folder / "config.xml", config)
     return f"{asked.out}: {len(tasks)} tasks; make a project with config.xml and import tasks.json"
 
 
@@ -103,21 +108,6 @@ def _task(asked: Asked, demo: Segments) -> dict[str, Any]:
         "data": {"series": series, DEMO: demo.name},
         "predictions": [{"model_version": asked.fit.place, "score": score, "result": found}],
     }
-
-
-def _config(asked: Asked, order: list[int], channels: list[str]) -> str:
-    view = ElementTree.Element("View")
-    ElementTree.SubElement(view, "Header", value=f"${DEMO}")
-    labels = ElementTree.SubElement(view, "TimeSeriesLabels", name=asked.level, toName="series")
-    for option in order:
-        ElementTree.SubElement(labels, "Label", value=asked.names[option], background=option_colour(option))
-    shown = ElementTree.SubElement(
-        view, "TimeSeries", name="series", valueType="json", value="$series", timeColumn="step"
-    )
-    for column in channels:
-        ElementTree.SubElement(shown, "Channel", column=column)
-    ElementTree.indent(view)
-    return ElementTree.tostring(view, "unicode") + "\n"
 
 
 # --- Rerun ------------------------------------------------------------------------------------------------------------

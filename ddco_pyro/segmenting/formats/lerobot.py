@@ -41,22 +41,14 @@ COPIED = "copied_from"
 
 
 def check(asked: Asked) -> None:
-    """Check that nothing is where the copy is to be.
+    """Check that nothing is where the copy is to be, and that a dataset that gets subtasks has none.
 
-    :raises BadInput: something is.
+    :raises BadInput: something is, or it has.
     """
+    if asked.option == "--lerobot" and {SUBTASK, PERSISTENT} & LeRobot(asked.source.path).features.keys():
+        raise BadInput(f"{asked.source.path}: has subtasks already; name a dataset without them")
     if asked.out.exists():
         raise BadInput(f"{asked.out}: exists; remove it, or choose another {asked.option}")
-
-
-def check_bare(asked: Asked) -> None:
-    """The same for a dataset that has no subtasks.
-
-    :raises BadInput: it has.
-    """
-    if {SUBTASK, PERSISTENT} & LeRobot(asked.source.path).features.keys():
-        raise BadInput(f"{asked.source.path}: has subtasks already; name a dataset without them")
-    check(asked)
 
 
 def is_copy(out: Path, dataset: Path) -> bool:
