@@ -61,7 +61,15 @@ def inspect(
 ) -> None:
     """Print the contents of a file: keys, shapes, lengths, ranges, NaN, constant dimensions, masks, a starting spec."""
     if against is not None:
-        _compare_annotators(file, against, tolerance, as_json)
+        from ddco_pyro.cli import console
+        from ddco_pyro.evaluation.agreement import compare_annotators
+
+        found = compare_annotators(file, against, tolerance)
+        if as_json:
+            each = {name: asdict(own) | {"boundary_f1": own.boundary_f1} for name, own in found.items()}
+            print(json.dumps(each, indent=1))
+        else:
+            console.annotators(found, tolerance)
         return
     from ddco_pyro.data.errors import DemonstrationsError
     from ddco_pyro.data.inspection import inspect as look
@@ -81,19 +89,6 @@ def inspect(
         print(f"\n{starting_spec(facts, file).text}\nnext: {command('init', file, '--out', f'{file.stem}.yaml')}")
     except DemonstrationsError as error:
         print(f"\nno spec to start with: {str(error).removeprefix(f'{file}: ')}")
-
-
-def _compare_annotators(first: Path, second: Path, tolerance: int, as_json: bool) -> None:
-    from ddco_pyro.cli import console
-    from ddco_pyro.evaluation.agreement import compare_annotators
-
-    found = compare_annotators(first, second, tolerance)
-    if as_json:
-        print(
-            json.dumps({name: asdict(own) | {"boundary_f1": own.boundary_f1} for name, own in found.items()}, indent=1)
-        )
-        return
-    console.annotators(found, tolerance)
 
 
 def init(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from numbers import Real
 from pathlib import Path
@@ -17,7 +16,7 @@ from ddco_pyro.data.demonstration import NOTHING, Attribute, Demonstration, chec
 from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.labels import LABEL_NAMES, label_names
-from ddco_pyro.data.sources import narrowed, open_source, refuse_foreign
+from ddco_pyro.data.sources import open_own
 from ddco_pyro.data.sources.robomimic import frequency_of, robomimic_file, write_demonstration
 from ddco_pyro.data.tasks import (
     NAMES,
@@ -92,12 +91,12 @@ class Demonstrations(Sequence[Demonstration]):
         :raises DemonstrationsError: the file cannot be read, lacks something asked for, or does not fit into memory.
         """
         whole = path_of(path, "demonstrations")
-        with stored(whole, observations, labels, exclude, where) as (found, masks, attributes):
-            refuse_too_much(
-                needed(found, copies=0), "reading it", "read only some observations, or scale pictures down"
-            )
+        with open_own(whole, where, exclude) as source:
+            found = [source.read(name, observations, labels) for name in source.names]
+            remedy = "read only some observations, or scale pictures down"
+            refuse_too_much(needed(found, copies=0), "reading it", remedy)
             read = tuple(Demonstration(**vars(demo)) for demo in found)
-            return cls(read, masks, attributes)
+            return cls(read, source.masks, source.attributes)
 
     def write(self, path: str | Path) -> None:
         """Write an HDF5 file, whole or not at all."""
@@ -215,36 +214,6 @@ def not_demonstrations(given: object) -> DemonstrationsError:
         "demonstrations have to be a list of ddco_pyro.Demonstration(name, observations, actions), or "
         f"ddco_pyro.Demonstrations.read(FILE); got {type(given).__name__}"
     )
-
-
-Stored = tuple[list[Demonstration], Mapping[str, tuple[str, ...]], Mapping[str, Attribute]]
-"""Demonstrations as their file stores them, the masks, and the attributes of the file."""
-
-
-@contextmanager
-def stored(
-    path: Path,
-    observations: Sequence[str] | None,
-    labels: Sequence[str] | None,
-    exclude: Sequence[str],
-    where: Where = NOTHING,
-) -> Iterator[Stored]:
-    """The demonstrations of an HDF5 file, open, without the excluded ones; no observation is read.
-
-    :param where: as :func:`~ddco_pyro.data.tasks.chosen` takes it.
-
-    :raises DemonstrationsError: the file cannot be read, or lacks something asked for.
-    """
-    if path.is_file():
-        refuse_foreign(path)
-    with open_source(path, "robomimic") as source:
-        for name in exclude:
-            if name not in source.names:
-                raise DemonstrationsError(f"demonstrations.exclude: {unknown(name, source.names)}")
-        if set(exclude) == set(source.names):
-            raise DemonstrationsError("demonstrations.exclude: leaves every demonstration out; keep some")
-        source = narrowed(source, where, exclude)
-        yield [source.read(name, observations, labels) for name in source.names], source.masks, source.attributes
 
 
 # --- division ---------------------------------------------------------------------------------------------------------

@@ -63,7 +63,7 @@ def agreement(mine: Document, theirs: Document, names: Sequence[str]) -> dict[st
     :returns: Cohen's κ (None where there is one name alone), F1 of boundaries within :data:`TOLERANCE`, and the share
         of the steps that both said in which the names are the same.
     """
-    pairs = [(_numbered(mine, name), _numbered(theirs, name)) for name in names]
+    pairs = [(mine.in_file(name), theirs.in_file(name)) for name in names]
     known = [["", *mine.names], ["", *theirs.names]]
     if not any(((a != UNKNOWN) & (b != UNKNOWN)).any() for a, b in pairs):
         return None
@@ -83,7 +83,3 @@ def taken(mine: Document, theirs: Document, name: str) -> list[Change]:
     cuts = [("cut", name, step, True) for step in sorted(theirs.cuts[name])]
     gone = [("cut", name, step, False) for step in sorted(mine.cuts[name] - theirs.cuts[name])]
     return [("names", names), *painted, *cuts, *gone]
-
-
-def _numbered(document: Document, name: str) -> np.ndarray:
-    return document.in_file(name).astype(np.int64)

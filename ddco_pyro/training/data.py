@@ -14,12 +14,12 @@ from ddco_pyro.data.demonstration import Demonstration, check, needed
 from ddco_pyro.data.demonstrations import (
     Demonstrations,
     check_trained,
-    stored,
     with_labels_of_tasks,
     with_tasks,
     with_values,
 )
 from ddco_pyro.data.errors import DemonstrationsError
+from ddco_pyro.data.sources import open_own
 from ddco_pyro.data.tasks import chosen, known_tasks
 from ddco_pyro.data.tensors import read_tensors
 from ddco_pyro.errors import nearest
@@ -154,10 +154,11 @@ def _read(spec: Spec, path: Path, ready: Callable[[Demonstration], Demonstration
             "data/<demonstration>"
         )
     sought = spec.demonstrations
-    with stored(path, spec.observed, _labels(spec), sought.exclude, sought.where) as (found, masks, attributes):
+    with open_own(path, sought.where, sought.exclude) as source:
+        found = [source.read(name, spec.observed, _labels(spec)) for name in source.names]
         remedy = "leave observations out, or make its demonstrations fewer, shorter or equally long"
         refuse_too_much(needed(found), f"a fit to {', '.join(spec.observed)}", remedy)
-        return _set_apart(spec, Demonstrations(tuple(ready(demo) for demo in found), masks, attributes))
+        return _set_apart(spec, Demonstrations(tuple(map(ready, found)), source.masks, source.attributes))
 
 
 def _outlined(demo: Demonstration, measured: Collection[str]) -> Demonstration:

@@ -15,9 +15,9 @@ from ddco_pyro.data.demonstration import NOTHING, Attribute, Demonstration
 from ddco_pyro.data.errors import DemonstrationsError, Located
 from ddco_pyro.data.formats import FORMATS, LAYOUTS
 from ddco_pyro.data.tasks import Where, chosen
-from ddco_pyro.errors import command, path_of, refuse_unknown
+from ddco_pyro.errors import command, nearest, path_of, refuse_unknown
 
-__all__ = ["Source", "narrowed", "open_source", "refuse_foreign"]
+__all__ = ["Source", "narrowed", "open_own", "open_source", "refuse_foreign"]
 
 
 @dataclass(frozen=True)
@@ -70,6 +70,25 @@ def open_source(
         if not source.names:
             raise Located(f"{path}: holds no demonstrations; at least one is needed")
         yield narrowed(replace(source, format=form, path=path), where, exclude)
+
+
+@contextmanager
+def open_own(path: Path, where: Where, exclude: Sequence[str]) -> Iterator[Source]:
+    """Open an HDF5 file of this project's layout, which datasets of other libraries are to be imported into.
+
+    :raises DemonstrationsError: as :func:`open_source`; it is such a dataset; ``exclude`` names an unknown
+        demonstration, or all.
+    """
+    if path.is_file():
+        refuse_foreign(path)
+    with open_source(path, "robomimic") as source:
+        for name in exclude:
+            if name not in source.names:
+                known = nearest(name, source.names)
+                raise DemonstrationsError(f"demonstrations.exclude: there is no demonstration {name!r}{known}")
+        if set(exclude) == set(source.names):
+            raise DemonstrationsError("demonstrations.exclude: leaves every demonstration out; keep some")
+        yield narrowed(source, where, exclude)
 
 
 def narrowed(source: Source, where: Where, exclude: Sequence[str] = ()) -> Source:
