@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import difflib
 import shlex
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from numbers import Integral
 from os import PathLike
 from pathlib import Path
@@ -44,6 +45,18 @@ def path_of(given: Any, what: str) -> Path:
     if not isinstance(given, str | PathLike):
         raise BadInput(f"{what}: has to be the path of a file or folder; got {type(given).__name__}")
     return Path(given)
+
+
+@contextmanager
+def needing(extra: str, what: str) -> Iterator[None]:
+    """Say how to install a package of an extra of this project that the block imports.
+
+    :raises BadInput: it is not installed.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise BadInput(f"{what} needs {error.name}; install it with: pip install 'ddco-pyro[{extra}]'") from None
 
 
 def refuse_unknown(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import torch
 
-from ddco_pyro.errors import BadInput, check_whole, nearest
+from ddco_pyro.errors import BadInput, check_whole, nearest, needing
 from ddco_pyro.evaluation.inferred import Inferred, drawn, within
 from ddco_pyro.statistics import matching
 
@@ -85,10 +85,8 @@ class Draws:
 
         :raises BadInput: xarray is not installed.
         """
-        try:
+        with needing("xarray", "a DataTree"):
             import xarray
-        except ModuleNotFoundError:
-            raise BadInput("a DataTree needs xarray; install it with: pip install 'ddco-pyro[xarray]'") from None
         chains, draws, _, steps = next(iter(self.options.values())).shape
         coordinates = {
             "chain": np.arange(chains),

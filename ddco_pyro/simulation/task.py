@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, get_args
 
 import numpy as np
 
-from ddco_pyro.errors import BadInput, Failed
+from ddco_pyro.errors import BadInput, Failed, needing
 from ddco_pyro.spec.base import TASKS
 
 if TYPE_CHECKING:  # one's own demonstrations need no simulator
@@ -102,10 +102,8 @@ class Task:
         :raises BadInput: gymnasium or the environment's package cannot be imported, the environment is not
             registered, or a space has another type.
         """
-        try:
+        with needing("gymnasium", id):
             from ddco_pyro.simulation.gymnasium_environment import GymnasiumEnvironment
-        except ModuleNotFoundError as error:
-            raise BadInput(f"{id}: needs {error.name}; install it with: pip install 'ddco-pyro[gymnasium]'") from error
         example = GymnasiumEnvironment(id, 0, options)
         example.close()
         return cls(

@@ -32,16 +32,12 @@ from ddco_pyro.data.sources.metadata import (
     stored_keys,
 )
 from ddco_pyro.data.sources.video import frames_of_steps
-from ddco_pyro.errors import nearest
+from ddco_pyro.errors import nearest, needing
 
-try:
+with needing("lerobot", "reading LeRobot datasets"):
     import pyarrow
     import pyarrow.compute as compute
     import pyarrow.parquet as parquet
-except ImportError:  # pragma: no cover (the tests' environment has it)
-    raise DemonstrationsError(
-        "reading LeRobot datasets needs pyarrow; install it with: pip install 'ddco-pyro[lerobot]'"
-    ) from None
 
 VERSION = "v3."
 _CONVERT = (

@@ -14,7 +14,7 @@ from ddco_pyro.data.errors import DemonstrationsError, reading
 from ddco_pyro.data.hdf5 import dataset_at, datasets, member, opened
 from ddco_pyro.data.sources import Source
 from ddco_pyro.data.sources.metadata import check_count, joined, stored_keys
-from ddco_pyro.errors import refuse_unknown
+from ddco_pyro.errors import needing, refuse_unknown
 
 BARE = "observation"
 """Key of an observation array without a name."""
@@ -31,12 +31,8 @@ def open_minari(path: Path, actions: Sequence[str] = ()) -> Iterator[Source]:
     :param actions: names of nested actions that are the control together, such as ``arm/joints``; all if empty.
     :raises DemonstrationsError: Minari is not installed, or cannot read the dataset.
     """
-    try:
+    with needing("minari", "reading Minari datasets"):
         from minari.dataset.minari_storage import MinariStorage
-    except ImportError:
-        raise DemonstrationsError(
-            "reading Minari datasets needs minari; install it with: pip install 'ddco-pyro[minari]'"
-        ) from None
     folder = path.parent if path.is_file() else path / "data" if (path / "data").is_dir() else path
     with reading(folder):
         spaces = MinariStorage.read_raw_metadata(folder).keys() & {"observation_space", "action_space"}
