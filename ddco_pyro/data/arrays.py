@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
 
@@ -92,6 +93,13 @@ def blocks(array: Observed, steps: slice = slice(None)) -> Iterator[np.ndarray]:
 def block_steps(shape: tuple[int, ...], dtype: np.dtype[Any]) -> int:
     """Number of steps of this shape in a block."""
     return max(1, BLOCK_BYTES // max(1, math.prod(shape) * dtype.itemsize))
+
+
+def in_blocks(pictures: Iterable[np.ndarray], size: tuple[int, int]) -> Iterator[np.ndarray]:
+    """Pictures [H, W, 3] one after the other, ``size`` [H, W] each, in blocks [steps, H, W, 3]."""
+    rest = iter(pictures)
+    while block := list(islice(rest, block_steps((*size, 3), PICTURES))):
+        yield np.stack(block)
 
 
 def same(left: Observed, right: Observed) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
@@ -160,27 +160,28 @@ def check(demo: Demonstration, first: Demonstration | None = None) -> None:
 
     :raises DemonstrationsError: it is such a demonstration.
     """
-    ours = demo.arrays()
+    for problem in _problems(demo, demo if first is None else first):
+        raise DemonstrationsError(f"{demo.name}: {problem}")
+
+
+def _problems(demo: Demonstration, other: Demonstration) -> Iterator[str]:
+    """The problems with a demonstration beside another one; only where there is none does the next one make sense."""
+    ours, theirs = demo.arrays(), other.arrays()
     for place, array in ours.items():
         if array.dtype.kind not in NUMBERS:
-            raise DemonstrationsError(f"{demo.name}: {place} {no_numbers(array.dtype)}")
+            yield f"{place} {no_numbers(array.dtype)}"
     if problem := problem_of("actions", demo.actions.shape[1:], demo.actions.dtype):
-        raise DemonstrationsError(f"{demo.name}: actions {problem}")
+        yield f"actions {problem}"
     if not len(demo):
-        raise DemonstrationsError(f"{demo.name}: actions has no steps; remove this demonstration")
-    other = demo if first is None else first
-    theirs = other.arrays()
+        yield "actions has no steps; remove this demonstration"
     if missing := sorted(theirs.keys() - ours.keys()):
-        raise DemonstrationsError(f"{demo.name}: {', '.join(missing)} is missing, which {other.name} has")
+        yield f"{', '.join(missing)} is missing, which {other.name} has"
     if more := sorted(ours.keys() - theirs.keys()):
-        raise DemonstrationsError(
-            f"{demo.name}: {', '.join(more)} is not in {other.name}; all demonstrations need the same"
-        )
+        yield f"{', '.join(more)} is not in {other.name}; all demonstrations need the same"
     for place, array in ours.items():
-        if place.startswith("labels/") and (problem := problem_of(place, array.shape[1:], array.dtype)):
-            raise DemonstrationsError(f"{demo.name}: {place} {problem}")
-        if problem := different(array, len(demo), theirs[place].shape[1:], other.name):
-            raise DemonstrationsError(f"{demo.name}: {place} {problem}")
+        problem = problem_of(place, array.shape[1:], array.dtype) if place.startswith("labels/") else ""
+        if problem := problem or different(array, len(demo), theirs[place].shape[1:], other.name):
+            yield f"{place} {problem}"
 
 
 def problem_of(place: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:

@@ -51,28 +51,17 @@ SHIFT = 20
 """Pictures are shifted by up to 1 / SHIFT of their longer side."""
 
 
-class Recipe(NamedTuple):
-    """The budget of training.
-
-    :param batch_steps: steps in a minibatch, about.
-    :param gradient_steps: gradient steps of a model, about.
-    :param epochs: fewest epochs of a model.
-    """
-
-    batch_steps: int
-    gradient_steps: int
-    epochs: int
-
-
 EXACT_EPOCHS = 500
 """Fewest epochs where a stage takes exact steps, one over all demonstrations in each epoch."""
 
-VECTORS = Recipe(batch_steps=1000, gradient_steps=6000, epochs=200)
-"""About a minute on one core. The hierarchy and the baselines converge on the files of docs/decisions.md; with a
-patience of 20, flat policies stopped too early there."""
+VECTORS = (1000, 6000, 200)
+"""Steps in a minibatch and gradient steps of a model, about, and its fewest epochs.
 
-PICTURES = Recipe(batch_steps=250, gradient_steps=4000, epochs=20)
-"""About six minutes on one core for each model, with pictures of 48 × 64 pixels."""
+About a minute on one core. The hierarchy and the baselines converge on the files of docs/decisions.md; with a patience
+of 20, flat policies stopped too early there."""
+
+PICTURES = (250, 4000, 20)
+"""The same. About six minutes on one core for each model, with pictures of 48 × 64 pixels."""
 
 
 HEAVY = "one Student t predicts left-out demonstrations better than Gaussians"
@@ -131,9 +120,10 @@ def starting_spec(
     count, many = (count, many) if counted else (OPTIONS, "")
     apart = _held_out(facts, hold_out_by) if hold_out_by not in (None, EACH) else ""
     lengths, small = list(facts.lengths.values()), decided or Decided()
-    recipe, em = VECTORS if vectors else PICTURES, bool(vectors) and not images
-    batch = int(np.clip(round(recipe.batch_steps / np.mean(lengths)), 1, max(1, len(lengths) // 2)))
-    epochs = round(recipe.gradient_steps / np.ceil(len(lengths) / batch), -1)
+    batch_steps, gradient_steps, fewest = VECTORS if vectors else PICTURES
+    batch = int(np.clip(round(batch_steps / np.mean(lengths)), 1, max(1, len(lengths) // 2)))
+    epochs = int(np.clip(round(gradient_steps / np.ceil(len(lengths) / batch), -1), fewest, MOST_EPOCHS))
+    em = bool(vectors) and not images
     few = em and len(lengths) < FEW and not {"train", "valid"} & set(masks) and not apart
     text = ENVIRONMENT.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
         facts=facts,
@@ -160,7 +150,7 @@ def starting_spec(
         starts=("windows", *STARTS) if small.window else STARTS,
         margin=MARGIN,
         em=em,
-        epochs=max(int(np.clip(epochs, recipe.epochs, MOST_EPOCHS)), EXACT_EPOCHS if em else 0),
+        epochs=max(epochs, EXACT_EPOCHS if em else 0),
     )
     parse_spec(read_yaml(text))  # the text is a valid spec
     said = [decided.why, "heavy tails: " + HEAVY if decided.heavy else ""] if decided else []

@@ -332,7 +332,9 @@ def said_in(
     known = label_names(demos.attributes).get(level, ())
     words = label_names(demos.attributes).get(level + SOURCE, SOURCES)
     ours, changes = not lerobot and any(level + SOURCE in demo.labels for demo in demos), list[Change]()
-    marks = _marks(demos) if marked else []
+    marks: list[Change] = [("mark", name, EXCLUDE, True) for name in demos.masks.get(EXCLUDE, ()) if marked]
+    said = [(demo, {"flag", "note"} & demo.attributes.keys()) for demo in demos if marked]
+    marks += [("mark", demo.name, mark, demo.attributes[mark]) for demo, own in said for mark in sorted(own)]
     if not ours and any(level + BOUNDARY in demo.labels for demo in demos):
         return marks
     found, options = [*names], dict[int, int]()
@@ -354,17 +356,6 @@ def said_in(
                 kind = CONFIRM if source == "accepted" else PAINT
                 changes.append((kind, demo.name, start, stop, OPEN if source == "open" else options[value]))
     return [("names", found), *changes, *marks] if changes else marks
-
-
-def _marks(demos: Demonstrations) -> list[Change]:
-    """What a file says of demonstrations as a whole."""
-    left_out: list[Change] = [("mark", name, EXCLUDE, True) for name in demos.masks.get(EXCLUDE, ())]
-    return left_out + [
-        ("mark", demo.name, mark, demo.attributes[mark])
-        for demo in demos
-        for mark in ("flag", "note")
-        if mark in demo.attributes
-    ]
 
 
 def shown_segments(

@@ -104,7 +104,9 @@ def timelines(
         names = [option_name(choice, segmented.names.get(name, ())) for choice in range(count + 1)]
         known = dict(enumerate(names)) | {UNKNOWN: SOURCES[0]} if name + SOURCE in segmented.label_names else names
         lanes[name] = known, list(map(option_colour, range(count + 1)))
-    lanes |= {name: (names, segmented.label_colours(name)) for name, names in _values(segmented).items()}
+    for name, words in _values(segmented).items():
+        matched = segmented.matched.get(name, {}).items()
+        lanes[name] = words, {label: option_colour(option) for label, option in matched}
     before = accumulate((len(demo) * len(segmented.counts) for demo in segmented.segments), initial=0)
     shown = [demo for demo, steps in zip(segmented.segments, before, strict=False) if steps < most_steps]
     steps = min(sum(map(len, segmented.segments)), most_steps / len(segmented.counts))
@@ -113,7 +115,8 @@ def timelines(
         {
             "name": demo.name,
             "anchor": anchor(demo.name),
-            "facts": ", ".join(filter(None, (demo.task, duration(segmented.frequency, len(demo)), _nats(demo)))),
+            "facts": f"{demo.task and f'{demo.task}, '}{duration(segmented.frequency, len(demo))}, "
+            f"{number(demo.log_likelihood)} nats/step",
             "held_out": demo.held_out,
             "steps": len(demo),
             "lanes": [_runs(demo, name) for name in lanes],
@@ -123,10 +126,6 @@ def timelines(
     ]
     rows = [{"name": name, "names": names, "colours": colours} for name, (names, colours) in lanes.items()]
     return Timelines(rows, tracks, segmented.frequency)
-
-
-def _nats(demo: Segments) -> str:
-    return f"{number(demo.log_likelihood)} nats/step"
 
 
 def _values(segmented: Segmented) -> dict[str, dict[int, str]]:

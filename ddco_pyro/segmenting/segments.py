@@ -25,7 +25,6 @@ from ddco_pyro.evaluation.inferred import Inferred, runs
 from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Scores
-from ddco_pyro.names import option_colour
 
 
 @dataclass(frozen=True)
@@ -129,10 +128,6 @@ class Segmented:
                 scores[f"options, {part}"] = scores_of(options, labels, tasks)
                 scores[f"{EQUAL}, {part}"] = of_equal_lengths(labels, self.counts[level], options, tasks)
         return agreements
-
-    def label_colours(self, name: str) -> dict[int, str]:
-        """The colour of each label of this name: that of the option that it is matched with."""
-        return {label: option_colour(option) for label, option in self.matched.get(name, {}).items()}
 
 
 def segment(fit: Fit, path: str | Path) -> Segmented:

@@ -10,7 +10,7 @@ import cv2
 import h5py
 import numpy as np
 
-from ddco_pyro.data.arrays import PICTURES, LazyArray, Observed
+from ddco_pyro.data.arrays import PICTURES, LazyArray, Observed, in_blocks
 from ddco_pyro.data.demonstration import Demonstration
 from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.hdf5 import dataset_at, datasets, lazy, member, natural, opened, values_of
@@ -18,9 +18,6 @@ from ddco_pyro.data.sources import Source
 from ddco_pyro.data.sources.metadata import joined
 
 EPISODE = re.compile(r"episode_(\d+)\.(?:hdf5|h5)")
-
-AT_ONCE = 32
-"""Pictures that are decoded together."""
 
 
 def open_act(path: Path) -> Iterator[Source]:
@@ -74,7 +71,6 @@ def _observation(file: h5py.File, key: str, name: str) -> Observed:
     shape = decoded(stored[0]).shape
 
     def read(start: int, stop: int) -> Iterator[np.ndarray]:
-        for first in range(start, stop, AT_ONCE):
-            yield np.stack([decoded(each, shape) for each in stored[first : min(first + AT_ONCE, stop)]])
+        return in_blocks((decoded(each, shape) for block in stored.read(start, stop) for each in block), shape[:2])
 
     return LazyArray((len(stored), *shape), PICTURES, read, where)

@@ -9,7 +9,6 @@ import json
 import math
 from collections.abc import Iterator, Sequence
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from shlex import quote
 from typing import Any
@@ -17,7 +16,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ddco_pyro.data.arrays import PICTURES, LazyArray, Observed, channels_last, turned
+from ddco_pyro.data.arrays import PICTURES, LazyArray, Observed, channels_last, in_blocks, turned
 from ddco_pyro.data.demonstration import DIMENSION_NAMES, Attribute, Demonstration
 from ddco_pyro.data.errors import DemonstrationsError, reading
 from ddco_pyro.data.labels import EXCLUDE, LABEL_NAMES, SOURCE, UNKNOWN
@@ -51,7 +50,6 @@ MOST_NAMES = 10_000
 ANNOTATIONS = Path("meta") / "lerobot_annotations.json"
 WHO = "subtask" + SOURCE
 """The column, and the label, of who says what a step's subtask is, where a person labelled."""
-IMAGES_AT_ONCE = 32
 _NO_CONTROL = {"timestamp", "frame_index", "episode_index", "index", "task_index", "image", "video", "string"}
 """Names and types of features that are never the control."""
 
@@ -232,9 +230,7 @@ class LeRobot:
             path = self._path("video_path", index, f"videos/{key}", video_key=key)
             begin = float(self._episodes[index][f"videos/{key}/from_timestamp"])
         rate = self._frequency or 1.0
-        shown = frames_of_steps(path, rows.name, begin + start / rate, stop - start, rate, size)
-        while block := list(islice(shown, IMAGES_AT_ONCE)):
-            yield np.stack(block)
+        yield from in_blocks(frames_of_steps(path, rows.name, begin + start / rate, stop - start, rate, size), size)
 
 
 class _Rows:
@@ -292,10 +288,8 @@ class _Rows:
             return np.ascontiguousarray(image[..., ::-1])
 
         with reading(self.path, f"{self.name}: {key}"):
-            values = self.column(key)
-            for first in range(start, stop, IMAGES_AT_ONCE):
-                some = values.slice(first, min(IMAGES_AT_ONCE, stop - first))
-                yield np.stack([decoded(picture["bytes"]) for picture in some.to_pylist()])
+            values = self.column(key).slice(start, stop - start)
+            yield from in_blocks((decoded(picture.as_py()["bytes"]) for picture in values), size)
 
 
 def _episodes(folder: Path) -> dict[int, dict[str, Any]]:

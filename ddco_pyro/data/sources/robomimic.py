@@ -15,7 +15,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from ddco_pyro.data.arrays import Observed, blocks, is_picture
+from ddco_pyro.data.arrays import blocks, is_picture
 from ddco_pyro.data.demonstration import Attribute, Demonstration
 from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.files import whole_file
@@ -173,13 +173,9 @@ def write_demonstration(data: h5py.Group, demo: Demonstration) -> None:
     group = data.create_group(demo.name, track_order=True)
     group.attrs.update({**demo.attributes, STEPS: len(demo)})
     for place, array in demo.arrays().items():
-        dataset, at = group.create_dataset(place, array.shape, array.dtype, **_compression(array)), 0
+        packed = is_picture(array) and 0 not in array.shape
+        how = {"chunks": (1, *array.shape[1:]), "compression": "gzip", "compression_opts": 1} if packed else {}
+        dataset, at = group.create_dataset(place, array.shape, array.dtype, **how), 0
         for block in blocks(array):
             dataset[at : at + len(block)] = block
             at += len(block)
-
-
-def _compression(array: Observed) -> dict[str, object]:
-    if not is_picture(array) or 0 in array.shape:
-        return {}
-    return {"chunks": (1, *array.shape[1:]), "compression": "gzip", "compression_opts": 1}
