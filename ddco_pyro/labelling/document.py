@@ -12,7 +12,6 @@ import hashlib
 import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -41,7 +40,6 @@ MARKS = ("exclude", "flag", "note")
 """What a person can say of a demonstration as a whole: leave it out, look at it again, and a text."""
 
 
-@dataclass
 class Document:
     """The labels of every demonstration.
 
@@ -57,22 +55,14 @@ class Document:
     :ivar undone: edits that can be done again, the next one last.
     """
 
-    lengths: Mapping[str, int]
-    names: tuple[str, ...]
-    labels: dict[str, np.ndarray] = field(init=False)
-    given: dict[str, np.ndarray] = field(init=False)
-    cuts: dict[str, frozenset[int]] = field(init=False)
-    accepted: dict[str, tuple[float, int]] = field(init=False, default_factory=dict)
-    marks: dict[str, dict[str, Any]] = field(init=False)
-    colours: dict[str, str] = field(init=False, default_factory=dict)
-    done: list[Edit] = field(init=False, default_factory=list)
-    undone: list[Edit] = field(init=False, default_factory=list)
-
-    def __post_init__(self) -> None:
-        self.labels = {name: np.full(length, FREE, np.int16) for name, length in self.lengths.items()}
-        self.given = {name: np.ones(length, bool) for name, length in self.lengths.items()}
-        self.cuts = dict.fromkeys(self.lengths, frozenset())
-        self.marks = {name: {} for name in self.lengths}
+    def __init__(self, lengths: Mapping[str, int], names: tuple[str, ...]) -> None:
+        self.lengths, self.names = lengths, names
+        self.labels = {name: np.full(length, FREE, np.int16) for name, length in lengths.items()}
+        self.given = {name: np.ones(length, bool) for name, length in lengths.items()}
+        self.cuts = dict.fromkeys(lengths, frozenset[int]())
+        self.accepted, self.colours = dict[str, tuple[float, int]](), dict[str, str]()
+        self.marks: dict[str, dict[str, Any]] = {name: {} for name in lengths}
+        self.done, self.undone = list[Edit](), list[Edit]()
 
     def alters(self, change: Change) -> bool:
         """Whether a change makes a difference."""

@@ -46,8 +46,8 @@ from ddco_pyro.labelling.proposals import (
 from ddco_pyro.labelling.refitting import refit
 from ddco_pyro.labelling.team import Team, agreement, taken
 from ddco_pyro.names import option_colour, option_name
-from ddco_pyro.segmenting.formats import FORMATS, Asked, check_format, write_format
-from ddco_pyro.segmenting.formats.labels import check_copy, check_labels
+from ddco_pyro.segmenting.formats import FORMATS, Asked, check_copy, check_format, write_format
+from ddco_pyro.segmenting.formats.labels import check_labels
 from ddco_pyro.segmenting.segments import Segmented
 
 NEAREST = 5
@@ -148,17 +148,10 @@ class Session:
 
     def _check_out(self) -> None:
         """Refuse a place of something else."""
-        if self.form == "robomimic" and self.in_place:
-            check_labels(self.path, [self.level, self.level + SOURCE], self.demos.names)
+        if not self.in_place:
+            check_copy(self.form, self.out, self.path)
         elif self.form == "robomimic":
-            check_copy(self.path, self.out)
-        elif not self.in_place and self.out.exists():
-            from ddco_pyro.segmenting.formats.lerobot import is_copy
-
-            if not is_copy(self.out, self.path):
-                raise BadInput(
-                    f"--out {self.out}: exists and is not a labelled copy of {self.path}; choose another --out"
-                )
+            check_labels(self.path, [self.level, self.level + SOURCE], self.demos.names)
 
     def begin(self) -> None:
         """Refit where something is labelled already; else have the process ready for it."""

@@ -138,6 +138,16 @@ def check_format(asked: Asked) -> None:
         resolve_name(f"{__name__}.{form.write.partition(':')[0]}:check")(asked)
 
 
+def check_copy(form: str, out: Path, path: Path) -> None:
+    """Refuse a place that is no labelled copy of demonstrations of a format.
+
+    :raises BadInput: something else is there.
+    """
+    module = "labels" if form == "robomimic" else "lerobot"
+    if out.exists() and not resolve_name(f"{__name__}.{module}:is_copy")(out, path):
+        raise BadInput(f"--out {out}: exists and is not a labelled copy of {path}; choose another --out, or remove it")
+
+
 def write_format(asked: Asked, segmented: Segmented) -> str:
     """Write segments in a format, and say what was written."""
     said: str = resolve_name(f"{__name__}.{format_of(asked.option).write}")(asked, segmented)

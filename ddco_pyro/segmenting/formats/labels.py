@@ -19,7 +19,7 @@ from ddco_pyro.data.hdf5 import attributes_of, opened, written
 from ddco_pyro.data.labels import BOUNDARY, EXCLUDE, LABEL_NAMES, SOURCE, label_names
 from ddco_pyro.errors import BadInput
 from ddco_pyro.names import choice_names
-from ddco_pyro.segmenting.formats import Asked
+from ddco_pyro.segmenting.formats import Asked, check_copy
 from ddco_pyro.segmenting.segments import Segmented, Segments, chosen_names
 
 OURS = "segmented_by"
@@ -51,7 +51,7 @@ def check(asked: Asked) -> None:
     :raises BadInput: the copy's place is taken, or a demonstration has labels of that name from another source.
     """
     if not _same(asked.out, asked.source.path):
-        check_copy(asked.source.path, asked.out)
+        check_copy("robomimic", asked.out, asked.source.path)
     check_labels(asked.source.path, asked.fit.names, chosen_names(asked.source, asked.fit))
 
 
@@ -73,13 +73,11 @@ def check_labels(path: Path, given: Iterable[str], names: Iterable[str]) -> None
                     )
 
 
-def check_copy(path: Path, out: Path) -> None:
-    """Check that ``out`` does not exist or is a labelled copy of ``path``.
-
-    :raises BadInput: ``out`` is something else.
-    """
-    if out.exists() and _copied_from(out) != _digest(path):
-        raise BadInput(f"--out {out}: exists and is not a labelled copy of {path}; choose another --out, or remove it")
+def is_copy(out: Path, path: Path) -> bool:
+    """Whether ``out`` is a labelled copy of ``path``."""
+    with suppress(DemonstrationsError), opened(out) as file:
+        return bool(file.attrs.get(COPIED) == _digest(path))
+    return False
 
 
 def write(asked: Asked, segmented: Segmented) -> str:
@@ -140,10 +138,3 @@ def _same(out: Path, path: Path) -> bool:
 
 def _digest(path: Path) -> str:
     return hashlib.sha256(os.fsencode(path.resolve())).hexdigest()
-
-
-def _copied_from(copy: Path) -> str | None:
-    """The :func:`_digest` of the file that a labelled copy was made of; None for other files."""
-    with suppress(DemonstrationsError), opened(copy) as file:
-        return str(file.attrs.get(COPIED))
-    return None
