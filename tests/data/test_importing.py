@@ -27,6 +27,7 @@ from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
 from ddco_pyro.data.importing import Choice, import_demonstrations
 from ddco_pyro.data.inspection import inspect
 from ddco_pyro.errors import BadInput
+from ddco_pyro.events import DemonstrationsDone
 
 ROBOMIMIC, LEROBOT = Path(__file__).parents[1] / "fixtures" / "robomimic.hdf5", odd.FIXTURE
 
@@ -441,12 +442,12 @@ class Stopped(Exception):
 
 
 def test_an_interrupted_import_leaves_nothing_and_one_that_is_there_is_not_replaced(out: Path, tmp_path: Path) -> None:
-    def stop(done: int, total: int) -> None:
-        if done == 3:
+    def stop(event: DemonstrationsDone) -> None:
+        if event.done == 3:
             raise Stopped
 
     with pytest.raises(Stopped):
-        import_demonstrations(ROBOMIMIC, out, on_demonstration=stop)
+        import_demonstrations(ROBOMIMIC, out, on_event=stop)
     assert not any(tmp_path.iterdir())
     import_demonstrations(ROBOMIMIC, out)
     assert [path.name for path in tmp_path.iterdir()] == ["demos.hdf5"]
