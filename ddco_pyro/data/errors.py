@@ -20,6 +20,17 @@ class Located(DemonstrationsError):
     """An error whose line names the file already."""
 
 
+@contextmanager
+def located(path: str | Path) -> Iterator[None]:
+    """Name a file in errors about its demonstrations that do not name one yet."""
+    try:
+        yield
+    except Located:
+        raise
+    except DemonstrationsError as error:
+        raise Located(f"{path}: {error}") from None
+
+
 def printable(text: str) -> str:
     """A text as one line without control characters, which names in a file can contain."""
     return "".join(character if character.isprintable() else repr(character)[1:-1] for character in text)

@@ -18,7 +18,7 @@ import numpy as np
 
 from ddco_pyro.data.arrays import LazyArray, block_steps, channels_last, refuse_too_much, turned
 from ddco_pyro.data.demonstration import Attribute
-from ddco_pyro.data.errors import DAMAGE, DemonstrationsError, Located, reading
+from ddco_pyro.data.errors import DAMAGE, DemonstrationsError, Located, located, reading
 from ddco_pyro.errors import nearest
 
 
@@ -32,13 +32,8 @@ def opened(path: str | Path) -> Iterator[h5py.File]:
         raise Located(f"{path}: there is no such file; check the path")
     if not os.path.isfile(path):
         raise Located(f"{path}: is no regular file; name an HDF5 file")
-    try:
-        with reading(Path(path)), h5py.File(path, "r") as file:
-            yield file
-    except Located:
-        raise
-    except DemonstrationsError as error:
-        raise Located(f"{path}: {error}") from None
+    with located(path), reading(Path(path)), h5py.File(path, "r") as file:
+        yield file
 
 
 class _Disk(io.FileIO):

@@ -200,13 +200,14 @@ def _chosen(source: Source, name: str, choice: Choice, alone: Mapping[str, str])
     """
     demo = source.read(name)
     known = demo.observations
-    keys = {**dict.fromkeys(known), **{given: key for given, key in source.given.items() if key in known}}
-    for key in choice.observations:
-        refuse_unknown("observation", key, keys, DemonstrationsError, f"{name}: ")
+    named = {f"observation.{key.replace('/', '.')}": key for key in known}  # as LeRobot calls them
+    asked = [named.get(key, key) for key in choice.observations]
+    for key in asked:
+        refuse_unknown("observation", key, known, DemonstrationsError, f"{name}: ")
     videos = {key for key, array in known.items() if isinstance(array, LazyArray) and array.video}
     without = {*alone, *(() if choice.videos else videos)}
     usual = [key for key in known if known[key].dtype.kind in NUMBERS and key not in without]
-    wanted = [keys[key] or key for key in choice.observations] or usual
+    wanted = asked or usual
     if not wanted:
         why = "; ".join(_unread(demo, {}, alone)) or "there is none"
         raise DemonstrationsError(f"{name}: has no observation that can be used: {why}")

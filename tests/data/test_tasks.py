@@ -145,6 +145,16 @@ def test_instructions_of_one_demonstration_each_are_drawn_together() -> None:
 # --- pooled -----------------------------------------------------------------------------------------------------------
 
 
+def test_a_damaged_one_of_several_files_is_named(tmp_path: Path) -> None:
+    for name in ("open", "push"):
+        demonstrations(3).write(tmp_path / f"{name}.hdf5")
+    with h5py.File(tmp_path / "open.hdf5", "r+") as file:
+        del file["data/demo_1/actions"]
+    ended = call("import", tmp_path / "open.hdf5", tmp_path / "push.hdf5", "--out", tmp_path / "pooled.hdf5")
+    assert (ended.status, ended.out) == (2, "")
+    assert f"{tmp_path / 'open.hdf5'}: demo_1: actions is missing; " in ended.err
+
+
 def test_files_are_pooled_with_the_keys_that_all_have(tmp_path: Path) -> None:
     random = np.random.default_rng(0)
     for name, size in (("open", 4), ("push", 7)):

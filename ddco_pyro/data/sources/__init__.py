@@ -29,7 +29,6 @@ class Source:
     :param masks: name of each mask (robomimic: filter key) to names of demonstrations.
     :param frequency: control steps per second, Hz; None if unknown.
     :param attributes: facts about the whole source.
-    :param given: the names that the source gives to observations with another key, and their keys.
     :param format: the name of its format, and ``path`` the file or folder, once it is open.
     """
 
@@ -38,7 +37,6 @@ class Source:
     masks: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     frequency: float | None = None
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
-    given: Mapping[str, str] = field(default_factory=dict)
     format: str = ""
     path: Path = Path()
 

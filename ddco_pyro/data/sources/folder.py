@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ddco_pyro.data.demonstration import NOTHING, Attribute, Demonstration
-from ddco_pyro.data.errors import DemonstrationsError
+from ddco_pyro.data.errors import DemonstrationsError, located
 from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.labels import BOUNDARY, LABEL_NAMES, SOURCE, UNKNOWN, label_names
 from ddco_pyro.data.sources import Source, narrowed, open_source
@@ -50,7 +50,8 @@ def open_pooled(
         def stored(name: str) -> tuple[Demonstration, str]:
             """A demonstration as its file has it, and its task."""
             stem, own = parts[name]
-            demo = each[stem].read(own)
+            with located(each[stem].path):
+                demo = each[stem].read(own)
             return demo, task_of(demo.attributes) or task_of(each[stem].attributes) or stem
 
         words: dict[str, dict[str, dict[int, str]]] = {}  # of each value, by labels and demonstration

@@ -112,7 +112,7 @@ class LeRobot:
         left_out = tuple(f"demo_{index}" for index, noted in self._noted.items() if noted.get(EXCLUDE))
         names = tuple(f"demo_{index}" for index in self._episodes)
         masks = {EXCLUDE: left_out} if left_out else {}
-        return Source(names, self._read, masks, self._frequency, about, self.keys)
+        return Source(names, self._read, masks, self._frequency, about)
 
     def _check_actions(self) -> None:
         types = {name: about.get("dtype") if isinstance(about, dict) else None for name, about in self.features.items()}
