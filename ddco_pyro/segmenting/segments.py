@@ -157,7 +157,25 @@ def segments(fit: Fit, source: Source, on_event: OnEvent = ignore, intervals: bo
     labels: dict[str, dict[str, np.ndarray]] = {}
     compared: dict[str, Traits] = {}
     segmented: list[Segments] = []
-    for piece in fit.infer(_demonstrations(source, chosen, fit, labels, compared)):
+
+    def read() -> Iterator[Demonstration]:
+        """Each demonstration as the run's networks observe it."""
+        before = 0  # steps whose labels are in memory
+        for name in chosen:
+            found = source.read(name)
+            seen = {key: array for key, array in found.observations.items() if key in fit.hierarchy.encoder.shapes}
+            inferred = INFERENCE * len(found) + FOUND * fit.hierarchy.depth * (before + len(found))
+            whole = needed([Demonstration.stored(name, seen, found.actions)]) + inferred
+            refuse_too_much(whole, f"{name}: segmenting its {len(found)} steps", "divide it, or the file")
+            labels[name] = {
+                key: values for key, values in found.labels.items() if values.dtype.kind in "iub" and values.ndim == 1
+            }
+            demo = _demonstration(found, fit)
+            compared[name] = traits(demo, demo.observations)
+            before += len(demo)
+            yield demo
+
+    for piece in fit.infer(read()):
         segmented += (replace(one, task=compared[one.name].task) for one in of_piece(fit, piece, labels, intervals))
         on_event(DemonstrationsDone(len(segmented), len(chosen)))
     each, known = of_tasks([demo.task for demo in segmented], [demo.labels for demo in segmented], known)
@@ -198,33 +216,6 @@ def chosen_names(source: Source, fit: Fit) -> list[str]:
 
 FOUND = 40
 """Bytes of one step's labels at one level."""
-
-
-def _demonstrations(
-    source: Source,
-    names: Sequence[str],
-    fit: Fit,
-    labels: dict[str, dict[str, np.ndarray]],
-    compared: dict[str, Traits],
-) -> Iterator[Demonstration]:
-    """Each demonstration as the run's networks observe it.
-
-    Ground-truth labels go into ``labels``, and what is compared with the fit into ``compared``.
-    """
-    before = 0  # steps whose labels are in memory
-    for name in names:
-        found = source.read(name)
-        seen = {key: array for key, array in found.observations.items() if key in fit.hierarchy.encoder.shapes}
-        inferred = INFERENCE * len(found) + FOUND * fit.hierarchy.depth * (before + len(found))
-        whole = needed([Demonstration.stored(name, seen, found.actions)]) + inferred
-        refuse_too_much(whole, f"{name}: segmenting its {len(found)} steps", "divide it, or the file")
-        labels[name] = {
-            key: values for key, values in found.labels.items() if values.dtype.kind in "iub" and values.ndim == 1
-        }
-        demo = _demonstration(found, fit)
-        compared[name] = traits(demo, demo.observations)
-        before += len(demo)
-        yield demo
 
 
 def _demonstration(found: Demonstration, fit: Fit) -> Demonstration:
