@@ -20,8 +20,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import h5py
-
 from ddco_pyro.errors import BadInput, Failed
 
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
@@ -89,8 +87,12 @@ def check_outputs(outputs: Sequence[Output], inputs: Sequence[Path] = ()) -> Non
                     raise output.refused("is what this command reads")
                 if read.is_dir() and read in output.place.parents:
                     raise output.refused(f"lies in {path}, which this command reads")
-        if output.kind == "stream" and h5py.is_hdf5(output.path):
-            raise output.refused("is an HDF5 file, which this would replace", "choose another place or remove it first")
+        if output.kind == "stream":
+            from h5py import is_hdf5  # help loads nothing heavy
+
+            if is_hdf5(output.path):
+                remedy = "choose another place or remove it first"
+                raise output.refused("is an HDF5 file, which this would replace", remedy)
         for other in outputs[:number]:
             if _same(output.path, other.path):
                 raise output.refused(f"is also where {other.option} is written")
