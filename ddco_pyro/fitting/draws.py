@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import torch
 
-from ddco_pyro.errors import BadInput, check_whole, nearest, needing
+from ddco_pyro.errors import BadInput, check_whole, needing, refuse_unknown
 from ddco_pyro.evaluation.inferred import Inferred, drawn, within
 from ddco_pyro.statistics import matching
 
@@ -61,10 +61,7 @@ class Draws:
         :param mass: as in :func:`~ddco_pyro.evaluation.inferred.within`.
         :raises BadInput: there is no such level, or ``mass`` is not a share.
         """
-        if level not in self.options:
-            raise BadInput(
-                f"there is no level {level!r}{nearest(level, self.options)}; there is: {', '.join(self.options)}"
-            )
+        refuse_unknown("level", level, self.options)
         if not 0 < mass <= 1:
             raise BadInput(f"mass={mass!r}: has to be a number above 0, at most 1")
         steps = len(path) if (path >= 0).all() else int(np.argmax(path < 0))
