@@ -241,6 +241,7 @@ CONSTANT: Mapping[str, Any] = {
     "control.relative_to": None,
     "training": {"optimizer": {"name": "em"}, "tune_fraction": 0, "starts": ["random"]},
     "report": {},
+    "selection.grid": {},
 }
 """What makes a spec one of a policy that reads no observation."""
 
