@@ -43,19 +43,6 @@ def cache(tmp_path_factory):
     return folder
 
 
-class Watched:
-    """What a fit told whoever watches it."""
-
-    def __init__(self):
-        self.events = []
-
-    def __call__(self, event):
-        self.events.append(event)
-
-    def of(self, *kinds):
-        return [event for event in self.events if isinstance(event, kinds)]
-
-
 @pytest.fixture(scope="session")
 def toy_spec():
     return parse_spec(yaml.safe_load(toy_task.SPEC))
@@ -63,13 +50,14 @@ def toy_spec():
 
 @pytest.fixture(scope="session")
 def watched():
-    return Watched()
+    """What the fit of the toy task tells whoever watches it."""
+    return []
 
 
 @pytest.fixture(scope="session")
 def toy_run(cache, tmp_path_factory, toy_spec, watched):
     """A fit of the toy task with both baselines beside it; nobody changes its folder."""
-    return fit(toy_spec, out=tmp_path_factory.mktemp("runs") / "toy", on_event=watched)
+    return fit(toy_spec, out=tmp_path_factory.mktemp("runs") / "toy", on_event=watched.append)
 
 
 @pytest.fixture

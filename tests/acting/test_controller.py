@@ -61,9 +61,6 @@ def without_controls(hierarchy, states):
     return brute_force(replace(tables, control=unseen), 0, len(states))
 
 
-# --- terminations and selections --------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_an_option_that_does_not_end_stays(seed):
     choices, controls = play(Controller(by_hand(MEANS, [SELDOM] * 3, [0, 0, 0]), seed=seed), 30)
@@ -129,9 +126,6 @@ def test_choices_follow_the_models_latents(counts, emits, network):
         assert stats.chisquare(observed[possible], episodes * row[2][possible]).pvalue > P_VALUE
 
 
-# --- who acts ---------------------------------------------------------------------------------------------------------
-
-
 def test_choice_0_executes_the_meta_policys_mean():
     hierarchy = by_hand(MEANS, [SELDOM] * 3, [100.0, 0, 0, 0, 7.0, 8.0], emits=("options", "control"))
     controller = Controller(hierarchy)
@@ -172,36 +166,20 @@ def test_a_sample_has_the_models_deviation():
     assert abs(np.corrcoef(standard.T)[0, 1]) < 0.2
 
 
-# --- seeds ------------------------------------------------------------------------------------------------------------
-
-
-def test_equal_seeds_give_equal_episodes():
+def test_equal_seeds_give_equal_episodes_and_leave_the_global_randomness_alone():
     hierarchy = by_hand(MEANS, [0.0] * 3, [0, 0, 0])
+    torch.manual_seed(0)
+    before = torch.get_rng_state()
     controller = Controller(hierarchy, control="sample", seed=4)
     choices, controls = play(controller, 15)
+    assert torch.equal(torch.get_rng_state(), before)
+    torch.manual_seed(1)
     controller.reset(5)
     assert not np.array_equal(play(controller, 15)[1], controls)
     controller.reset(4)
     again = play(controller, 15)
     assert again[0] == choices
     np.testing.assert_array_equal(again[1], controls)
-
-
-def test_acting_leaves_the_global_randomness_alone():
-    controller = Controller(make(), control="sample")
-    torch.manual_seed(0)
-    before = torch.get_rng_state()
-    controller.act(STATE)
-    assert torch.equal(torch.get_rng_state(), before)
-    torch.manual_seed(1)
-    controller.reset(0)
-    one = controller.act(STATE)
-    torch.manual_seed(2)
-    controller.reset(0)
-    np.testing.assert_array_equal(controller.act(STATE), one)
-
-
-# --- observations -----------------------------------------------------------------------------------------------------
 
 
 def test_what_the_networks_do_not_see_is_ignored():

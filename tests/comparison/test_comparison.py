@@ -59,9 +59,6 @@ def found(folders):
     return compare(folders)
 
 
-# --- log-likelihood ---------------------------------------------------------------------------------------------------
-
-
 def jackknifed(values, steps):
     """The standard error of a sum over trajectories as they happen to be drawn, by steps: leaving out each in turn."""
     n, total = len(steps), sum(steps)
@@ -167,9 +164,6 @@ def test_demonstrations_may_be_held_out_in_another_order(folders, toy_spec, othe
     assert by_name[str(turned.folder)].each == pytest.approx(expected.tolist())
 
 
-# --- what is refused --------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
@@ -213,9 +207,6 @@ def test_a_run_is_not_compared_with_itself(folders):
         compare([folders[0], folders[0] / "baselines" / ".."])
 
 
-# --- agreement with labels --------------------------------------------------------------------------------------------
-
-
 def test_agreement_is_that_of_each_run_on_what_was_held_out(found, folders, held_out):
     """NMI by scikit-learn, and what the run says of its matching and of equal parts; baselines have no options."""
     by_run = {str(folder): load(folder) for folder in (folders[0], folders[-1])}
@@ -234,9 +225,6 @@ def test_agreement_is_that_of_each_run_on_what_was_held_out(found, folders, held
             assert (row["level"], row["labels"]) == (level.name, "phase")
             assert row["accuracy"] == scores.matched_globally.accuracy
             assert {key: row[key] for key in UNMATCHED} == {key: getattr(scores, key) for key in UNMATCHED}
-
-
-# --- rollouts ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -273,9 +261,6 @@ def test_rollouts_are_paired_by_initial_state(rolled):
         discordant = one["only_ours"] + one["only_theirs"]
         expected = stats.binomtest(one["only_ours"], discordant).pvalue if discordant else 1.0
         assert one["p_value"] == pytest.approx(expected)
-
-
-# --- what is written --------------------------------------------------------------------------------------------------
 
 
 def test_the_command_and_the_files_say_the_same(folders, found, tmp_path):

@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 import pandas as pd
 import pytest
-from command_line import call
+from command_line import done, refused
 
 from ddco_pyro.data.annotations import LabelTable
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
@@ -43,8 +43,6 @@ ROWS = [
     ("demo_0", "reach", 0, 0.2),
 ]
 STEPS = ["", *["reach"] * 3, *["grasp"] * 2, "", ""]
-
-# --- tables of any origin ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -89,8 +87,6 @@ def test_labels_that_differ_by_case_or_blanks_alone_are_one(tmp_path):
         "case or blanks alone differ"
     ]
 
-
-# --- tables of the tools ----------------------------------------------------------------------------------------------
 
 ELAN = """Begin Time - hh:mm:ss.ms\tBegin Time - ss.msec\tBegin Time - msec\tEnd Time - hh:mm:ss.ms\t\
 End Time - ss.msec\tEnd Time - msec\tDuration - hh:mm:ss.ms\tDuration - ss.msec\tDuration - msec\t\
@@ -200,9 +196,6 @@ def test_label_studio(tmp_path, regions, unit, said):
     assert found[1] == {"demo_0": {"label": ["", ""]}, "demo_1": {"label": said}}
 
 
-# --- what is refused --------------------------------------------------------------------------------------------------
-
-
 def plain(*rows, start="start_s", stop="stop_s"):
     return pd.DataFrame(rows, columns=["demonstration", "label", start, stop]).to_csv(index=False)
 
@@ -249,9 +242,6 @@ def test_what_does_not_fit_is_refused_in_one_line(tmp_path, text, more, said):
     assert "\n" not in str(refused.value)
 
 
-# --- the command ------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def demos(tmp_path):
     """Two demonstrations whose labels were written by ``segment``, with other names, and no frequency."""
@@ -267,8 +257,7 @@ def demos(tmp_path):
 def test_labels_are_imported_beside_others(demos, tmp_path):
     out, table = tmp_path / "out.hdf5", tmp_path / "elan.txt"
     table.write_text(ELAN)
-    ended = call("import", demos, "--labels", table, "--fps", 10, "--out", out)
-    assert ended.status == 0, ended.err
+    ended = done("import", demos, "--labels", table, "--fps", 10, "--out", out)
     assert ended.out == f"{out}: 2 demonstrations, labels/skill in 1, labels/who in 1\n"
     with h5py.File(out) as file, h5py.File(demos) as before:
         names = json.loads(file.attrs["label_names"])
@@ -285,8 +274,8 @@ def test_columns_and_the_unit_are_said(demos, tmp_path):
     (tmp_path / "a.csv").write_text("episode,what,from,to\ndemo_1,Reach,2,4\ndemo_1,lift,4,5\n")
     asked = ("import", demos, "--labels", tmp_path / "a.csv", "--out", tmp_path / "out.hdf5")
     columns = ("--columns", "demonstration=episode,label=what,start=from,stop=to")
-    ended = call(*asked, *columns, "--unit", "steps")
-    assert (ended.status, ended.out) == (0, f"{tmp_path / 'out.hdf5'}: 2 demonstrations, labels/what in 1\n")
+    ended = done(*asked, *columns, "--unit", "steps")
+    assert ended.out == f"{tmp_path / 'out.hdf5'}: 2 demonstrations, labels/what in 1\n"
     with h5py.File(tmp_path / "out.hdf5") as file:
         assert json.loads(file.attrs["label_names"])["what"] == ["Reach", "lift"]
         assert file["data/demo_1/labels/what"][:6].tolist() == [-1, -1, 0, 0, 1, -1]
@@ -296,9 +285,8 @@ def test_columns_and_the_unit_are_said(demos, tmp_path):
         (["--columns", "demo=episode"], "--columns demo=episode: write demonstration=COLUMN,label=COLUMN,start=COLUMN"),
         (columns, "does not say the unit of its times; add --unit seconds, milliseconds or steps"),
     ):
-        ended = call(*asked, *more)
-        assert (ended.status, ended.err.count("\n"), said in ended.err) == (2, 1, True), ended.err
-    assert call("import", demos, "--fps", 10, "--out", tmp_path / "out.hdf5").status == 2
+        refused(said, *asked, *more)
+    refused("--fps", "import", demos, "--fps", 10, "--out", tmp_path / "out.hdf5")
     assert not (tmp_path / "out.hdf5").exists()
 
 
@@ -308,5 +296,4 @@ def test_a_missing_table_is_the_file_that_is_named(demos, tmp_path):
         (tmp_path / "no.csv", "is missing"),
         (tmp_path / "folder", "is a folder; give a table: CSV, TSV or Parquet"),
     ):
-        ended = call("import", demos, "--labels", path, "--out", demos.with_name("out.hdf5"))
-        assert (ended.status, ended.err) == (2, f"ddco-pyro: --labels {path}: {said}\n")
+        refused(f": --labels {path}: {said}\n", "import", demos, "--labels", path, "--out", tmp_path / "out.hdf5")

@@ -8,9 +8,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-import yaml
 from command_line import call
-from odd_files.kinds import NUMBER, ROWS, arrays
+from odd_files.kinds import NUMBER, ROWS, arrays, put, write
+from odd_files.kinds import alone as by_itself
+from planted import small_spec
 
 import ddco_pyro
 from ddco_pyro.data.arrays import network_input, turned
@@ -18,6 +19,7 @@ from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, Demonst
 from ddco_pyro.data.importing import import_demonstrations
 from ddco_pyro.data.inspection import inspect
 from ddco_pyro.errors import BadInput
+from ddco_pyro.spec import dump_spec
 
 
 def stored(path: Path, key: str) -> list[np.ndarray]:
@@ -97,16 +99,7 @@ def test_what_is_written_again_has_labels_and_the_type_of_its_controls(tmp_path:
     assert inspect(tmp_path / "again.hdf5").fields["actions"].dtype == "int64"
 
 
-# --- what networks read -----------------------------------------------------------------------------------------------
-
 CONV = {"network": "conv", "layers": [{"filters": 2, "kernel": 1}], "hidden": [4]}
-
-
-def an_array(shape: tuple[int, ...], dtype: str, random: np.random.Generator) -> np.ndarray:
-    if dtype == "O":
-        return np.full(shape, "pick up the cup", dtype=h5py.string_dtype())
-    values = random.integers(0, 100, shape)
-    return values.astype(dtype)
 
 
 @pytest.mark.usefixtures("undecided")
@@ -126,15 +119,14 @@ def test_networks_read_an_observation_or_every_command_says_why_not(
 ) -> None:
     """Of any shape and type, alone or beside a vector."""
     path, random = tmp_path / "demos.hdf5", np.random.default_rng(0)
-    made = [{**arrays(n), "obs/odd": None} for n in range(NUMBER)]
-    for each in made:
-        each["obs/odd"] = an_array((len(each["actions"]), *shape), dtype, random)
-    with h5py.File(path, "w") as file:
-        for n, each in enumerate(made):
-            for place, values in each.items():
-                if not (alone and place == "obs/pose"):
-                    file[f"data/demo_{n}/{place}"] = values
-    seen = turned(made[0]["obs/odd"])
+
+    def odd(steps: int, number: int) -> np.ndarray:
+        if dtype == "O":
+            return np.full((steps, *shape), "pick up the cup", dtype=h5py.string_dtype())
+        return random.integers(0, 100, (steps, *shape)).astype(dtype)
+
+    write(path, (by_itself if alone else put)("obs/odd", odd))
+    seen = turned(odd(4, 0))
     kind, why = network_input(seen.shape[1:], seen.dtype)
     assert (kind == "") == (why != "")
     assert kind in ("", "vector" if len(seen.shape) < 4 else "picture")
@@ -142,14 +134,8 @@ def test_networks_read_an_observation_or_every_command_says_why_not(
     policy = CONV if kind == "picture" and alone else {"network": "linear"}
     if kind == "picture" and not alone:
         policy = {"network": "branches", "of": {"odd": CONV, "pose": {"network": "mlp", "hidden": [4]}}, "hidden": [4]}
-    data = {
-        "demonstrations": {"path": str(path)},
-        "observations": keys,
-        "baseline": {"kind": "flat", "policy": policy},
-        "training": {"epochs": 1},
-    }
-    spec, out = tmp_path / "spec.yaml", tmp_path / "out"
-    spec.write_text(yaml.safe_dump(data))
+    known, spec, out = {"path": str(path)}, tmp_path / "spec.yaml", tmp_path / "out"
+    spec.write_text(dump_spec(small_spec((), policy, demonstrations=known, observations=keys, training={"epochs": 1})))
     for command in (("inspect", path), ("init", path, "--out", out), ("check", spec), ("import", path, "--out", out)):
         ended = call(*command)
         said = ended.out + ended.err + (out.read_text() if command[0] == "init" and out.exists() else "")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -123,44 +122,32 @@ def test_values_that_are_not_finite_do_not_count() -> None:
     assert control_dimensions({"demo": np.full((3, 1), np.nan)}) == ()
 
 
-# --- values that a single demonstration makes -------------------------------------------------------------------------
-
-
-def dead(made: np.ndarray) -> np.ndarray:
-    return 0 * made
-
-
-def padded(made: np.ndarray) -> np.ndarray:
-    return np.concatenate([made, np.zeros((100, 2))])
-
-
-def at_its_limit(made: np.ndarray) -> np.ndarray:
-    return np.where(np.arange(len(made))[:, None] < 20, 5.0, made)
-
-
-def positive(random: np.random.Generator) -> np.ndarray:
-    return random.uniform(0.1, 1, (50, 2))
-
-
-def free(random: np.random.Generator) -> np.ndarray:
-    return random.normal(size=(50, 2))
+SPOILT = {
+    "dead": lambda made: 0 * made,
+    "padded": lambda made: np.concatenate([made, np.zeros((100, 2))]),
+    "at its limit": lambda made: np.where(np.arange(len(made))[:, None] < 20, 5.0, made),
+}
+OTHERS = {
+    "free": lambda random: random.normal(size=(50, 2)),
+    "positive": lambda random: random.uniform(0.1, 1, (50, 2)),
+}
 
 
 @pytest.mark.parametrize("spoilt", [(3,), (3, 17)], ids=["one", "two"])
-@pytest.mark.parametrize("spoil", [dead, padded, at_its_limit])
-@pytest.mark.parametrize("others", [free, positive])
-def test_what_few_demonstrations_make_decides_no_kind(others: Any, spoil: Any, spoilt: tuple[int, ...]) -> None:
+@pytest.mark.parametrize("spoil", SPOILT)
+@pytest.mark.parametrize("others", OTHERS)
+def test_what_few_demonstrations_make_decides_no_kind(others: str, spoil: str, spoilt: tuple[int, ...]) -> None:
     """It is said of whom it is; what half of them make decides the kind as it did."""
-    random = np.random.default_rng(0)
-    made = {f"demo_{n}": others(random) for n in range(20)}
-    rested = {name: spoil(one) if number % 2 else one for number, (name, one) in enumerate(made.items())}
-    made |= {f"demo_{n}": spoil(made[f"demo_{n}"]) for n in spoilt}
+    random, spoiling = np.random.default_rng(0), SPOILT[spoil]
+    made = {f"demo_{n}": OTHERS[others](random) for n in range(20)}
+    rested = {name: spoiling(one) if number % 2 else one for number, (name, one) in enumerate(made.items())}
+    made |= {f"demo_{n}": spoiling(made[f"demo_{n}"]) for n in spoilt}
     found = control_dimensions(made)
     (part,) = control_parts(ControlSpec(), found)
     assert part.kind == "gaussian"
     assert all(f"demo_{n}" in text for n in spoilt for text in (part.why, found[0].note))
     assert {part.kind for part in control_parts(ControlSpec(), control_dimensions(rested))} == {
-        "clipped" if spoil is at_its_limit or others is positive else "hurdle"
+        "clipped" if spoil == "at its limit" or others == "positive" else "hurdle"
     }
 
 

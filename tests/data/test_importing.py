@@ -15,7 +15,7 @@ import minari
 import numpy as np
 import pyarrow
 import pytest
-from command_line import call
+from command_line import call, done, refused
 from gymnasium import spaces
 from minari.data_collector.episode_buffer import EpisodeBuffer
 from odd_files import lerobot as odd
@@ -164,14 +164,6 @@ def test_what_is_not_chosen_is_not_read(change: odd.Change, tmp_path: Path, out:
     assert set(Demonstrations.read(out).observation_shapes) == {"images/wrist"}
 
 
-def test_episodes_without_all_of_their_video_are_left_out(tmp_path: Path, out: Path) -> None:
-    dataset = odd.changed(odd.video_of(*range(12)))(tmp_path)
-    with pytest.raises(DemonstrationsError, match=r"demo_2: .*; or leave such ones out with --skip-broken"):
-        import_demonstrations(dataset, out, choice=Choice(videos=True))
-    left_out = import_demonstrations(dataset, out, choice=Choice(videos=True, skip_broken=True)).left_out
-    assert (set(left_out), Demonstrations.read(out).names) == ({"demo_2", "demo_3"}, ("demo_0", "demo_1"))
-
-
 @pytest.mark.parametrize("index", [True, False], ids=["an index of pandas", "a column"])
 def test_lerobots_tasks_and_subtasks_of_frames_are_labels_with_names(index: bool, tmp_path: Path, out: Path) -> None:
     """Subtasks have a table of names, of which one number is missing; the task of the last episode changes."""
@@ -205,10 +197,7 @@ def test_lerobots_tasks_and_subtasks_of_frames_are_labels_with_names(index: bool
     ("change", "message"),
     [
         (lambda dataset: (dataset / odd.VIDEO).unlink(), r"file-000\.mp4: the video is missing; leave its observation"),
-        (
-            odd.feature("observation.images.top", dtype="video", shape=[11, 12, 3]),
-            r"file-000\.mp4: is \d+ x \d+, and meta/info\.json says 11 x 12",
-        ),
+        (odd.feature("observation.images.top", dtype="video", shape=[11, 12, 3]), r"mp4: is \d+ x \d+, and meta/info"),
         (
             lambda dataset: (dataset / odd.DATA).write_bytes((dataset / odd.DATA).read_bytes()[:-100]),
             r"demo_0: cannot be read, or is damaged",
@@ -285,13 +274,6 @@ def test_minari(written_by_minari, out: Path) -> None:
         assert inspect(other).format == "minari"
 
 
-def test_minari_with_discrete_actions(written_by_minari, out: Path) -> None:
-    folder, buffers = written_by_minari(spaces.Discrete(3))
-    import_demonstrations(folder, out)
-    for buffer, demo in zip(buffers, Demonstrations.read(out), strict=True):
-        np.testing.assert_array_equal(demo.actions[:, 0], buffer.actions)
-
-
 def test_minari_with_nested_actions(written_by_minari, out: Path) -> None:
     arm = spaces.Dict({"joints": spaces.Box(-1, 1, (2,)), "base": spaces.Box(-1, 1, (1,), np.float64)})
     folder, buffers = written_by_minari(
@@ -329,15 +311,20 @@ def test_minaris_environment_is_never_made(written_by_minari, out: Path) -> None
 
 
 def test_minaris_episodes_and_steps_are_counted(written_by_minari, out: Path) -> None:
-    """One episode says that it is longer, one has an observation too many, and then one is gone."""
+    """One episode was not stored to its end, one says that it is longer, one has an observation too many; then one is
+    gone.
+    """
     folder, _ = written_by_minari(spaces.Box(-1, 1, (2,)))
     with h5py.File(folder / "data" / "main_data.hdf5", "r+") as file:
         file["episode_2"].attrs["total_steps"] = 9
         joints = file["episode_3/observations/arm/joints"][:]
         instead(file, "episode_3/observations/arm/joints", np.concatenate([joints, joints[:1]]))
+        del file["episode_1/actions"]
+        file["episode_1"].create_dataset("actions", (6, 2), "f4", chunks=(1, 2))[:3] = 1.0
     left_out = import_demonstrations(folder, out, choice=Choice(skip_broken=True)).left_out
-    assert Demonstrations.read(out).names == ("demo_0", "demo_1")
+    assert Demonstrations.read(out).names == ("demo_0",)
     for name, message in {
+        "demo_1": "demo_1: actions claims 6 chunks, but the file holds 3",
         "demo_2": "demo_2: total_steps is 9, and there are 7 actions",
         "demo_3": "demo_3: obs/arm/joints has 10 steps, but actions has 8",
     }.items():
@@ -346,15 +333,6 @@ def test_minaris_episodes_and_steps_are_counted(written_by_minari, out: Path) ->
         del file["episode_1"]
     with pytest.raises(DemonstrationsError, match="counts 4 episodes, and the dataset has 3; correct total_episodes"):
         inspect(folder)
-
-
-def test_minaris_values_that_were_never_stored_are_no_zeros(written_by_minari, out: Path) -> None:
-    folder, _ = written_by_minari(spaces.Box(-1, 1, (2,)))
-    with h5py.File(folder / "data" / "main_data.hdf5", "r+") as file:
-        del file["episode_2/actions"]
-        file["episode_2"].create_dataset("actions", (7, 2), "f4", chunks=(1, 2))[:3] = 1.0
-    with pytest.raises(DemonstrationsError, match="demo_2: actions claims 7 chunks, but the file holds 3"):
-        import_demonstrations(folder, out)
 
 
 # --- JIGSAWS ---------------------------------------------------------------------------------------------------------
@@ -405,7 +383,7 @@ def test_a_task_of_jigsaws(surgeons, out: Path) -> None:
 
 def test_a_source_at_a_lower_rate(surgeons, out: Path) -> None:
     folder, trials = surgeons
-    assert call("import", folder, "--out", out, "--hz", "10").status == 0
+    done("import", folder, "--out", out, "--hz", "10")
     demos = Demonstrations.read(out)
     assert demos.lengths == (10, 8, 10)
     means = trials[0][:30].reshape(10, 3, 76).mean(1)
@@ -429,8 +407,7 @@ def test_what_is_wrong_with_surgeons_files_is_one_line(surgeons, out: Path, chan
     folder, _ = surgeons
     if change:
         (folder / change[0]).write_text(change[1])
-    ended = call("import", folder, "--out", out, *more)
-    assert (ended.status, ended.err.count("\n"), message in ended.err) == (2, 1, True), ended.err
+    refused(message, "import", folder, "--out", out, *more)
     assert not out.exists()
 
 
@@ -491,7 +468,5 @@ def test_broken_demonstrations_are_refused_or_left_out(tmp_path: Path, out: Path
     ],
 )
 def test_wrong_choices_are_refused_in_one_line(out: Path, arguments: list[str], message: str) -> None:
-    ended = call("import", ROBOMIMIC, "--out", out, *arguments)
-    assert (ended.status, ended.out, ended.err.count("\n")) == (2, "", 1)
-    assert message in ended.err
+    refused(message, "import", ROBOMIMIC, "--out", out, *arguments)
     assert not out.exists()

@@ -9,7 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from command_line import call
+from command_line import call, done
 from odd_files.hdf5 import instead
 from odd_files.kinds import ROWS, twins, write
 from random_demonstrations import demonstrations
@@ -77,27 +77,12 @@ def test_shapes_ranges_lengths_and_constants(path: Path) -> None:
     assert [one.key for one in found.labels] == ["phase"]
 
 
-def test_what_a_fit_would_refuse_is_said(path: Path) -> None:
-    with h5py.File(path, "r+") as file:
-        file["data/demo_1/obs/pose"][2, 1] = np.nan
-        file["data/demo_2/obs/pose"][0, 0] = np.inf
-        instead(file, "data/demo_3/obs/goal", np.ones((2, 2)))
-        del file["data/demo_4/actions"]
-        instead(file, "mask/valid", [b"demo_9"])
-    found = inspect(path)
-    assert (found.fields["obs/pose"].nan, found.fields["obs/pose"].infinite) == (1, 1)
-    assert np.isfinite(found.fields["obs/pose"].minimum).all()
-    assert found.problems == [
-        "demo_3: obs/goal has 2 steps, but actions has 6",
-        "demo_4: actions is missing; there is: labels/phase, obs/camera, obs/fixed, obs/goal, obs/pose",
-        "mask/valid: there is no demonstration 'demo_9' (did you mean 'demo_4'?)",
-        "obs/pose has 1 NaN and 1 infinite values, the first in demo_1 at step 2; 2 of 4 demonstrations are affected",
-    ]
-
-
-def test_values_that_cannot_be_used_have_a_place(path: Path) -> None:
+def test_what_a_fit_would_refuse_is_said_with_its_place(path: Path) -> None:
     """A number that no network takes is one of them."""
     with h5py.File(path, "r+") as file:
+        instead(file, "mask/valid", [b"demo_9"])
+        instead(file, "data/demo_1/obs/goal", np.ones((2, 2)))
+        del file["data/demo_2/actions"]
         file["data/demo_3/obs/pose"][[2, 4], 1] = np.nan, 1e300
         file["data/demo_4/obs/pose"][:, 2] = -2e30
         file["data/demo_4/obs/goal"][2] = np.inf
@@ -107,13 +92,17 @@ def test_values_that_cannot_be_used_have_a_place(path: Path) -> None:
     assert (pose.nan, pose.infinite, pose.huge) == (1, 0, 1 + 3)
     assert (pose.first, pose.affected) == (("demo_3", 2), ["demo_3", "demo_4"])
     assert (goal.first, goal.affected) == (("demo_4", 2), ["demo_4"])
+    assert np.isfinite(pose.minimum).all()
     assert found.problems == [
-        "obs/goal has 0 NaN and 2 infinite values, the first in demo_4 at step 2; 1 of 5 demonstrations is affected",
-        "obs/pose has 1 NaN and 0 infinite values and 4 beyond ±1e+30, the first in demo_3 at step 2; 2 of 5 "
+        "demo_1: obs/goal has 2 steps, but actions has 4",
+        "demo_2: actions is missing; there is: labels/phase, obs/camera, obs/fixed, obs/goal, obs/pose",
+        "mask/valid: there is no demonstration 'demo_9' (did you mean 'demo_4'?)",
+        "obs/goal has 0 NaN and 2 infinite values, the first in demo_4 at step 2; 1 of 3 demonstrations is affected",
+        "obs/pose has 1 NaN and 0 infinite values and 4 beyond ±1e+30, the first in demo_3 at step 2; 2 of 4 "
         "demonstrations are affected",
     ]
     assert "1 NaN and 0 infinite values and 4 beyond ±1e+30" in call("inspect", path).out
-    assert inspect(path, exclude=["demo_3", "demo_4"]).problems == []
+    assert len(inspect(path, exclude=["demo_3", "demo_4"]).problems) == 3
 
 
 def test_the_command_shows_it_and_a_spec(path: Path) -> None:
@@ -142,14 +131,12 @@ NOTES: dict[str, list[str]] = {
         "control dimension 1: -0.38171402837921675 is common in demo_3 alone",
     ],
     "a demonstration twice": ["1 of 5 demonstrations equal another one, the first demo_4, which equals demo_0: one of"],
-    "an observation that is the control": [
-        "obs/command is control dimensions 0-1 at the same step, up to units and noise, which a policy has to predict",
-    ],
+    "an observation that is the control": ["obs/command is control dimensions 0-1 at the same step, up to"],
     "a switch padded by zeros": [
-        "control dimension 2: exactly 0 in 29.4 % of the steps; exactly at its minimum -1 in 47.1 % of the steps",
+        "control dimension 2: exactly 0 in 29.4 % of the steps; exactly at its minimum -1 in 47.1"
     ],
     "two conventions of a switch": [
-        "control dimension 2: exactly 0 in 17.6 % of the steps; exactly at its minimum -1 in 29.4 % of the steps",
+        "control dimension 2: exactly 0 in 17.6 % of the steps; exactly at its minimum -1 in"
     ],
     "integers -1, 0, 1": [],
     "demonstrations of one step": [],
@@ -209,15 +196,13 @@ def arm(steps: int, random: np.random.Generator) -> dict[str, np.ndarray]:
     return {"actions": np.column_stack([velocity, switch]), "obs/hand": hand, "obs/jaw": 0.5 * switch}
 
 
-def held(made: dict[str, np.ndarray], before: int, after: int, still: float = 0.0) -> dict[str, np.ndarray]:
-    """The arm, which rests before and after, under commands of 0 or of another number."""
-
-    def longer(place: str, rows: np.ndarray) -> np.ndarray:
-        rest = np.full((1, rows.shape[1]), still) if place == "actions" else None
-        first, last = (rows[[at]] if rest is None else rest for at in (0, -1))
-        return np.concatenate([first.repeat(before, 0), rows, last.repeat(after, 0)])
-
-    return {place: longer(place, rows) for place, rows in made.items()}
+def held(made: dict[str, np.ndarray], before: int, after: int) -> dict[str, np.ndarray]:
+    """The arm, which rests before and after, under commands of 0."""
+    longer = {}
+    for place, rows in made.items():
+        first, last = (rows[[at]] * (place != "actions") for at in (0, -1))
+        longer[place] = np.concatenate([first.repeat(before, 0), rows, last.repeat(after, 0)])
+    return longer
 
 
 Spoil = Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]]
@@ -254,7 +239,7 @@ def test_an_odd_demonstration_is_named_and_left_out(name: str, spoilt: tuple[int
     names = [f"demo_{number}" for number in spoilt]
     line = f"{', '.join(names)} ({len(names)} of 20): {why}; exclude such ones (demonstrations.exclude)"
     assert inspect(path).notes[0] == line
-    assert call("init", path, "--out", tmp_path / "spec.yaml").status == 0
+    done("init", path, "--out", tmp_path / "spec.yaml")
     text = (tmp_path / "spec.yaml").read_text()
     assert f"# {line}\n" in text
     assert load_spec(tmp_path / "spec.yaml").demonstrations.exclude == tuple(names)

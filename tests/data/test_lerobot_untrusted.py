@@ -7,31 +7,24 @@ import re
 from pathlib import Path
 
 import pytest
-from command_line import call
+from command_line import call, done
 from odd_files import lerobot as odd
 from odd_files import snapshot
+from planted import small_spec
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.importing import Choice, import_demonstrations
 from ddco_pyro.data.inspection import inspect
 from ddco_pyro.fitting.fit import fit
-from ddco_pyro.spec import parse_spec
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("run")
     import_demonstrations(odd.FIXTURE, folder / "demos.hdf5")
-    linear = {"network": "linear"}
-    spec = {
-        "demonstrations": {"path": str(folder / "demos.hdf5"), "valid_fraction": 0.25},
-        "observations": ["state"],
-        "control": {"std": 0.5},
-        "hierarchy": {"levels": [{"count": 2, "policy": linear}], "meta_policy": linear},
-        "training": {"epochs": 1, "batch_size": 3},
-    }
-    return fit(parse_spec(spec), out=folder / "run").folder
+    known = {"path": str(folder / "demos.hdf5"), "valid_fraction": 0.25}
+    return fit(small_spec(demonstrations=known, training={"epochs": 1}), out=folder / "run").folder
 
 
 def refused(ended, message: str) -> None:
@@ -65,10 +58,10 @@ def test_the_hubs_cache_is_read_and_copied(tmp_path: Path, run: Path) -> None:
         path.symlink_to(hub / "blobs" / str(number))
     (dataset / "loop").symlink_to(dataset)
     before = snapshot(tmp_path)
-    assert call("import", dataset, "--out", tmp_path / "demos.hdf5").status == 0
+    done("import", dataset, "--out", tmp_path / "demos.hdf5")
     assert Demonstrations.read(tmp_path / "demos.hdf5").lengths == (5, 6, 7, 8)
     out = tmp_path / "annotated"
-    assert call("segment", run, dataset, "--lerobot", out).status == 0
+    done("segment", run, dataset, "--lerobot", out)
     assert not any(path.is_symlink() for path in out.rglob("*"))
     assert (out / odd.VIDEO).read_bytes() == (odd.FIXTURE / odd.VIDEO).read_bytes()
     assert before.items() <= snapshot(tmp_path).items()
@@ -89,16 +82,22 @@ def test_an_episode_that_is_not_whole_is_named_and_can_be_skipped(name: str, tmp
 
 
 @pytest.mark.parametrize(
-    ("times", "message"),
+    ("times", "message", "broken"),
     [
-        (range(12), "demo_2: .* has 1 frames from second 1.1 on, and 7 are needed"),
-        ([*range(7), *range(8, 27)], "demo_1: .* has no frame of step 2: the next one is at second 0.8"),
+        (range(12), "demo_2: .* has 1 frames from second 1.1 on, and 7 are needed", ["demo_2", "demo_3"]),
+        ([*range(7), *range(8, 27)], "demo_1: .* has no frame of step 2: the next one is at second 0.8", ["demo_1"]),
     ],
 )
-def test_a_video_without_all_frames(times, message: str, tmp_path: Path) -> None:
+def test_episodes_without_all_of_their_frames_are_named_or_left_out(
+    times, message: str, broken: list[str], tmp_path: Path
+) -> None:
     dataset = odd.changed(odd.video_of(*times))(tmp_path)
     with pytest.raises(DemonstrationsError, match=message):
         import_demonstrations(dataset, tmp_path / "demos.hdf5", choice=Choice(("images/top",)))
+    choice = Choice(("images/top",), skip_broken=True)
+    left_out = import_demonstrations(dataset, tmp_path / "demos.hdf5", choice=choice).left_out
+    assert left_out.keys() | {*Demonstrations.read(tmp_path / "demos.hdf5").names} == {f"demo_{n}" for n in range(4)}
+    assert [*left_out] == broken
 
 
 def test_rows_of_an_episode_that_is_not_named_are_not_annotated(tmp_path: Path, run: Path) -> None:
@@ -117,7 +116,7 @@ def test_data_need_not_lie_under_data(tmp_path: Path, run: Path) -> None:
     for index in range(4):
         odd.parquet.write_table(odd.of_episode(table, index), dataset / "steps" / f"{index}-000.parquet")
     out = tmp_path / "annotated"
-    assert call("segment", run, dataset, "--lerobot", out).status == 0
+    done("segment", run, dataset, "--lerobot", out)
     columns = odd.parquet.read_table(out / "steps" / "2-000.parquet").column_names
     assert "language_persistent" in columns
     assert "language_persistent" in json.loads((out / "meta" / "info.json").read_text())["features"]

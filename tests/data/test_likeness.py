@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command_line import call
+from command_line import call, done
+from planted import small_spec
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.inspection import inspect
@@ -16,7 +17,7 @@ from ddco_pyro.data.planted import pick_and_place
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.fitted import load
 from ddco_pyro.labelling.session import Session
-from ddco_pyro.spec import load_spec, parse_spec
+from ddco_pyro.spec import dump_spec, load_spec
 
 Change = Callable[[Demonstration, Demonstration], tuple[dict[str, Any], np.ndarray]]
 """The observations and controls of a spoilt demonstration; gets another one, too."""
@@ -57,11 +58,7 @@ POSITIONS = ("gripper", "object", "goal")
 
 FAULTS: dict[str, tuple[Change, str, str]] = {
     "millimetres": (scaled(1000, *POSITIONS), "obs/gripper dimensions 0-2", "1000 times as large as {}, perhaps milli"),
-    "metres": (
-        scaled(0.01, "gripper"),
-        "obs/gripper dimensions 0-2",
-        "100 times as small as {}, perhaps metres for cen",
-    ),
+    "metres": (scaled(0.01, "gripper"), "obs/gripper dimensions 0-2", "100 times as small as {}, perhaps metres for"),
     "degrees": (scaled(57.3, "gripper"), "obs/gripper", "57.3 times as large as {}, perhaps degrees for radians"),
     "gripper": (reversed_gripper, "control dimension 3", "the other sign than {}, perhaps reversed"),
     "joined": (joined, "observations jump at once, in demo_3 at step 4", "perhaps two recordings are joined"),
@@ -88,7 +85,7 @@ def test_a_share_of_a_file_that_is_unlike_the_rest_is_named_and_left_out(name: s
     assert line.endswith("; exclude such ones (demonstrations.exclude)")
     assert not others
     assert line in " ".join(call("inspect", path).out.split())
-    assert call("init", path, "--out", tmp_path / "spec.yaml").status == 0
+    done("init", path, "--out", tmp_path / "spec.yaml")
     assert f"# {line}\n" in (tmp_path / "spec.yaml").read_text()
     assert load_spec(tmp_path / "spec.yaml").demonstrations.exclude == names
 
@@ -110,16 +107,14 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("unlike")
     demos = pick_and_place(12)
     Demonstrations(demos.demonstrations, attributes={"control_frequency": 30}).write(folder / "demos.hdf5")
-    linear = {"policy": {"network": "linear"}, "termination": {"network": "linear"}}
-    spec = {
-        "demonstrations": {"path": str(folder / "demos.hdf5")},
-        "observations": ["gripper", "object", "goal", "jaw"],
-        "control": {"std": {"learn": True, "floor": 0.01}},
-        "hierarchy": {"levels": [{"name": "skill", "count": 4, **linear}], "meta_policy": linear["policy"]},
-        "training": {"optimizer": {"name": "em"}, "tune_fraction": 0, "epochs": 5},
-        "compare_with": [],
-    }
-    fit(parse_spec(spec), out=folder / "run")
+    spec = small_spec(
+        (4,),
+        demonstrations={"path": str(folder / "demos.hdf5")},
+        observations=["gripper", "object", "goal", "jaw"],
+        control={"std": {"learn": True, "floor": 0.01}},
+        training={"optimizer": {"name": "em"}, "tune_fraction": 0, "epochs": 5},
+    )
+    fit(spec, out=folder / "run")
     return folder / "run"
 
 
@@ -143,12 +138,6 @@ def test_segment_names_demonstrations_unlike_those_of_the_fit(name: str, run: Pa
     assert (tmp_path / "segments.csv").exists()
 
 
-def test_segment_says_nothing_of_others_of_the_same_kind(run: Path, tmp_path: Path) -> None:
-    path = tmp_path / "demos.hdf5"
-    pick_and_place(6, seed=1).write(path)
-    assert "note: " not in call("segment", run, path, "--csv", tmp_path / "segments.csv").err
-
-
 def test_label_warns_of_demonstrations_unlike_those_of_the_fit(run: Path, tmp_path: Path) -> None:
     path = tmp_path / "demos.hdf5"
     spoilt(pick_and_place(6, seed=1), reversed_gripper, (3, 5)).write(path)
@@ -163,18 +152,18 @@ def test_label_warns_of_demonstrations_unlike_those_of_the_fit(run: Path, tmp_pa
 def test_fit_warns_of_demonstrations_unlike_the_others(tmp_path: Path) -> None:
     path = tmp_path / "demos.hdf5"
     spoilt(pick_and_place(8), reversed_gripper, (3, 5)).write(path)
-    text = (
-        f"demonstrations: {{path: {path}}}\nobservations: [gripper, object, jaw]\ncompare_with: []\n"
-        "hierarchy: {levels: [{name: skill, count: 2, policy: {network: linear}, termination: {network: linear}}], "
-        "meta_policy: {network: linear}}\ntraining: {optimizer: {name: em}, tune_fraction: 0, epochs: 2}\n"
-    )
-    (tmp_path / "spec.yaml").write_text(text)
+    training = {"optimizer": {"name": "em"}, "tune_fraction": 0, "epochs": 2}
+    spec = small_spec(demonstrations={"path": str(path)}, observations=["gripper", "object", "jaw"], training=training)
+    (tmp_path / "spec.yaml").write_text(dump_spec(spec))
     said = call("fit", tmp_path / "spec.yaml", "--out", tmp_path / "run", "--jobs", 1).out
     assert "warning: demo_3, demo_5 (2 of 8): control dimension 3 has the other sign than in most" in said
 
 
-def test_segment_says_where_files_have_other_rates(run: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("rate", "notes"), [(30, 0), (10, 1)])
+def test_segment_says_where_files_have_other_rates_and_nothing_else_of_the_same_kind(
+    rate: int, notes: int, run: Path, tmp_path: Path
+) -> None:
     path = tmp_path / "demos.hdf5"
-    Demonstrations(pick_and_place(6, seed=1).demonstrations, attributes={"control_frequency": 10}).write(path)
+    Demonstrations(pick_and_place(6, seed=1).demonstrations, attributes={"control_frequency": rate}).write(path)
     said = call("segment", run, path, "--csv", tmp_path / "segments.csv").err
-    assert "(6 of 6): 10 Hz, and 30 Hz in the fit\n" in said
+    assert said.count("note: ") == said.count("(6 of 6): 10 Hz, and 30 Hz in the fit\n") == notes

@@ -102,9 +102,6 @@ def test_a_state_that_follows_slow_targets_closely_is_read(tmp_path: Path) -> No
     assert "obs/near" not in inspect(seen.path).leaks
 
 
-# --- signals of subtasks ----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("place", ["datagen_info", "obs/datagen_info"], ids=["MimicGen", "Isaac Lab"])
 def test_signals_of_subtasks_are_labels(place: str, tmp_path: Path) -> None:
     """A signal is 1 from the last step of its subtask on. What follows the last one is a subtask without a signal."""

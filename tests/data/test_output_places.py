@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import shlex
 import shutil
 from pathlib import Path
@@ -12,18 +11,12 @@ from typing import NamedTuple
 import h5py
 import pytest
 import toy_task
-from command_line import Ended, call
+from command_line import call, done, refused
 from odd_files import snapshot
 from random_demonstrations import demonstrations
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.training.data import demonstrations as of
-
-
-def refused(ended: Ended, says: str) -> None:
-    assert (ended.status, ended.out, ended.err.count("\n")) == (2, "", 1), ended
-    assert ended.err.startswith("ddco-pyro: ")
-    assert re.search(says, ended.err), ended.err
 
 
 @pytest.fixture(scope="module")
@@ -55,8 +48,10 @@ class Command(NamedTuple):
     folder: bool = False
 
 
+WITHIN = "lies in {}, which this command reads"
 COMMANDS = {
     "segment --csv": Command("segment run demos.hdf5 --csv", "demos.hdf5"),
+    "segment of links --csv": Command("segment run linked --csv", "linked"),
     "segment --out": Command("segment run demos.hdf5 --out", "demos.hdf5"),
     "segment --elan": Command("segment run demos.hdf5 --elan", "run", folder=True),
     "export": Command("export run --out", "run", folder=True),
@@ -93,8 +88,12 @@ NO_FOLDER = {"file": "is a file; name a folder", "pipe": "is a file; name a fold
 
 def places(command: Command) -> dict[str, str]:
     if command.read == "run":
-        return NOWHERE | NO_FOLDER | dict.fromkeys(["run/new", "link-run/new"], "lies in run, which this command reads")
+        return NOWHERE | NO_FOLDER | dict.fromkeys(["run/new", "link-run/new"], WITHIN.format("run"))
+    if command.read == "linked":
+        return {"file": READ, "folder/new": WITHIN.format("linked")}
+    of_run = dict.fromkeys(("run/model.safetensors", "run/new", "link-run/spec.yaml"), WITHIN.format("run"))
     read = dict.fromkeys((command.read, f"link-{command.read}", f"hard-{command.read}"), READ)
+    read |= of_run if command.arguments.startswith("segment") else {}
     return NOWHERE | (NO_FOLDER if command.folder else NO_FILE | read)
 
 
@@ -103,23 +102,7 @@ def test_a_bad_place_is_refused_before_anything_is_done(inputs: Path, monkeypatc
     monkeypatch.chdir(inputs)
     before = snapshot(inputs)
     for place, says in places(COMMANDS[name]).items():
-        refused(call(*COMMANDS[name].arguments.split(), place), says)
-    assert snapshot(inputs) == before
-
-
-def test_a_file_of_the_run_is_no_output(inputs: Path, monkeypatch) -> None:
-    monkeypatch.chdir(inputs)
-    before = snapshot(inputs)
-    for place in ("run/model.safetensors", "run/new", "link-run/spec.yaml"):
-        refused(call("segment", "run", "demos.hdf5", "--csv", place), "lies in run, which this command reads")
-    assert snapshot(inputs) == before
-
-
-def test_what_a_link_in_an_input_leads_to_is_no_output(inputs: Path, monkeypatch) -> None:
-    monkeypatch.chdir(inputs)
-    before = snapshot(inputs)
-    for place, says in {"file": READ, "folder/new": "lies in linked, which this command reads"}.items():
-        refused(call("segment", "run", "linked", "--csv", place), says)
+        refused(says, *COMMANDS[name].arguments.split(), place)
     assert snapshot(inputs) == before
 
 
@@ -127,10 +110,10 @@ def test_what_a_link_in_an_input_leads_to_is_no_output(inputs: Path, monkeypatch
 def test_two_outputs_of_one_name_are_refused(inputs: Path, tmp_path: Path, monkeypatch, second: str) -> None:
     monkeypatch.chdir(tmp_path)
     Path("link").symlink_to("a")
-    ended = call("segment", inputs / "run", inputs / "demos.hdf5", "--html", "a", "--csv", second)
-    refused(ended, f"--csv {Path(second)}: is also where --html is written; choose another place")
-    ended = call("segment", inputs / "run", inputs / "demos.hdf5", "--csv", "new/a", "--elan", "new")
-    refused(ended, "--elan new: and --csv new/a lie in one another")
+    given = ("segment", inputs / "run", inputs / "demos.hdf5")
+    says = f"--csv {Path(second)}: is also where --html is written; choose another place"
+    refused(says, *given, "--html", "a", "--csv", second)
+    refused("--elan new: and --csv new/a lie in one another", *given, "--csv", "new/a", "--elan", "new")
     assert [path.name for path in tmp_path.iterdir()] == ["link"]
 
 
@@ -152,29 +135,25 @@ def test_a_link_is_kept(toy_run, file: Path, tmp_path: Path) -> None:
     assert (tmp_path / "there.csv").read_text().startswith("<!doctype html>")
 
 
-def segment(run: Path, file: Path, out: Path) -> Ended:
-    return call("segment", run, file, "--out", out)
-
-
 def test_no_file_but_a_labelled_copy_is_replaced(toy_run, file: Path, tmp_path: Path) -> None:
     """A file of somebody else, and a labelled copy of other demonstrations."""
     other, copy = tmp_path / "other.hdf5", tmp_path / "copy.hdf5"
     Demonstrations(Demonstrations.read(file, labels=["phase"]).demonstrations[:9]).write(other)
-    assert segment(toy_run.folder, other, copy).status == 0
+    done("segment", toy_run.folder, other, "--out", copy)
     for there in (other, copy):
         before = there.read_bytes()
         says = f"--out {there}: exists and is not a labelled copy of {file}; choose another --out, or remove it"
-        refused(segment(toy_run.folder, file, there), says)
+        refused(says, "segment", toy_run.folder, file, "--out", there)
         assert there.read_bytes() == before
 
 
 def test_a_labelled_copy_is_replaced(toy_run, file: Path, tmp_path: Path) -> None:
     copy = tmp_path / "copy.hdf5"
-    assert segment(toy_run.folder, file, copy).status == 0
+    done("segment", toy_run.folder, file, "--out", copy)
     with h5py.File(file, "r+") as opened:
         opened["data/demo_0"].attrs["note"] = "seen"
         opened["mask/exclude"] = [b"demo_1"]
-    assert segment(toy_run.folder, file, copy).status == 0
+    done("segment", toy_run.folder, file, "--out", copy)
     with h5py.File(copy) as opened:
         assert opened["data/demo_0"].attrs["note"] == "seen"
         assert opened["mask/exclude"][()].tolist() == [b"demo_1"]
@@ -184,8 +163,8 @@ def test_a_page_or_table_does_not_replace_demonstrations(toy_run, file: Path, tm
     other = tmp_path / "other.hdf5"
     shutil.copy(file, other)
     for option in ("--html", "--csv", "--parquet"):
-        refused(call("segment", toy_run.folder, file, option, other), f"{option} {other}: is an HDF5 file")
-    refused(call("init", file, "--force", "--out", other), "is an HDF5 file, which this would replace")
+        refused(f"{option} {other}: is an HDF5 file", "segment", toy_run.folder, file, option, other)
+    refused("is an HDF5 file, which this would replace", "init", file, "--force", "--out", other)
     assert other.read_bytes() == file.read_bytes()
 
 
@@ -193,12 +172,12 @@ def test_collect_takes_only_its_own_file_for_done(tmp_path: Path, cache) -> None
     spec, out = tmp_path / "toy.yaml", tmp_path / "demos.hdf5"
     spec.write_text(toy_task.SPEC)
     for _ in range(2):
-        assert call("collect", spec, "--out", out, "--set", "demonstrations.count=3").status == 0
+        assert done("collect", spec, "--out", out, "--set", "demonstrations.count=3").out == f"{out}\n"
     before = out.read_bytes()
-    refused(call("collect", spec, "--out", out), "is there already and does not hold these demonstrations")
+    refused("is there already and does not hold these demonstrations", "collect", spec, "--out", out)
     assert out.read_bytes() == before
     demonstrations(12).write(out)
-    refused(call("collect", spec, "--out", out), "is there already and does not hold these demonstrations")
+    refused("is there already and does not hold these demonstrations", "collect", spec, "--out", out)
 
 
 # --- what is written --------------------------------------------------------------------------------------------------
@@ -210,7 +189,7 @@ def test_a_name_that_is_a_formula_is_quoted_in_csv(toy_run, file: Path, tmp_path
         for old, new in zip([*opened["data"]], names, strict=False):
             opened.move(f"data/{old}", f"data/{new.replace('/', '%')}")
     table = tmp_path / "a.csv"
-    assert call("segment", toy_run.folder, file, "--csv", table).status == 0
+    done("segment", toy_run.folder, file, "--csv", table)
     first = {line.split(",")[0] for line in table.read_text().splitlines()}
     assert {"'+1", "'-2", "'@SUM(A1)", "plain", "'=cmd|' %C calc'!A0"} <= first
     assert not [cell for cell in first if cell.startswith(("=", "+", "-", "@"))]
@@ -227,10 +206,10 @@ def test_a_rollout_asks_for_what_its_report_needs_first(toy_run, tmp_path: Path,
     spec = (run / "spec.yaml").read_text()
     (run / "report.html").unlink(missing_ok=True)
     (run / "report.html").mkdir()
-    refused(call("rollout", run, "--episodes", 2), f"RUN {run}/report.html: is a folder; name a file")
+    refused(f"RUN {run}/report.html: is a folder; name a file", "rollout", run, "--episodes", 2)
     (run / "report.html").rmdir()
     (run / "spec.yaml").write_text(spec.replace("task: toy\n", "", 1).replace("path: null", f"path: {gone}"))
-    refused(call("rollout", run, "--episodes", 2), f"{gone}: there is no such file")
+    refused(f"{gone}: there is no such file", "rollout", run, "--episodes", 2)
     assert not played
 
 
@@ -246,4 +225,4 @@ def test_commands_are_printed_as_a_shell_takes_them(tmp_path: Path, monkeypatch)
     said = call(*shlex.split(said)[1:]).out.partition("fit it with: ")[2]
     assert shlex.split(said) == ["ddco-pyro", "fit", "a b.yaml", "--out", "runs/a b"]
     assert "# Fit it:              ddco-pyro fit 'a b.yaml' --out runs/first\n" in Path("a b.yaml").read_text()
-    assert call("check", "a b.yaml").status == 0
+    done("check", "a b.yaml")

@@ -15,6 +15,7 @@ import yaml
 from command_line import call
 from dots import followed
 from odd_files.hdf5 import spoil
+from planted import small_spec
 
 import ddco_pyro
 from ddco_pyro.acting.controller import ObservationError, Window
@@ -161,10 +162,7 @@ def test_a_trajectory_is_shifted_as_one_and_anew_in_each_epoch() -> None:
     [
         ({"key": "camera", "crop": [3, 3, 10, 4]}, r"'camera' crop: \[3, 3, 10, 4\] is not within 12 × 10 pixels"),
         ({"key": "pose", "resize": [4, 4]}, r"'pose' has shape \[3\] at each step: crop and resize are for"),
-        (
-            {"key": "pose", "shift": 1},
-            r"'pose' has shape \[3\] at each step: shift is f",
-        ),
+        ({"key": "pose", "shift": 1}, r"'pose' has shape \[3\] at each step: shift is f"),
         ({"key": "camera", "bins": 4}, r"'camera' has pictures: bins are for vectors"),
     ],
 )
@@ -238,15 +236,8 @@ CONVOLUTION = {
 
 def test_a_dot_is_followed():
     """With less than a fifth of the error of the best control that does not look."""
-    spec = parse_spec(
-        {
-            "demonstrations": {"path": "unused.hdf5"},
-            "observations": ["camera"],
-            "control": {"std": 0.1},
-            "baseline": {"kind": "flat", "policy": CONVOLUTION},
-            "training": {"epochs": 60, "batch_size": 4, "optimizer": {"lr": 0.01}},
-        }
-    )
+    training = {"epochs": 60, "batch_size": 4, "optimizer": {"lr": 0.01}}
+    spec = small_spec((), CONVOLUTION, observations=["camera"], control={"std": 0.1}, training=training)
     controller, new = ddco_pyro.fit(spec, followed(16)).controller(), followed(8, seed=1)
     squared = []
     for demo in new:

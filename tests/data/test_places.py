@@ -13,7 +13,7 @@ import forked
 import pytest
 import torch
 import toy_task
-from command_line import call
+from command_line import call, done
 from killing import HANGS
 from random_demonstrations import demonstrations
 
@@ -21,8 +21,6 @@ from ddco_pyro.data.files import only_one, whole_file, whole_folder, write_text
 from ddco_pyro.data.tensors import read_tensors, write_tensors
 from ddco_pyro.errors import BadInput
 from ddco_pyro.training.data import demonstrations as of
-
-NOBODY = 65534
 
 
 def fails_on_a_full_disk(size: int, *command: object) -> None:
@@ -44,8 +42,8 @@ def test_a_full_disk_while_importing(tmp_path: Path, size: int) -> None:
     fails_on_a_full_disk(size, "import", source, "--out", out)
     assert not out.exists()
     assert not list(tmp_path.rglob("*.tmp"))
-    assert call("import", source, "--out", out).status == 0
-    assert call("import", source, "--out", tmp_path / "again.hdf5").status == 0
+    done("import", source, "--out", out)
+    done("import", source, "--out", tmp_path / "again.hdf5")
     assert out.read_bytes() == (tmp_path / "again.hdf5").read_bytes()
 
 
@@ -64,8 +62,8 @@ def test_a_full_disk_while_fitting(tmp_path: Path, cache) -> None:
     spec.write_text(toy_task.SPEC)
     short = ["--set", "training.epochs=2", "--set", "compare_with=[]"]
     fails_on_a_full_disk(4000, "fit", spec, "--out", tmp_path / "run", *short)
-    assert call("fit", spec, "--out", tmp_path / "run", *short).status == 0
-    assert call("fit", spec, "--out", tmp_path / "other", *short).status == 0
+    done("fit", spec, "--out", tmp_path / "run", *short)
+    done("fit", spec, "--out", tmp_path / "other", *short)
     assert (tmp_path / "run/model.safetensors").read_bytes() == (tmp_path / "other/model.safetensors").read_bytes()
 
 
@@ -81,7 +79,7 @@ def test_a_read_only_folder(tmp_path: Path) -> None:
 
     def as_nobody() -> list[str]:
         if os.getuid() == 0:
-            os.setuid(NOBODY)
+            os.setuid(65534)  # nobody
         said = []
         for attempt in (lambda: write_text(folder / "file", "x"), lambda: only_one(folder / "run").__enter__()):
             with pytest.raises(BadInput) as refused:

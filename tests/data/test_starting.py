@@ -11,8 +11,7 @@ import h5py
 import numpy as np
 import pytest
 import yaml
-from command_line import call
-from gripper import planted
+from command_line import call, done, refused, with_set
 from odd_files.kinds import ROWS
 from random_demonstrations import demonstration, demonstrations, numbered
 from scipy import stats
@@ -20,6 +19,7 @@ from scipy import stats
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
 from ddco_pyro.data.inspection import inspect
+from ddco_pyro.data.planted import pick_and_place
 from ddco_pyro.data.starting import starting_spec
 from ddco_pyro.report.likelihood import stds
 from ddco_pyro.spec import Spec, load_spec, with_overrides
@@ -76,8 +76,7 @@ def test_what_it_writes_finds_what_was_planted_as_it_is(path: Path, tmp_path: Pa
     assert said[0] == "2 options, as many as the values of labels/skill"
     assert re.fullmatch(r"median segment [\d.]+ steps in small fits", said[1])
     assert said[2:] == [f"{spec}: fit it with: ddco-pyro fit {spec} --out runs/spec"]
-    ended = call("fit", spec, "--out", tmp_path / "run")
-    assert ended.status == 0, ended.err
+    ended = done("fit", spec, "--out", tmp_path / "run")
     assert ended.out.splitlines()[-1] == f"next: ddco-pyro segment {tmp_path / 'run'} '{path}' --html segments.html"
     looked = call("inspect", path).out.splitlines()[-1]
     assert looked == f"next: ddco-pyro init '{path}' --out 'my demos: 1.yaml'"
@@ -93,9 +92,9 @@ def test_what_it_writes_finds_what_was_planted_as_it_is(path: Path, tmp_path: Pa
 @pytest.mark.slow
 def test_what_it_writes_lets_every_method_converge(tmp_path: Path) -> None:
     """Two-valued and constant controls are what took longest."""
-    planted().write(tmp_path / "gripper.hdf5")
-    ended = call("fit", started(tmp_path / "gripper.hdf5"), "--out", tmp_path / "run")
-    assert ended.status == 0, ended.err
+    demos = (replace(demo, actions=np.insert(demo.actions, 0, 0.5, axis=1)) for demo in pick_and_place(120))
+    Demonstrations(tuple(demos)).write(tmp_path / "planted.hdf5")
+    done("fit", started(tmp_path / "planted.hdf5"), "--out", tmp_path / "run")
     metrics = ddco_pyro.load(tmp_path / "run").metrics
     trainings = metrics.trainings.values()
     assert [one.converged for one in trainings] == [True] * 4  # with a mixture and two flat policies
@@ -155,8 +154,7 @@ def test_a_few_broken_demonstrations_are_left_out(path: Path, tmp_path: Path) ->
     fit = ddco_pyro.fit(load_spec(written, ["training.epochs=1", "compare_with=[]"]), out=tmp_path / "run")
     numbers = fit.metrics.demonstrations
     assert numbers.train + numbers.tune + numbers.valid == 8
-    ended = call("segment", tmp_path / "run", path, "--csv", tmp_path / "segments.csv")
-    assert ended.status == 0, ended.err
+    done("segment", tmp_path / "run", path, "--csv", tmp_path / "segments.csv")
     rows = [line.split(",")[0] for line in (tmp_path / "segments.csv").read_text().splitlines()[1:]]
     assert set(rows) == {f"demo_{number}" for number in range(10)} - {"demo_2", "demo_9"}
 
@@ -187,10 +185,8 @@ def test_pictures_alone_are_seen_by_one_network(tmp_path: Path) -> None:
     assert set(spec.hierarchy.trunk.of) == set(CAMERAS)
     fit = ddco_pyro.fit(load_spec(written, ["training.epochs=2"]))
     assert list(fit.baselines) == ["mixture", "flat_equal"]
-    assert (
-        stds(fit)
-        == "Options and mixture have one σ for each option; flat of equal size has a σ that depends on the state."
-    )
+    said = "Options and mixture have one σ for each option; flat of equal size has a σ that depends on the state."
+    assert stds(fit) == said
 
 
 CAMERAS = {"eye": (40, 80), "2nd eye": (12, 16)}
@@ -256,9 +252,7 @@ def test_angles_that_are_none_are_refused(
 ) -> None:
     seen, levels = [{"key": "pose", **settings}], [{"count": 2}]
     spec = {"demonstrations": {"path": str(path)}, "observations": seen, "hierarchy": {"levels": levels}}
-    ended = call("check", write(tmp_path, yaml.safe_dump(spec)))
-    assert (ended.status, ended.err.count("\n")) == (2, 1)
-    assert says in ended.err
+    refused(says, "check", write(tmp_path, yaml.safe_dump(spec)))
 
 
 def test_text_alone_cannot_be_fitted(path: Path) -> None:
@@ -277,7 +271,7 @@ def test_a_file_that_is_there_is_not_replaced_unasked(path: Path, tmp_path: Path
     ended = call("init", path, "--out", spec)
     assert (ended.status, spec.read_text()) == (2, "mine")
     assert ended.err == f"ddco-pyro: {spec}: exists; choose another --out, or replace it with --force\n"
-    assert call("init", path, "--out", spec, "--force").status == 0
+    done("init", path, "--out", spec, "--force")
     assert spec.read_text() != "mine"
 
 
@@ -364,17 +358,11 @@ def test_what_cannot_be_held_out_by(attribute: str, says: str, path: Path, tmp_p
     ended = call("init", of_operators(path, "ABCAB"), "--out", spec, "--hold-out-by", attribute)
     assert (ended.status, ended.out, ended.err) == (2, "", f"ddco-pyro: {path}: {says}\n")
     assert not spec.exists()
-    asked = [f"demonstrations.hold_out_by={attribute}"]
-    assert call("init", path, "--out", spec).status == 0
+    done("init", path, "--out", spec)
     for command in ("check", "fit"):
         out = ["--out", tmp_path / "run"] if command == "fit" else []
-        ended = call(command, spec, *out, *(word for one in asked for word in ("--set", one)))
-        assert (ended.status, ended.err.count("\n")) == (2, 1)
-        assert says in ended.err
+        refused(says, command, spec, *out, *with_set(f"demonstrations.hold_out_by={attribute}"))
     assert not (tmp_path / "run").exists()
-
-
-# --- ``init``, ``check`` and ``fit`` ask the same questions -----------------------------------------------------------
 
 
 FITTED = ("grey alone", "demonstrations of one step")
@@ -387,26 +375,10 @@ def started(path: Path) -> Path | None:
     ended = call("init", path, "--out", spec)
     assert ended.status in (0, 2), ended.err
     if ended.status == 0:
-        assert call("check", spec).status == 0
+        done("check", spec)
         return spec
     assert ended.err.count("\n") == 1
     return None
-
-
-def fit(spec: Path) -> None:
-    ended = call(
-        "fit",
-        spec,
-        "--out",
-        spec.with_suffix(".run"),
-        "--jobs",
-        "1",
-        "--set",
-        "training.epochs=2",
-        "--set",
-        "compare_with=[]",
-    )
-    assert ended.status == 0, ended.err
 
 
 @pytest.mark.parametrize("name", ROWS)
@@ -422,4 +394,5 @@ def test_what_init_accepts_check_accepts(name: str, tmp_path: Path) -> None:
         said = "\n".join([*found.problems, *found.notes])
         assert re.search(says, said) or found.problems or found.leaks or all(d.constant for d in found.control)
     elif name in FITTED:
-        fit(spec)
+        run = spec.with_suffix(".run")
+        done("fit", spec, "--out", run, "--jobs", 1, *with_set("training.epochs=2", "compare_with=[]"))

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
-from command_line import call
+from command_line import call, done
 from targets import targets, velocities
 
-from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.inspection import inspect
 from ddco_pyro.data.starting import starting_spec
 
@@ -19,36 +21,26 @@ def test_init_recognises_targets_and_what_it_writes_can_be_fitted(tmp_path: Path
     path, spec = tmp_path / "targets.hdf5", tmp_path / "spec.yaml"
     targets(velocities()).write(path)
     assert "the control is a target of obs/gripper" in call("inspect", path).out
-    assert call("init", path, "--out", spec).status == 0
+    done("init", path, "--out", spec)
     assert yaml.safe_load(spec.read_text())["control"]["relative_to"] == "gripper"
-    ended = call("check", spec)
-    assert ended.status == 0, ended.err
-    ended = call("fit", spec, "--out", tmp_path / "run", "--set", "compare_with=[]", "--set", "training.epochs=5")
-    assert ended.status == 0, ended.err
+    done("check", spec)
+    done("fit", spec, "--out", tmp_path / "run", "--set", "compare_with=[]", "--set", "training.epochs=5")
 
 
-def lagging(demos: Demonstrations, share: float) -> Demonstrations:
-    """Positions that cover a share of the way to their target in each step; the target leads them by its inverse."""
-    return Demonstrations(
-        tuple(replace(demo, actions=demo.observations["gripper"] + demo.actions / share) for demo in demos)
-    )
-
-
-def in_other_units(demos: Demonstrations) -> Demonstrations:
-    return Demonstrations(tuple(replace(demo, actions=1000 * demo.actions) for demo in demos))
-
-
-def reordered(demos: Demonstrations) -> Demonstrations:
-    return Demonstrations(tuple(replace(demo, actions=demo.actions[:, [1, 2, 0]]) for demo in demos))
+def acted(demos: Demonstrations, control: Callable[[Demonstration], np.ndarray]) -> Demonstrations:
+    """The same demonstrations with other controls."""
+    return Demonstrations(tuple(replace(demo, actions=control(demo)) for demo in demos))
 
 
 FILES: dict[str, tuple[Demonstrations, str | None]] = {
     "the next state": (targets(velocities()), "gripper"),
-    "a target that the state lags behind": (lagging(velocities(), 0.7), "gripper"),
+    "a target that the state lags behind": (
+        acted(velocities(), lambda demo: demo.observations["gripper"] + demo.actions / 0.7), "gripper"
+    ),
     "velocities": (velocities(), None),
-    "in millimetres": (in_other_units(targets(velocities())), None),
-    "in another order": (reordered(targets(velocities())), None),
-}
+    "in millimetres": (acted(targets(velocities()), lambda demo: 1000 * demo.actions), None),
+    "in another order": (acted(targets(velocities()), lambda demo: demo.actions[:, [1, 2, 0]]), None),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(("demos", "key"), FILES.values(), ids=FILES)

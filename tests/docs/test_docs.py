@@ -95,9 +95,6 @@ def test_the_citation_has_the_version_of_the_package() -> None:
     assert citation["references"][0]["year"] == 2017
 
 
-# --- prose, of library, docs and specs --------------------------------------------------------------------------------
-
-
 TURNS = (
     "of before", "whoever", "so it is", "told from", "nobody", "but for", "be it that", "tells? apart", "told apart",
     "of its own accord", "as it was", "as they were",

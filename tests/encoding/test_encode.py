@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from command_line import call
+from command_line import call, done, refused
 from dots import SIZE, followed, together
 from sklearn.decomposition import PCA
 from sklearn.linear_model import LinearRegression
@@ -136,8 +136,7 @@ def test_models_of_timm(monkeypatch):
 
 def test_the_command(few_dots, out):
     arguments = ("encode", few_dots, "--observation", "camera", "--encoder", MEANS, "--allow-code", "--size", 3)
-    ended = call(*arguments, "--out", out)
-    assert ended.status == 0
+    ended = done(*arguments, "--out", out)
     assert ended.out.startswith(f"{out}: obs/camera_features: 3 of 4 features, ")
     before = out.read_bytes()
     other = call(*arguments, "--out", out)
@@ -169,13 +168,14 @@ OWN = "user_encoders:"
 )
 def test_what_cannot_be_used(few_dots, out, options, message):
     given = ["--observation", "camera", "--encoder", MEANS, "--allow-code", *options]
-    refused(call("encode", few_dots, *given, "--out", out), out, message)
+    refused(message, "encode", few_dots, *given, "--out", out)
+    assert not list(out.parent.iterdir())
 
 
 def test_timm_is_an_extra(few_dots, out, monkeypatch):
     monkeypatch.setitem(sys.modules, "timm", None)
-    ended = call("encode", few_dots, "--observation", "camera", "--encoder", "timm:resnet18.a1_in1k", "--out", out)
-    refused(ended, out, "pip install 'ddco-pyro[timm]'")
+    asked = ["--observation", "camera", "--encoder", "timm:resnet18.a1_in1k"]
+    refused("pip install 'ddco-pyro[timm]'", "encode", few_dots, *asked, "--out", out)
 
 
 def test_features_that_only_later_pictures_spoil(tmp_path, out):
@@ -188,8 +188,8 @@ def test_features_that_only_later_pictures_spoil(tmp_path, out):
 
 
 def test_user_code_needs_permission(few_dots, out):
-    ended = call("encode", few_dots, "--observation", "camera", "--encoder", MEANS, "--out", out)
-    refused(ended, out, "would import user code; pass --allow-code")
+    asked = ["--observation", "camera", "--encoder", MEANS]
+    refused("would import user code; pass --allow-code", "encode", few_dots, *asked, "--out", out)
     encoded(few_dots, out)
     with pytest.raises(BadInput, match="would import user code"):
         load(out)
@@ -203,9 +203,3 @@ def test_a_damaged_encoder(few_dots, out):
         load(out, allow_code=True)
     with pytest.raises(BadInput, match="there is no encoder of one observation alone; there is: none"):
         load(few_dots)
-
-
-def refused(ended, out, message):
-    assert (ended.status, ended.err.count("\n")) == (2, 1)
-    assert message in ended.err
-    assert not list(out.parent.iterdir())

@@ -9,7 +9,7 @@ from itertools import groupby, permutations
 
 import numpy as np
 import pytest
-from command_line import call
+from command_line import call, done
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse import csr_array
@@ -51,9 +51,6 @@ def noisy(seed, options=4):
     return [np.where(k, one, w) for k, one, w in zip(keep, labels, wrong, strict=True)], labels
 
 
-# --- NMI, ARI, accuracy and IoU ---------------------------------------------------------------------------------------
-
-
 def nmi(ours, theirs):
     """2 I(X; Y) / (H(X) + H(Y)) from counts."""
     n, joint, x, y = len(ours), Counter(zip(ours, theirs, strict=True)), Counter(ours), Counter(theirs)
@@ -88,9 +85,6 @@ def test_the_matching_is_one_for_all_demonstrations_or_one_for_each():
     whole, each = (found[way] for way in WAYS)
     assert whole["accuracy"] == pytest.approx(0.6)
     assert each == dict.fromkeys(MATCHED, 1.0)
-
-
-# --- segments, by hand ------------------------------------------------------------------------------------------------
 
 
 def literal_f1(segments, labels, overlap):
@@ -143,9 +137,6 @@ def test_edit_score_by_hand():
     assert found["matched_globally"]["edit"] == pytest.approx(np.mean([3 / 4, 2 / 3, 1]))
 
 
-# --- what is not known, and what is left over -------------------------------------------------------------------------
-
-
 def test_steps_of_unknown_label_are_left_out():
     known = measured("0011 01", "0011 00")
     assert measured("007611 01 555", "00..11 00 ...") == known
@@ -161,8 +152,6 @@ def test_the_table_says_where_each_label_went():
         "matched": [None, 4, 1],
     }
 
-
-# --- properties -------------------------------------------------------------------------------------------------------
 
 demonstrations = st.lists(
     st.lists(st.tuples(st.integers(0, 3), st.integers(-1, 2)), min_size=1, max_size=12), min_size=1, max_size=4
@@ -201,9 +190,6 @@ def test_every_measure_is_at_most_1_which_is_perfect_and_a_matching_for_each_is_
         perfect = agreement(truth, truth)
         assert [perfect[name] for name in UNMATCHED] == pytest.approx([1] * len(UNMATCHED))
         assert [perfect[way] for way in WAYS] == [dict.fromkeys(MATCHED, 1.0)] * 2
-
-
-# --- two annotators ---------------------------------------------------------------------------------------------------
 
 
 def test_distances_are_those_of_the_best_of_all_matchings():
@@ -253,8 +239,7 @@ def test_two_annotators(tmp_path):
     assert found.distances == [1, 1]
     assert found.boundary_f1 == 1
     assert compare_annotators(a, b, 0)["skill"].boundary_f1 == 0
-    shown = call("inspect", a, "--against", b, "--tolerance", 1)
-    assert shown.status == 0, shown.err
+    shown = done("inspect", a, "--against", b, "--tolerance", 1)
     assert f"{found.kappa:.2f}" in shown.out
     said = json.loads(call("inspect", a, "--against", b, "--json").out)["skill"]
     assert said["counts"] == found.counts

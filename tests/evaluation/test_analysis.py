@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from oracle import brute_force, predictions, random_tables
+from planted import LINEAR, small_spec
 from random_demonstrations import numbered
 from scipy import stats
 
@@ -20,7 +21,7 @@ from ddco_pyro.model.batch import Batch, encode
 from ddco_pyro.model.emissions import Gaussian
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
-from ddco_pyro.spec import TrainingSpec, parse_spec
+from ddco_pyro.spec import TrainingSpec
 from ddco_pyro.statistics import paired
 from ddco_pyro.training.networks import Dimensions
 
@@ -150,13 +151,10 @@ DEMOS = numbered(
 
 def make(counts: tuple[int, ...], emits: tuple[str, ...]) -> Hierarchy:
     """Random networks that differ between options; σ of each level is its own."""
-    lowest = {"network": "linear"}
-    above = lowest | {"emits": list(emits)}
-    levels = [{"name": f"level-{d}", "count": k, "policy": above if d else lowest} for d, k in enumerate(counts)]
-    options = {"hierarchy": {"levels": levels, "meta_policy": above}}
-    model = options if counts else {"baseline": {"kind": "flat", "policy": lowest}}
-    data = {"demonstrations": {"path": "unused.hdf5"}, "observations": ["pose"], "control": {"std": {"learn": True}}}
-    spec = parse_spec(data | model)
+    above = LINEAR | {"emits": list(emits)}
+    levels = [{"name": f"level-{d}", "count": k, "policy": above if d else LINEAR} for d, k in enumerate(counts)]
+    options = {"hierarchy": {"levels": levels, "meta_policy": above}} if counts else {}
+    spec = small_spec(counts, observations=["pose"], control={"std": {"learn": True}}, **options)
     torch.manual_seed(1)
     size = Dimensions.of(DEMOS)
     hierarchy = Hierarchy(spec, size.shapes, size.control_size, size.steps, size.constant)

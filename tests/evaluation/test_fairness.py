@@ -38,8 +38,6 @@ def fitted(spec, tmp_path_factory):
     return ddco_pyro.load(folder), ended
 
 
-# --- each its own optimiser -------------------------------------------------------------------------------------------
-
 OWN = {"kind": "flat", "policy": {"hidden": [8]}, "optimizer": {"lr": 0.03}}
 
 
@@ -51,9 +49,6 @@ def test_a_baseline_beside_trains_as_it_would_alone(toy_spec, tmp_path):
     spec = with_overrides(toy_spec, shared | alone | {"training.optimizer.lr": 0.03})
     assert beside.metrics.log_likelihood_per_step == fit(spec, out=tmp_path / "alone").metrics.log_likelihood_per_step
     assert beside.spec.training == spec.training
-
-
-# --- equal in size ----------------------------------------------------------------------------------------------------
 
 
 def perceptron(hidden, inputs=5, outputs=2):
@@ -86,9 +81,6 @@ def test_flat_equal_has_as_many_parameters_as_the_hierarchy(fitted):
     assert equal.spec.baseline.kind == equal.name == "flat_equal"
 
 
-# --- equal budgets ----------------------------------------------------------------------------------------------------
-
-
 def test_every_method_has_the_same_budget(fitted):
     """Eight training demonstrations in minibatches of three: three gradient steps in an epoch."""
     metrics = fitted[0].metrics
@@ -105,9 +97,6 @@ def test_candidates_of_a_selection_have_the_same_budget(tmp_path):
     found = select(spec, tmp_path / "run", Told(), Workers(1))
     assert [row.gradient_steps for row in found.choice.rows] == [13.0, 13.0]  # five to train with are one minibatch
     assert [len(row.unconverged) for row in found.choice.rows] == [2, 2]  # in both folds
-
-
-# --- not converged ----------------------------------------------------------------------------------------------------
 
 
 def test_stages_that_needed_more_are_named_on_the_console(fitted):

@@ -7,6 +7,7 @@ import pickle
 
 import numpy as np
 import pytest
+from planted import small_spec
 
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
@@ -14,10 +15,7 @@ from ddco_pyro.data.files import json_text
 from ddco_pyro.evaluation import verdicts
 from ddco_pyro.metrics import Metrics
 from ddco_pyro.report import write_report
-from ddco_pyro.spec import parse_spec
 from ddco_pyro.training.data import train_and_valid
-
-POLICY = {"network": "mlp", "hidden": [4]}
 
 
 def demonstrations(number):
@@ -29,15 +27,11 @@ def demonstrations(number):
     return Demonstrations(tuple(each))
 
 
-def make_spec(valid_fraction, **model):
-    return parse_spec(
-        {
-            "observations": ["state"],
-            "demonstrations": {"path": "unused.hdf5", "valid_fraction": valid_fraction},
-            "training": {"epochs": 30, "optimizer": {"lr": 0.03}, "starts": ["random"]},
-            **model,
-        }
-    )
+def make_spec(counts, valid_fraction, compare_with):
+    known = {"path": "unused.hdf5", "valid_fraction": valid_fraction}
+    training = {"epochs": 30, "optimizer": {"lr": 0.03}, "starts": ["random"]}
+    mlp = {"network": "mlp", "hidden": [4]}
+    return small_spec(counts, mlp, demonstrations=known, training=training, compare_with=compare_with)
 
 
 def strictly(text):
@@ -52,7 +46,7 @@ def strictly(text):
 def test_a_baseline_of_the_models_own_kind_has_numbers_of_its_own(tmp_path):
     """``flat`` with hidden units, and beside it a linear ``flat``, both by their own log-likelihoods."""
     linear = {"kind": "flat", "policy": {"network": "linear"}}
-    spec = make_spec(0.4, baseline={"kind": "flat", "policy": POLICY}, compare_with=[linear, linear])
+    spec = make_spec((), 0.4, [linear, linear])
     demos = demonstrations(10)
     run = ddco_pyro.fit(spec, demos, out=tmp_path / "run")
     valid = train_and_valid(spec, demos)["valid"]
@@ -72,7 +66,7 @@ def test_a_baseline_of_the_models_own_kind_has_numbers_of_its_own(tmp_path):
 
 
 def test_a_single_held_out_demonstration_has_no_error_and_every_file_is_json(tmp_path):
-    spec = make_spec(0.1, hierarchy={"levels": [{"count": 2}]}, compare_with=["flat"])
+    spec = make_spec((2,), 0.1, ["flat"])
     run = ddco_pyro.fit(spec, demonstrations(6), out=tmp_path / "run")
     again = ddco_pyro.load(tmp_path / "run")
     read = strictly((tmp_path / "run" / "metrics.json").read_text())

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from made_metrics import compared, made_metrics, scored
-from planted import LINEAR
+from planted import small_spec
 from random_demonstrations import numbered
 from scipy import stats
 
@@ -15,7 +15,7 @@ import ddco_pyro
 from ddco_pyro.cli import console
 from ddco_pyro.evaluation import verdicts
 from ddco_pyro.evaluation.options import degeneracies
-from ddco_pyro.spec import TrainingSpec, parse_spec
+from ddco_pyro.spec import TrainingSpec
 
 TEN = np.linspace(-0.1, 0.1, 10)
 
@@ -117,11 +117,15 @@ def test_the_density_without_observations_has_the_means_and_spreads_of_training(
         ({"seen": random.normal(size=(30, 2))}, np.stack([random.normal(3, 2, 30), random.random(30) < 0.3], 1) * 1.0)
         for _ in range(12)
     ]
-    data = {"demonstrations": {"path": "unused.hdf5", "valid_fraction": 0.25}, "observations": ["seen"]}
-    model = {"baseline": {"kind": "flat", "policy": LINEAR}, "control": {"kind": kind, "std": 0.1}}
-    training = {"epochs": 2, "tune_fraction": 0, "optimizer": {"name": "em"}}
+    spec = small_spec(
+        (),
+        demonstrations={"path": "unused.hdf5", "valid_fraction": 0.25},
+        observations=["seen"],
+        control={"kind": kind, "std": 0.1},
+        training={"epochs": 2, "tune_fraction": 0, "optimizer": {"name": "em"}},
+    )
     demos = numbered(rows)
-    metrics = ddco_pyro.fit(parse_spec({**data, **model, "training": training}), demos).metrics
+    metrics = ddco_pyro.fit(spec, demos).metrics
     held_out = {row.name for row in metrics.valid}
     train, valid = (
         np.concatenate([demo.actions for demo in demos if (demo.name in held_out) == part]) for part in (False, True)
@@ -279,9 +283,7 @@ def test_equal_parts_that_agree_better_are_a_sign():
         return [said for said, _ in degeneracies(found, spec, {"skill": []})]
 
     (said,) = signs(train=0.9, equal_train=0.2, valid=0.41, equal_valid=0.52)
-    assert said.startswith(
-        "Equal parts of each demonstration agree better with labels “phase” than options do: NMI 0.52"
-    )
+    assert said.startswith("Equal parts of each demonstration agree better with labels “phase” than options do: NMI 0")
     assert said.endswith("held out.")
     (said,) = signs(train=0.41, equal_train=0.52)
     assert said.endswith("in training.")

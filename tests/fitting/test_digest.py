@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 import pytest
 import yaml
-from command_line import call
+from command_line import call, done
 from killing import Interrupting
 from odd_files.hdf5 import instead
 from selecting import DATA, data_at, two_skills
@@ -24,7 +24,6 @@ from ddco_pyro.fitting import digest as fitted_to
 from ddco_pyro.fitting.digest import difference, digest
 from ddco_pyro.spec import Spec, parse_spec
 
-FLAT = {"kind": "flat", "policy": {"network": "linear"}}
 REFUSED = (
     "{folder}: is a run of other demonstrations ({what}); bring back those that it was fitted to, or choose another "
     "--out for these"
@@ -47,7 +46,7 @@ def spec_of(path: Path, **training: object) -> Spec:
         {
             **data,
             "demonstrations": {"path": str(path), "labels": "phase"},
-            "compare_with": [FLAT],
+            "compare_with": [{"kind": "flat", "policy": {"network": "linear"}}],
             "training": {**DATA["training"], "epochs": 4, **training},
         }
     )
@@ -149,7 +148,7 @@ def test_a_selection_of_a_file_that_has_changed_is_not_continued(tmp_path: Path)
     data["selection"] = {"folds": 2, "grid": {"training.epochs": [1, 2]}}
     (tmp_path / "spec.yaml").write_text(yaml.safe_dump(data))
     command = ("select", tmp_path / "spec.yaml", "--out", tmp_path / "run", "--jobs", "1")
-    assert call(*command).status == 0
+    done(*command)
     edited(tmp_path / "demos.hdf5", CHANGES["a label"][0])
     before = contents(tmp_path)
     says = REFUSED.format(folder=tmp_path / "run", what="labels/phase changed")
@@ -167,9 +166,6 @@ def test_a_run_of_another_version_is_to_be_fitted_again(finished: Path, tmp_path
             (run / "spec.yaml").write_text("a_former_key: 1\n" + (run / "spec.yaml").read_text())
         command = ("report", run) if name == "run" else ("fit", run / "spec.yaml", "--out", run, "--resume")
         assert call(*command) == (2, "", f"ddco-pyro: {run}: {said}: fit again\n")
-
-
-# --- the digest -------------------------------------------------------------------------------------------------------
 
 
 def test_the_digest_sees_every_number() -> None:

@@ -12,9 +12,9 @@ import h5py
 import numpy as np
 import pytest
 import yaml
-from command_line import call
+from command_line import done
 from made_metrics import compared as made
-from selecting import DATA, two_skills
+from selecting import data_at, two_skills
 
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
@@ -25,21 +25,14 @@ from ddco_pyro.metrics import Compared
 from ddco_pyro.report import write_report
 from ddco_pyro.spec import load_spec, with_overrides
 
-FLAT = {"kind": "flat", "policy": {"network": "linear"}}
-
-
-def spec_for(path: Path, **changes: object) -> dict[str, object]:
-    data = {key: value for key, value in DATA.items() if key != "selection"}
-    return {**data, "demonstrations": {"path": str(path)}, "compare_with": [FLAT], **changes}
-
 
 @pytest.fixture(scope="module")
 def commanded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What the command makes of a file: ``spec.yaml``, ``demos.hdf5`` and ``run``."""
     folder = tmp_path_factory.mktemp("commanded")
-    two_skills().write(folder / "demos.hdf5")
-    (folder / "spec.yaml").write_text(yaml.safe_dump(spec_for(folder / "demos.hdf5")))
-    assert call("fit", folder / "spec.yaml", "--out", folder / "run").status == 0
+    flat = {"kind": "flat", "policy": {"network": "linear"}}
+    (folder / "spec.yaml").write_text(yaml.safe_dump(data_at(folder) | {"compare_with": [flat]}))
+    done("fit", folder / "spec.yaml", "--out", folder / "run")
     return folder
 
 
@@ -59,10 +52,7 @@ def one(place: object = np.ones((8, 2)), actions: object = np.ones((8, 2)), **ob
 
 
 NOT_READ = {
-    "a control too many": (
-        lambda: [one(actions=np.ones((8, 3)))],
-        r"demo: actions has shape \(3,\) at each step, .*\(2,\)",
-    ),
+    "a control too many": (lambda: [one(actions=np.ones((8, 3)))], r"demo: actions has shape \(3,\) at each step,"),
     "a wide observation": (lambda: [one(np.ones((8, 3)))], r"demo: obs/place has shape \(3,\)"),
     "a missing observation": (
         lambda: [Demonstration("demo", {"plce": np.ones((8, 2))}, np.ones((8, 2)))],
@@ -129,10 +119,7 @@ def test_what_cannot_be_acted_on_is_refused_in_a_line_and_changes_nothing(fault:
     [
         (lambda fit: fit.controller(-1), "seed=-1: has to be a whole number from 0 on"),
         (lambda fit: ddco_pyro.Controller(fit), "a Fit in place of networks: give fit.hierarchy"),
-        (
-            lambda fit: ddco_pyro.Controller(fit.hierarchy, "average"),
-            "control='average': has to be one of mean, sample",
-        ),
+        (lambda fit: ddco_pyro.Controller(fit.hierarchy, "average"), "control='average': has to be one of mean,"),
         (lambda fit: fit.controller().act_all([SEEN, SEEN]), "there are 1 episodes and 2 observations"),
         (lambda fit: fit.draws(two_skills(), 0), "draws=0: has to be a whole number from 1 on"),
         (lambda fit: fit.draws(two_skills(), 2).boundaries("skill", 0, np.ones(8)), "there is no level 'skill'"),
@@ -220,8 +207,8 @@ def test_demonstrations_from_memory_are_kept_with_the_run(commanded: Path, tmp_p
     fit = ddco_pyro.fit(spec, two_skills(), out=folder)
     assert (folder / "model.safetensors").read_bytes() == (commanded / "run" / "model.safetensors").read_bytes()
     assert numbers(ddco_pyro.load(folder)) == numbers(fit)
-    assert call("report", folder).status == 0
-    assert call("compare", folder, commanded / "run", "--out", tmp_path / "compared").status == 0
+    done("report", folder)
+    done("compare", folder, commanded / "run", "--out", tmp_path / "compared")
     before = (folder / "metrics.json").read_bytes()
     assert ddco_pyro.fit(spec, two_skills(), out=folder).metrics == fit.metrics
     assert (folder / "metrics.json").read_bytes() == before
@@ -301,10 +288,10 @@ def test_the_best_model_is_exported(commanded: Path, tmp_path: Path) -> None:
     best = replace(run, metrics=run.metrics.model_copy(update={"comparison": {"flat": compared(-1.0, 0.1)}}))
     best.metrics.write(commanded / "run")
     try:
-        assert call("export", commanded / "run", "--best", "--out", tmp_path / "best").status == 0
+        done("export", commanded / "run", "--best", "--out", tmp_path / "best")
     finally:
         run.metrics.write(commanded / "run")
-    assert call("export", commanded / "run", "--out", tmp_path / "own").status == 0
+    done("export", commanded / "run", "--out", tmp_path / "own")
     names = [json.loads((tmp_path / name / "controller.json").read_text())["names"] for name in ("own", "best")]
     assert [sorted(each) for each in names] == [["option"], []]  # a flat policy has no options
 
@@ -336,7 +323,7 @@ def everything(path: Path) -> set[str]:
 
 def test_a_fit_reads_its_demonstrations_once(commanded: Path, tmp_path: Path, reads: Counter) -> None:
     """The report looks for pictures in one more demonstration, with its control."""
-    assert call("fit", commanded / "spec.yaml", "--out", tmp_path / "run").status == 0
+    done("fit", commanded / "spec.yaml", "--out", tmp_path / "run")
     again = Counter(reads) - Counter(dict.fromkeys(everything(commanded / "demos.hdf5"), 1.0))
     assert reads.keys() == everything(commanded / "demos.hdf5")
     assert [name.rpartition("/")[-1] for name in again] == ["actions"]
@@ -345,5 +332,5 @@ def test_a_fit_reads_its_demonstrations_once(commanded: Path, tmp_path: Path, re
 
 def test_check_reads_no_observations(commanded: Path, reads: Counter) -> None:
     """The controls are read: which are constant, or take two values, is part of what it says."""
-    assert call("check", commanded / "spec.yaml").status == 0
+    done("check", commanded / "spec.yaml")
     assert reads == {name: 1.0 for name in everything(commanded / "demos.hdf5") if name.endswith("/actions")}

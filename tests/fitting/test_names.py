@@ -10,7 +10,8 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
-from command_line import call
+from command_line import call, done, refused
+from planted import small_spec
 from time_lines import embedded
 
 import ddco_pyro
@@ -22,16 +23,10 @@ from ddco_pyro.exporting import write_numpy
 from ddco_pyro.fitting.names import accepted, matched
 from ddco_pyro.metrics import NamedByLabel
 from ddco_pyro.report.options import use_table
-from ddco_pyro.spec import parse_spec
+from ddco_pyro.spec import dump_spec, with_overrides
 
-SPEC = {
-    "demonstrations": {"path": "demos.hdf5", "labels": "phase"},
-    "observations": ["place"],
-    "hierarchy": {
-        "levels": [{"name": "skill", "count": 3, "policy": {"network": "linear"}}],
-        "meta_policy": {"network": "linear"},
-    },
-}
+LABELLED = {"path": "demos.hdf5", "labels": "phase"}
+SPEC = small_spec((3,), name="skill", demonstrations=LABELLED, observations=["place"])
 PHASES = np.repeat([0, 1, 2], [6, 4, 5])
 
 
@@ -47,11 +42,11 @@ def labelled(phases=PHASES, number=4, names=None):
 
 
 def stands_for(choices, demos):
-    return matched(parse_spec(SPEC), demos, (np.tile(choices, (len(demos), 1)),))
+    return matched(SPEC, demos, (np.tile(choices, (len(demos), 1)),))
 
 
 def propose(choices, demos):
-    return accepted(parse_spec(SPEC), stands_for(choices, demos))
+    return accepted(SPEC, stands_for(choices, demos))
 
 
 @pytest.mark.parametrize("order", [(1, 2, 3), (3, 1, 2)])
@@ -91,18 +86,13 @@ def files(tmp_path_factory):
     """A run that is trained from labels: option h + 1 is label h. The file names the labels."""
     folder = tmp_path_factory.mktemp("names")
     labelled(number=8, names=["reach", "grasp", "lift"]).write(folder / "demos.hdf5")
-    (folder / "mine.yaml").write_text(
-        f"""
-demonstrations: {{path: {folder / "demos.hdf5"}, labels: phase}}
-observations: [place]
-control: {{std: 0.3}}
-hierarchy:
-  levels: [{{name: skill, count: 3, policy: {{network: linear}}, termination: {{network: linear}}}}]
-  meta_policy: {{network: linear}}
-compare_with: [{{kind: mixture}}]
-training: {{epochs: 60, optimizer: {{lr: 0.1}}, labels: {{level: skill, from: phase}}}}
-"""
-    )
+    spec = with_overrides(SPEC, {
+        "demonstrations.path": str(folder / "demos.hdf5"),
+        "control": {"std": 0.3},
+        "compare_with": ["mixture"],
+        "training": {"epochs": 60, "optimizer": {"lr": 0.1}, "labels": {"level": "skill", "from": "phase"}},
+    })  # fmt: skip
+    (folder / "mine.yaml").write_text(dump_spec(spec))
     ended = call("fit", folder / "mine.yaml", "--out", folder / "run", "--jobs", 1)
     assert f"names: {folder / 'run' / 'names.yaml'}: reach 1.00, grasp 1.00, lift 1.00\n" in ended.out
     return folder
@@ -120,10 +110,10 @@ def test_a_fit_proposes_the_names_of_its_labels(files):
 def test_names_are_shown_wherever_options_are(files):
     run, demos = files / "run", files / "demos.hdf5"
     (run / "names.yaml").write_text("skill: [<go>, pick & place, 'on']\n")
-    assert call("report", run).status == 0
+    done("report", run)
     outputs = {option: files / option for option in ("--html", "--csv", "--parquet")}
     written = [part for pair in outputs.items() for part in pair]
-    assert call("segment", run, demos, *written).status == 0
+    done("segment", run, demos, *written)
     for page in (run / "report.html", outputs["--html"]):
         text = page.read_text()
         assert "&lt;go&gt; (option 1)" in text
@@ -159,12 +149,12 @@ def test_a_file_with_labels_keeps_the_names_of_options_and_of_labels(files, tmp_
     run, out, phases = files / "run", tmp_path / "labelled.hdf5", ["reach", "grasp", "lift"]
     for names in (["go", "hold", "up"], ["go", "hold", "raise"], ["option 1", "option 2", "option 3"]):
         ddco_pyro.load(run).name_options("skill", names)
-        assert call("segment", run, files / "demos.hdf5", "--out", out).status == 0
+        done("segment", run, files / "demos.hdf5", "--out", out)
         named = [] if names[0] == "option 1" else ["control", *names]
         facts = {field.key: field.names for field in inspect(out).labels}
         assert facts == {"phase": phases, "skill": named, "skill_boundary": []}
     assert "0: reach, 1: grasp, 2: lift" in call("inspect", out).out
-    assert call("init", out, "--out", tmp_path / "again.yaml").status == 0
+    done("init", out, "--out", tmp_path / "again.yaml")
     assert "labels: phase " in (text := (tmp_path / "again.yaml").read_text())
     assert "# labels 0, 1, ...: reach, grasp, lift\n" in text
 
@@ -201,9 +191,7 @@ def test_names_that_are_given_are_read_again(files):
 def test_names_that_do_not_fit_are_refused(files, text, problem):
     path = files / "run" / "names.yaml"
     path.write_bytes(text.encode("latin-1"))
-    ended = call("segment", files / "run", files / "demos.hdf5", "--csv", files / "none.csv")
-    assert (ended.status, ended.out, ended.err.count("\n")) == (2, "", 1)
-    assert str(path) in ended.err
+    ended = refused(str(path), "segment", files / "run", files / "demos.hdf5", "--csv", files / "none.csv")
     assert problem in ended.err
     assert not (files / "none.csv").exists()
     path.unlink()
@@ -213,7 +201,7 @@ def test_label_names_that_are_none_are_refused_before_anything_is_written(tmp_pa
     demos = labelled()
     wrong = Demonstrations(demos.demonstrations, attributes={"label_names": "phase"})
     with pytest.raises(BadInput, match="attribute 'label_names': is no JSON"):
-        ddco_pyro.fit(parse_spec(SPEC), wrong, out=tmp_path / "run")
+        ddco_pyro.fit(SPEC, wrong, out=tmp_path / "run")
     assert not (tmp_path / "run").exists()
     wrong.write(tmp_path / "wrong.hdf5")
     assert "problem: attribute 'label_names': is no JSON" in call("inspect", tmp_path / "wrong.hdf5").out

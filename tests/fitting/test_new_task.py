@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from command_line import call
+from command_line import done, refused
+from planted import small_spec
 
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstrations
@@ -16,29 +17,25 @@ from ddco_pyro.data.planted import pick_and_place
 from ddco_pyro.evaluation.inferred import infer
 from ddco_pyro.fitting.library import STRENGTHS, imitation_error
 from ddco_pyro.fitting.names import write_names
+from ddco_pyro.spec import with_overrides
 from ddco_pyro.training import prior
 
-LINEAR = {"network": "linear"}
-SPEC = {
-    "demonstrations": {"path": "none.hdf5"},
-    "observations": ["gripper", "object", "goal", "jaw"],
-    "control": {"std": {"learn": True, "per_option": True}},
-    "hierarchy": {"levels": [{"count": 3, "policy": LINEAR, "termination": LINEAR}], "meta_policy": LINEAR},
-    "compare_with": ["mixture"],
-    "training": {"starts": ["vq_controls"], "optimizer": {"name": "em"}, "epochs": 30},
-}
+SPEC = small_spec(
+    (3,),
+    name="option",
+    observations=["gripper", "object", "goal", "jaw"],
+    control={"std": {"learn": True, "per_option": True}},
+    compare_with=["mixture"],
+    training={"starts": ["vq_controls"], "optimizer": {"name": "em"}, "epochs": 30},
+)
 
 
 def task(number, count):
     """Pick and place by a hand that is as much faster."""
+    about = {"task": f"task {number}"}
     times = np.array([*[1 + 0.1 * number] * 3, 1.0])
     return [
-        replace(
-            demo,
-            name=f"task{number}_{demo.name}",
-            actions=demo.actions * times,
-            attributes={**demo.attributes, "task": f"task {number}"},
-        )
+        replace(demo, name=f"task{number}_{demo.name}", actions=demo.actions * times, attributes=about)
         for demo in pick_and_place(count, seed=number)
     ]
 
@@ -46,9 +43,8 @@ def task(number, count):
 @pytest.fixture(scope="module")
 def library(tmp_path_factory):
     folder = tmp_path_factory.mktemp("library")
-    (folder / "library.yaml").write_text(yaml.safe_dump(SPEC))
     demos = Demonstrations(tuple(demo for number in range(3) for demo in task(number, 4)))
-    ddco_pyro.fit(folder / "library.yaml", demos, out=folder / "run")
+    ddco_pyro.fit(SPEC, demos, out=folder / "run")
     Demonstrations(tuple(task(5, 1))).write(folder / "new.hdf5")
     (folder / "new.yaml").write_text(yaml.safe_dump({"demonstrations": {"path": str(folder / "new.hdf5")}}))
     return folder
@@ -70,8 +66,7 @@ def test_controls_are_expected_by_the_belief_of_a_monitor(library):
 
 def test_one_demonstration_and_a_library_are_enough(library, tmp_path):
     """The strength is chosen once, is kept with the library and said; the model is that of the library, adapted."""
-    ended = call("fit", library / "new.yaml", "--library", library / "run", "--out", tmp_path / "run", "--jobs", 1)
-    assert ended.status == 0, ended.err
+    ended = done("fit", library / "new.yaml", "--library", library / "run", "--out", tmp_path / "run", "--jobs", 1)
     kept = json.loads((library / "run" / "library.json").read_text())
     assert kept["ridge"] in STRENGTHS
     assert kept["ridge"] == STRENGTHS[int(np.argmin([*kept["error"].values()]))]
@@ -84,7 +79,7 @@ def test_one_demonstration_and_a_library_are_enough(library, tmp_path):
     for name, value in run.hierarchy.encoder.state_dict().items():
         assert (adapted.hierarchy.encoder.state_dict()[name] == value).all()
     write_names(library / "run", {"option": ("reach", "grasp", "carry")})
-    assert call("report", tmp_path / "run").status == 0
+    done("report", tmp_path / "run")
     page = (tmp_path / "run" / "report.html").read_text()
     assert [name for name in ("reach", "grasp", "carry") if f">{name}<" in page]
     assert not (tmp_path / "run" / "names.yaml").exists()  # they are proposed alone
@@ -131,21 +126,16 @@ def test_what_cannot_begin_with_a_library_is_refused_in_one_line(library, tmp_pa
     Demonstrations(tuple(wide)).write(library / "wide.hdf5")
     settings = [f"--set={key}={value}".replace("{folder}", str(library)) for key, value in changes.items()]
     out = tmp_path / "run"
-    ended = call("fit", library / "new.yaml", "--library", library / "run", "--out", out, "--jobs", 1, *settings)
-    assert ended.status == 2
-    assert message in ended.err
-    assert len(ended.err.strip().splitlines()) == 1
+    refused(message, "fit", library / "new.yaml", "--library", library / "run", "--out", out, "--jobs", 1, *settings)
     assert not out.exists()
 
 
 def test_a_library_of_one_task_says_that_a_strength_is_needed(tmp_path):
-    spec = tmp_path / "library.yaml"
-    spec.write_text(yaml.safe_dump(SPEC | {"compare_with": []}))
-    ddco_pyro.fit(spec, task(0, 4), out=tmp_path / "run")
+    ddco_pyro.fit(with_overrides(SPEC, {"compare_with": []}), task(0, 4), out=tmp_path / "run")
     new = tmp_path / "new.yaml"
     Demonstrations(tuple(task(1, 1))).write(tmp_path / "new.hdf5")
     new.write_text(yaml.safe_dump({"demonstrations": {"path": str(tmp_path / "new.hdf5")}}))
-    ended = call("fit", new, "--library", tmp_path / "run", "--out", tmp_path / "new", "--jobs", 1)
-    assert ended.status == 2
-    assert "training.library.ridge=30" in ended.err
+    refused(
+        "training.library.ridge=30", "fit", new, "--library", tmp_path / "run", "--out", tmp_path / "new", "--jobs", 1
+    )
     assert not (tmp_path / "new").exists()

@@ -9,34 +9,33 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from command_line import call
+from command_line import done
+from planted import small_spec
 from targets import targets, velocities
 
 import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
 from ddco_pyro.exporting.runner import Runner
-from ddco_pyro.spec import SpecError, parse_spec, with_overrides
+from ddco_pyro.spec import SpecError, with_overrides
 
 ABSOLUTE = targets(velocities())
 BY_HAND = Demonstrations(tuple(replace(demo, actions=demo.actions - demo.observations["gripper"]) for demo in ABSOLUTE))
 """The differences of the targets, which are the velocities, up to rounding."""
 
-LINEAR = {"network": "linear"}
-DATA: dict[str, Any] = {
-    "demonstrations": {"path": "nowhere.hdf5"},
-    "observations": ["gripper", "object", "goal", "jaw"],
-    "control": {"std": {"learn": True}},
-    "hierarchy": {"levels": [{"count": 3, "policy": LINEAR, "termination": LINEAR}], "meta_policy": LINEAR},
-    "training": {"epochs": 15, "starts": ["vq_controls"], "optimizer": {"name": "em"}},
-}
-RELATIVE = with_overrides(parse_spec(DATA), {"control.relative_to": "gripper"})
+SPEC = small_spec(
+    (3,),
+    observations=["gripper", "object", "goal", "jaw"],
+    control={"std": {"learn": True}},
+    training={"epochs": 15, "starts": ["vq_controls"], "optimizer": {"name": "em"}},
+)
+RELATIVE = with_overrides(SPEC, {"control.relative_to": "gripper"})
 
 
 @pytest.fixture(scope="module")
 def fits(tmp_path_factory: pytest.TempPathFactory) -> tuple[ddco_pyro.Fit, ddco_pyro.Fit]:
     """A fit to targets, and one to the differences that were taken by hand."""
     ours = ddco_pyro.fit(RELATIVE, ABSOLUTE, out=tmp_path_factory.mktemp("relative") / "run")
-    return ddco_pyro.load(ours.folder), ddco_pyro.fit(parse_spec(DATA), BY_HAND)
+    return ddco_pyro.load(ours.folder), ddco_pyro.fit(SPEC, BY_HAND)
 
 
 Fits = tuple[ddco_pyro.Fit, ddco_pyro.Fit]
@@ -80,16 +79,13 @@ def test_its_export_gives_targets(fits: Fits, form: str, tmp_path: Path) -> None
         pytest.importorskip("onnxscript")
     run = fits[0]
     more = ["--onnx"] if form == "onnx" else []
-    ended = call("export", run.folder, "--out", tmp_path / "controller", *more)
-    assert ended.status == 0, ended.err
+    done("export", run.folder, "--out", tmp_path / "controller", *more)
     runner, controller = Runner(tmp_path / "controller", form), run.controller(seed=5)
     runner.reset(5)
     for step in range(10):
         seen = {key: rows[step] for key, rows in ABSOLUTE[4].observations.items()}
         np.testing.assert_allclose(runner.act(seen), controller.act(seen), atol=1e-6)
 
-
-# --- what is not possible ---------------------------------------------------------------------------------------------
 
 REFUSED = {
     "unknown": ({"control.relative_to": "griper"}, "control.relative_to: there is no observation 'griper' (did you"),
@@ -103,7 +99,7 @@ REFUSED = {
 @pytest.mark.parametrize(("changes", "message"), REFUSED.values(), ids=REFUSED)
 def test_a_spec_that_cannot_be_meant_is_refused(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(SpecError) as caught:
-        with_overrides(parse_spec(DATA), changes)
+        with_overrides(SPEC, changes)
     assert str(caught.value).startswith(message)
 
 

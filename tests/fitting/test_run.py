@@ -56,7 +56,7 @@ def test_the_folder_holds_what_it_promises(toy_run):
 
 def test_the_history_has_every_epoch(toy_run, watched):
     rows = list(csv.DictReader((toy_run.folder / "history.csv").open()))
-    told = [asdict(row) for row in watched.of(EpochEnded) if row.stage != "policy"]
+    told = [asdict(row) for row in watched if isinstance(row, EpochEnded) and row.stage != "policy"]
     assert [{**row, "restart": str(row["restart"]), "epoch": str(row["epoch"])} for row in told] == [
         {**row, "train": float(row["train"]), "tune": float(row["tune"])} for row in rows
     ]
@@ -64,14 +64,6 @@ def test_the_history_has_every_epoch(toy_run, watched):
 
 
 # --- the numbers again ------------------------------------------------------------------------------------------------
-
-
-def test_what_is_loaded_is_what_was_fitted(toy_run, demos):
-    loaded = ddco_pyro.load(toy_run.folder)
-    np.testing.assert_array_equal(loaded.log_likelihood(demos), toy_run.log_likelihood(demos))
-    for one, other in zip(loaded.segment(demos), toy_run.segment(demos), strict=True):
-        assert one.segments == other.segments
-    assert loaded.metrics == toy_run.metrics
 
 
 def test_log_likelihoods_can_be_computed_again(toy_run, parts):

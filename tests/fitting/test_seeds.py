@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from command_line import call, with_set
+from command_line import call, done, refused, with_set
 from planted import LINEAR, small_spec
 from random_demonstrations import numbered
 from scipy import stats
@@ -70,8 +70,7 @@ def test_draws_have_a_chain_for_each_training_seed(written):
 def test_what_is_done_is_not_done_again(written):
     spec, run, _ = written
     before = {path: path.stat().st_mtime_ns for path in (run / "seeds").rglob("model.safetensors")}
-    ended = call("fit", spec, "--out", run, "--seeds", 3, "--resume")
-    assert ended.status == 0, ended.err
+    done("fit", spec, "--out", run, "--seeds", 3, "--resume")
     assert {path: path.stat().st_mtime_ns for path in before} == before
     assert len(before) == 6
 
@@ -85,8 +84,7 @@ def test_the_intervals_are_those_of_scipy():
 def test_rollouts_have_the_same_two_parts_and_the_same_seeds(written, tmp_path):
     """The parts are counted again from ``rollouts.csv`` of each repetition."""
     run = shutil.copytree(written[1], tmp_path / "run")
-    ended = call("rollout", run, "--episodes", 6, "--jobs", 1)
-    assert ended.status == 0, ended.err
+    ended = done("rollout", run, "--episodes", 6, "--jobs", 1)
     found = json.loads((run / "metrics.json").read_text())["rollouts"]
     succeeded = []
     for folder in (run, run / "seeds" / "1", run / "seeds" / "2"):
@@ -114,10 +112,7 @@ def test_rollouts_have_the_same_two_parts_and_the_same_seeds(written, tmp_path):
     ],
 )
 def test_what_cannot_be_repeated_is_refused_before_any_work(written, tmp_path, changes, said):
-    ended = call("fit", written[0], "--out", tmp_path / "run", "--seeds", 3, *with_set(*changes))
-    assert ended.status == 2
-    assert said in ended.err
-    assert len(ended.err.splitlines()) == 1
+    refused(said, "fit", written[0], "--out", tmp_path / "run", "--seeds", 3, *with_set(*changes))
     assert not (tmp_path / "run").exists()
 
 

@@ -16,9 +16,6 @@ from ddco_pyro.model.tables import NEVER, Tables, complete
 
 SHAPES = [(1,), (3,), (20,), (1, 1), (2, 2), (4, 1), (2, 1, 2)]
 
-SHARP = [1.0, 30.0, 1e3, 1e5]
-TERMINATION = [0.0, 1e-8, 0.3, 1 - 1e-8, 1.0]
-
 
 @pytest.mark.parametrize("counts", SHAPES)
 def test_value_and_gradient_are_those_of_log_space(counts):
@@ -41,7 +38,7 @@ def compare(counts, steps, seed):
 
     Each trajectory has one combination of these, and its own share of impossible entries.
     """
-    grid = list(product(SHARP, TERMINATION, [False, True]))
+    grid = list(product([1.0, 30.0, 1e3, 1e5], [0.0, 1e-8, 0.3, 1 - 1e-8, 1.0], [False, True]))
     sharp, termination, identical = (torch.tensor(column) for column in zip(*grid, strict=True))
     hybrid = tuple(bool(seed >> level & 1) for level in range(len(counts)))
     tables = random_tables(counts, hybrid, trajectories=len(grid), steps=steps, seed=seed)

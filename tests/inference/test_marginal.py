@@ -17,8 +17,6 @@ from ddco_pyro.inference.marginal import EliminatedAHMM
 from ddco_pyro.model.ahmm import ahmm
 from ddco_pyro.model.tables import complete
 
-PRIOR = 0.5
-
 
 def bayesian(hierarchy, batch, eliminated):
     """Normal priors on all weights; the demonstrations' controls given the observations."""
@@ -26,7 +24,7 @@ def bayesian(hierarchy, batch, eliminated):
 
     def model():
         weights = {
-            name: pyro.sample(name.replace(".", "_"), dist.Normal(0.0, PRIOR).expand(shape).to_event())
+            name: pyro.sample(name.replace(".", "_"), dist.Normal(0.0, 0.5).expand(shape).to_event())
             for name, shape in shapes.items()
         }
         weights = {name: weight.float() for name, weight in weights.items()}  # NUTS has float64 weights

@@ -40,9 +40,6 @@ def repeated(tables, times):
     return Tables(*(tuple(table[:1].expand(times, *table.shape[1:]) for table in part) for part in parts))
 
 
-# --- samples ----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("counts", "hybrid", "steps"), [((2,), (True,), 4), ((2, 2), (False, True), 3), ((1, 1, 1), (True, True, True), 3)]
 )
@@ -61,6 +58,3 @@ def test_latents_are_as_frequent_as_the_sum_over_paths_says(counts, hybrid, step
         for name, p in expected.items():
             error = np.sqrt(p * (1 - p) / SAMPLES)
             assert (np.abs(found[name].numpy() - p) <= 4.5 * error + 1e-12).all(), (name, d, found[name], p)
-
-
-# --- tables -----------------------------------------------------------------------------------------------------------

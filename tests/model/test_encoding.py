@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from planted import small_spec
 from scipy import stats
 from sklearn.preprocessing import QuantileTransformer
 
@@ -15,7 +16,7 @@ from ddco_pyro.model.batch import encode
 from ddco_pyro.model.controls import ControlScaling
 from ddco_pyro.model.encoder import ObservationEncoder
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.spec import ControlSpec, ObservationSpec, parse_spec
+from ddco_pyro.spec import ControlSpec, ObservationSpec
 
 LENGTHS = (5, 3, 4)
 SHAPES = {"pose": (3,), "grid": (2, 2), "camera": (6, 4, 3)}
@@ -141,19 +142,9 @@ def test_batches_are_padded_with_zeros_and_images_stay_bytes():
             assert not padded[n, len(demo) :].any()
 
 
-# --- controls ---------------------------------------------------------------------------------------------------------
-
-
 def test_the_density_is_in_the_controls_own_units():
     """log p(a) of a flat policy against scipy's Gaussian of a with the mean and deviation carried over to a's units."""
-    spec = parse_spec(
-        {
-            "demonstrations": {"path": "unused.hdf5"},
-            "observations": ["pose"],
-            "control": {"std": 0.2},
-            "baseline": {"kind": "flat", "policy": {"network": "linear"}},
-        }
-    )
+    spec = small_spec((), observations=["pose"], control={"std": 0.2})
     torch.manual_seed(0)
     hierarchy = Hierarchy(spec, SHAPES, 3, steps=5)
     hierarchy.encoder.fit(DEMOS)

@@ -30,8 +30,6 @@ from ddco_pyro.training.networks import (
 )
 from ddco_pyro.training.upper import Constants, fitted
 
-# --- the likelihood ---------------------------------------------------------------------------------------------------
-
 
 @pytest.mark.parametrize(("counts", "memoryless"), [((2, 2), [1]), ((2, 2), [2]), ((2, 2), [1, 2])])
 def test_any_level_can_be_without_memory(counts, memoryless):
@@ -45,9 +43,6 @@ def test_any_level_can_be_without_memory(counts, memoryless):
         value = float(log_likelihood(tables, batch.lengths)[0])
     assert value == pytest.approx(truth.log_likelihood, abs=1e-6)
     assert compare_engines(outputs, batch.actions, batch.lengths).agrees
-
-
-# --- the spec ---------------------------------------------------------------------------------------------------------
 
 
 def spec_of(**changes):
@@ -84,9 +79,6 @@ def test_a_grid_of_models_is_one_line():
     assert all(one.spec.compare_with == () for one in found)
 
 
-# --- training ---------------------------------------------------------------------------------------------------------
-
-
 def test_levels_above_start_from_segments_without_memory_too():
     """ψ of a level whose options end after every step stays exactly 1 in the EM that levels above start from."""
     hierarchy, batch = make_hierarchy((2, 2), memoryless=[2]), make_batch(4, 6)
@@ -117,9 +109,6 @@ def test_a_fit_trains_it_beside_with_the_same_budget(run):
     np.testing.assert_array_equal(again.log_likelihood(run.demonstrations), mixture.log_likelihood(run.demonstrations))
     lasting = parameters(build_hierarchy(run.spec, Dimensions.of(run.demonstrations))) - mixture.metrics.parameters
     assert lasting == sum(p.numel() for p in run.hierarchy.levels[0].termination.parameters())
-
-
-# --- what it says -----------------------------------------------------------------------------------------------------
 
 
 def test_the_worth_of_a_hierarchy_has_two_parts():

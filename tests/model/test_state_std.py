@@ -23,9 +23,6 @@ def softplus(values):
     return np.log1p(np.exp(values))
 
 
-# --- the density ------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("counts", [(), (3,), (2, 2)])
 def test_density_is_scipys_with_the_sigma_of_each_step(counts):
     """Of every caller, the meta-policy among them: two means, then two y, by the formula of the documentation."""
@@ -78,9 +75,6 @@ def test_dimensions_with_other_sigmas_stand_beside():
     assert (std[0, 0, :, 0] == std[..., 0]).all()
     assert std[0, 0, 0, 0] < std[0, 0, 1, 0]
     assert std[..., 2].flatten().unique().numel() == 16
-
-
-# --- what it is worth -------------------------------------------------------------------------------------------------
 
 
 def noisy(number=40, steps=25):
@@ -141,6 +135,3 @@ def test_a_planted_sigma_of_the_state_is_found(fitted):
 def _rows(demos):
     states = np.concatenate([demo.observations["state"] for demo in demos])
     return np.column_stack([states, np.ones(len(states))]), np.concatenate([demo.actions for demo in demos])
-
-
-# --- what is refused --------------------------------------------------------------------------------------------------

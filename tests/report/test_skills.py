@@ -116,9 +116,6 @@ def test_each_path_of_two_arms_has_a_line_of_its_own():
     assert drawn.count('class="faint"') == 4
 
 
-# --- films ------------------------------------------------------------------------------------------------------------
-
-
 HEIGHT, WIDTH = 121, 161
 
 
@@ -151,9 +148,6 @@ def test_the_border_has_the_colour_of_the_active_option(episode):
             assert (edge == option_rgb(choice)).all()
     assert not (captioned(episode, 3)[-1] == option_rgb(1)).all(-1).any()
     assert (episode.frames[0] == 0).all()  # the episode's own frames stay as they are
-
-
-# --- colours ----------------------------------------------------------------------------------------------------------
 
 
 # What people without red, green or blue cones see, in linear RGB (Machado, Oliveira & Fernandes 2009, severity 1).

@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 import pyarrow.parquet as parquet
 import pytest
-from command_line import call
+from command_line import call, done
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.importing import import_demonstrations
@@ -330,14 +330,13 @@ def in_tools(script, *arguments):
 @pytest.mark.slow
 @pytest.mark.skipif(not TOOLS.exists(), reason="the tools are not installed: make tools")
 def test_lerobot_acts_as_the_run_does(toy_run, tmp_path):
-    ended = call("export", toy_run.folder, "--lerobot", tmp_path / "policy", "--out", tmp_path / "export")
-    assert ended.status == 0
+    done("export", toy_run.folder, "--lerobot", tmp_path / "policy", "--out", tmp_path / "export")
     in_tools("act_lerobot.py", tmp_path / "policy", tmp_path / "export")
 
 
 def test_a_policy_for_lerobot_is_an_export_with_lerobots_files(toy_run, tmp_path):
-    assert call("export", toy_run.folder, "--lerobot", tmp_path / "policy").status == 0
-    assert call("export", toy_run.folder, "--out", tmp_path / "export").status == 0
+    done("export", toy_run.folder, "--lerobot", tmp_path / "policy")
+    done("export", toy_run.folder, "--out", tmp_path / "export")
     exported, policy = (
         {path.name: path.read_bytes() for path in (tmp_path / name).iterdir()} for name in ("export", "policy")
     )

@@ -12,8 +12,8 @@ import h5py
 import numpy as np
 import pyarrow.parquet as parquet
 import pytest
-import yaml
-from command_line import call
+from command_line import call, done, refused
+from planted import LINEAR, small_spec
 from sklearn.metrics import normalized_mutual_info_score
 from time_lines import embedded, tracks, unpacked
 
@@ -25,7 +25,6 @@ from ddco_pyro.fitting.fit import fit
 from ddco_pyro.segmenting.formats import Asked
 from ddco_pyro.segmenting.formats.lerobot import write_subtasks
 from ddco_pyro.segmenting.segments import LevelLabels, Segmented, Segments, recorded, segments
-from ddco_pyro.spec import parse_spec
 from ddco_pyro.training.data import demonstrations
 from ddco_pyro.training.data import train_and_valid as split_in_parts
 
@@ -47,8 +46,7 @@ def written(toy_spec, toy_run, tmp_path_factory):
         opened.attrs["control_frequency"] = 20.0
     before, time = path.read_bytes(), path.stat().st_mtime_ns
     places = {option: path.with_name(option) for option in ("--html", "--csv", "--parquet", "--out")}
-    ended = call("segment", toy_run.folder, path, *(part for pair in places.items() for part in pair))
-    assert ended.status == 0, ended.err
+    done("segment", toy_run.folder, path, *(part for pair in places.items() for part in pair))
     assert (path.read_bytes(), path.stat().st_mtime_ns) == (before, time)
     return path, places
 
@@ -56,13 +54,6 @@ def written(toy_spec, toy_run, tmp_path_factory):
 def look(run: Path, demos: Path) -> Segmented:
     with open_source(demos) as source:
         return segments(ddco_pyro.load(run), source)
-
-
-def refused(message, *arguments):
-    """``segment`` refuses these arguments in one line that says this."""
-    ended = call("segment", *arguments)
-    assert (ended.status, ended.out, ended.err.count("\n")) == (2, "", 1)
-    assert message in ended.err
 
 
 def test_they_are_the_fits_own(toy_run, toy_spec, file, monkeypatch):
@@ -86,22 +77,16 @@ def test_they_are_the_fits_own(toy_run, toy_spec, file, monkeypatch):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (
-            ["--level", "option"],
-            "name what to write, such as --html PAGE or --csv FILE; labels for each step go to --out",
-        ),
+        (["--level", "option"], "name what to write, such as --html PAGE or --csv FILE; labels for each step go to"),
         (["--in-place", "--out", "copy.hdf5"], "--out and --in-place exclude each other; keep one"),
         (["--mimicgen", "copy.hdf5"], "demo_0: has no datagen_info/eef_pose"),
-        (
-            ["--sarm", "copy"],
-            "demos.hdf5: is no LeRobot dataset, which --sarm needs; name another format, such as --csv",
-        ),
+        (["--sarm", "copy"], "demos.hdf5: is no LeRobot dataset, which --sarm needs; name another format, such as"),
     ],
 )
 def test_what_to_write_has_to_be_said(toy_run, file, monkeypatch, options, message):
     monkeypatch.chdir(file.parent)
     before = file.read_bytes()
-    refused(message, toy_run.folder, file, *options)
+    refused(message, "segment", toy_run.folder, file, *options)
     assert [path.name for path in file.parent.iterdir()] == ["demos.hdf5"]
     assert file.read_bytes() == before
 
@@ -123,7 +108,7 @@ def test_labels_from_elsewhere_are_never_replaced(toy_run, file):
         opened["data/demo_3/labels/option"] = np.zeros(len(opened["data/demo_3/actions"]), int)
     before = file.read_bytes()
     message = "demo_3: labels/option exists and was not written by ddco-pyro segment"
-    refused(message, toy_run.folder, file, "--in-place")
+    refused(message, "segment", toy_run.folder, file, "--in-place")
     assert file.read_bytes() == before
 
 
@@ -228,7 +213,7 @@ def test_the_page_escapes_what_it_shows(toy_run, tmp_path, toy_spec):
         for group in opened["data"].values():
             group.move("labels/phase", "labels/<b>phase")
     page = tmp_path / "segments.html"
-    assert call("segment", toy_run.folder, path, "--html", page).status == 0
+    done("segment", toy_run.folder, path, "--html", page)
     text = page.read_text()
     assert "&lt;script&gt;alert(1)&lt;%script&gt;" in text
     assert [lane["name"] for lane in embedded(text)["lanes"]] == ["option", "<b>phase"]
@@ -255,12 +240,12 @@ def test_other_demonstrations_are_refused(toy_run, file, key, other, width, mess
             steps = len(group["actions"])
             del group[key]
             group[other] = np.zeros((steps, width))
-    refused(f"demo_0: {message}", toy_run.folder, file, "--in-place")
+    refused(f"demo_0: {message}", "segment", toy_run.folder, file, "--in-place")
 
 
 def test_a_policy_without_options_is_refused(toy_run, file):
     message = "is a flat policy without options; name a run that has options"
-    refused(message, toy_run.folder / "baselines" / "flat", file, "--in-place")
+    refused(message, "segment", toy_run.folder / "baselines" / "flat", file, "--in-place")
 
 
 # --- subtasks of LeRobot datasets -------------------------------------------------------------------------------------
@@ -268,17 +253,6 @@ def test_a_policy_without_options_is_refused(toy_run, file):
 
 LEROBOT = Path(__file__).parents[1] / "fixtures" / "lerobot"
 LANGUAGE = Path(__file__).parents[1] / "fixtures" / "lerobot_language"
-SPEC = """
-demonstrations: {path: PATH, valid_fraction: 0.25}
-observations: [state]
-control: {std: 0.5}
-hierarchy:
-  levels:
-    - {name: skill, count: 2, policy: {network: linear}}
-    - {name: phase, count: 2, policy: {network: linear, emits: [options, control]}}
-  meta_policy: {network: linear}
-training: {epochs: 2, batch_size: 3}
-"""
 
 
 @pytest.fixture(scope="module")
@@ -286,7 +260,12 @@ def lerobot_run(tmp_path_factory):
     """A run of two levels on the LeRobot fixture, imported."""
     folder = tmp_path_factory.mktemp("lerobot")
     import_demonstrations(LEROBOT, folder / "demos.hdf5")
-    spec = parse_spec(yaml.safe_load(SPEC.replace("PATH", str(folder / "demos.hdf5"))))
+    upper = {"name": "phase", "count": 2, "policy": LINEAR | {"emits": ["options", "control"]}}
+    spec = small_spec(
+        demonstrations={"path": str(folder / "demos.hdf5"), "valid_fraction": 0.25},
+        hierarchy={"levels": [{"name": "skill", "count": 2, "policy": LINEAR}, upper], "meta_policy": LINEAR},
+        training={"epochs": 2, "batch_size": 3},
+    )
     return fit(spec, out=folder / "run")
 
 
@@ -345,7 +324,7 @@ def test_a_copy_with_subtasks(lerobot_run, tmp_path):
 def test_what_cannot_be_written_of_a_lerobot_dataset(lerobot_run, tmp_path):
     out = tmp_path / "out"
     message = "there is no level 'skil' (did you mean 'skill'?); there is: skill"
-    refused(message, lerobot_run.folder, LEROBOT, "--lerobot", out, "--level", "skil")
+    refused(message, "segment", lerobot_run.folder, LEROBOT, "--lerobot", out, "--level", "skil")
     message = "is no HDF5 file in robomimic's layout, which --out needs; name another format"
-    refused(message, lerobot_run.folder, LEROBOT, "--html", tmp_path / "page", "--out", out)
+    refused(message, "segment", lerobot_run.folder, LEROBOT, "--html", tmp_path / "page", "--out", out)
     assert not list(tmp_path.iterdir())

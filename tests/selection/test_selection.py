@@ -89,9 +89,6 @@ def test_the_final_fit_is_on_all_the_data(finished):
     assert final.selection.grid == {}
 
 
-# --- failures, and giving up ------------------------------------------------------------------------------------------
-
-
 def test_a_fold_that_fails_is_named_and_the_others_go_on(tmp_path, monkeypatch):
     grid = {"training.optimizer.lr": [0.05, 1e30], "training.patience": [None], "training.epochs": [16]}
     spec = spec_at(tmp_path, grid=grid, folds=2)
@@ -115,9 +112,6 @@ def test_where_nothing_is_left_an_unexpected_error_is_told_and_tried_again_next_
     assert json.loads((tmp_path / "run" / "selection.json").read_text())["chosen"] is None
     monkeypatch.undo()
     assert select(spec, tmp_path / "run", Told(), ONE).choice.chosen is not None
-
-
-# --- in processes -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow

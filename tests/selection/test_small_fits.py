@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
-from command_line import call
+from command_line import done, refused
+from planted import small_spec
 from random_demonstrations import numbered
 from sklearn.metrics import normalized_mutual_info_score
 
@@ -16,7 +16,7 @@ from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.options import segments_of
 from ddco_pyro.selection import small
 from ddco_pyro.selection.small import Lasting, heavy_tails, in_steps, lasting, moved, overrides
-from ddco_pyro.spec import load_spec, parse_spec, with_overrides
+from ddco_pyro.spec import load_spec, with_overrides
 
 SLOW = 30
 
@@ -36,49 +36,40 @@ def skills_within_which_speed_varies(number=5, steps=100, seed=0, long=SLOW):
     return numbered(found)
 
 
-SPEC = """
-demonstrations: {path: FILE, valid_fraction: 0, labels: skill}
-observations: [state]
-control: {std: {learn: true, floor: 0.01, per_option: true}}
-hierarchy:
-  levels: [{name: option, count: 2, policy: {network: linear}, termination: {network: linear}}]
-  meta_policy: {network: linear}
-training: {starts: [vq_controls], optimizer: {name: em}, epochs: 60}
-"""
+SPEC = small_spec(
+    demonstrations={"path": "unused.hdf5", "valid_fraction": 0},
+    control={"std": {"learn": True, "floor": 0.01, "per_option": True}},
+    training={"starts": ["vq_controls"], "optimizer": {"name": "em"}, "epochs": 60},
+)
 
 
 @pytest.mark.parametrize("long", [SLOW, 8])
 def test_options_last_as_long_as_is_asked(long):
     """Windows as wide as two short skills would mix them; long ones are not found without windows."""
     demos = skills_within_which_speed_varies(long=long)
-    spec = parse_spec(yaml.safe_load(SPEC))
-    assert segments_of(ddco_pyro.fit(spec, demos).segment(demos)[0]).median < 6  # the speed
-    found = lasting(spec, demos, long)
+    assert segments_of(ddco_pyro.fit(SPEC, demos).segment(demos)[0]).median < 6  # the speed
+    found = lasting(SPEC, demos, long)
     assert long / 1.5 < found.segments.median < 1.5 * long
-    fit = ddco_pyro.fit(with_overrides(spec, overrides(spec, found.power, found.constant, found.window)), demos)
+    fit = ddco_pyro.fit(with_overrides(SPEC, overrides(SPEC, found.power, found.constant, found.window)), demos)
     options = np.concatenate(fit.segment(demos)[0])
     assert normalized_mutual_info_score(np.concatenate([demo.labels["skill"] for demo in demos]), options) > 0.7
 
 
 def test_long_options_are_found_where_no_length_is_asked():
     demos = skills_within_which_speed_varies()
-    assert not lasting(parse_spec(yaml.safe_load(SPEC)), demos, None).segments.brief
+    assert not lasting(SPEC, demos, None).segments.brief
 
 
-@pytest.mark.parametrize(
-    ("length", "frequency", "steps"), [("2s", 10.0, 20.0), ("20", 10.0, 20.0), ("20", None, 20.0), ("0.5s", 30.0, 15.0)]
-)
-def test_lengths_are_seconds_or_steps(length, frequency, steps):
-    assert in_steps("--segment", length, frequency) == steps
-
-
-@pytest.mark.parametrize(
-    ("length", "frequency", "says"),
-    [("2s", None, "do not say how many steps"), ("long", 10.0, "give seconds"), ("-3", 10.0, "give seconds")],
-)
-def test_what_is_no_length_is_refused(length, frequency, says):
-    with pytest.raises(BadInput, match=says):
-        in_steps("--segment", length, frequency)
+def test_lengths_are_seconds_or_steps():
+    for length, frequency, steps in (("2s", 10.0, 20.0), ("20", 10.0, 20.0), ("20", None, 20.0), ("0.5s", 30.0, 15.0)):
+        assert in_steps("--segment", length, frequency) == steps
+    for length, frequency, says in (
+        ("2s", None, "do not say how many"),
+        ("long", 10.0, "give sec"),
+        ("-3", 10.0, "give sec"),
+    ):
+        with pytest.raises(BadInput, match=says):
+            in_steps("--segment", length, frequency)
 
 
 def test_init_writes_what_it_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -89,30 +80,24 @@ def test_init_writes_what_it_found(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     found = {20: Lasting(0.3, True, 7, some, 0.0)}
     monkeypatch.setattr(small, "lasting", lambda _, __, steps, ___: found[steps])
     monkeypatch.setattr(small, "heavy_tails", lambda *_: (1, 2))
-    ended = call("init", file, "--out", spec, "--segments", "5")
-    assert ended.status == 0, ended.err
+    ended = done("init", file, "--out", spec, "--segments", "5")
     assert "median segment 21 steps in small fits; asked: 20 steps" in ended.out
     written = load_spec(spec)
     assert (written.control.power, written.training.window) == (0.3, 7)
     assert written.hierarchy.levels[0].termination.network == written.hierarchy.meta_policy.network == "constant"
     assert [(part.kind, part.dims) for part in written.control.parts] == [("student", (1, 2))]
-    both = call("init", file, "--out", spec, "--force", "--segments", "5", "--segment", "3s")
-    assert both.status == 2
-    assert "exclude each other" in both.err
+    refused("exclude each other", "init", file, "--out", spec, "--force", "--segments", "5", "--segment", "3s")
 
 
 def test_heavy_tails_are_found_where_they_predict_better():
     random = np.random.default_rng(0)
     observed = [random.normal(size=(60, 2)) for _ in range(8)]
-    spec = parse_spec(yaml.safe_load(SPEC.replace(", labels: skill", "").replace("count: 2", "count: 1")))
+    spec = with_overrides(SPEC, {"hierarchy.levels.0.count": 1})
     for degrees, dims in ((1.5, (0, 1)), (1000.0, ())):
         scale = [1 / np.sqrt(random.chisquare(degrees, size=(60, 1)) / degrees) for _ in observed]
         noise = [0.3 * own * random.normal(size=(60, 2)) for own in scale]
         demos = numbered(({"state": x}, x + e) for x, e in zip(observed, noise, strict=True))
         assert heavy_tails(spec, demos) == dims
-
-
-# --- what is drawn ----------------------------------------------------------------------------------------------------
 
 
 def reaching(other, absolute, random):
@@ -124,9 +109,7 @@ def reaching(other, absolute, random):
 
 
 @pytest.mark.parametrize("absolute", [False, True], ids=["velocities", "targets"])
-@pytest.mark.parametrize(
-    "other", [lambda time: np.maximum(time - 0.7, 0), lambda time: time], ids=["late", "on a belt"]
-)
+@pytest.mark.parametrize("other", [lambda time: np.maximum(time - 0.7, 0), lambda time: time], ids=["late", "belt"])
 def test_the_hand_is_drawn_where_something_else_moves_further(other, absolute):
     random = np.random.default_rng(0)
     assert moved(numbered(reaching(other, absolute, random) for _ in range(10))) == "palm"

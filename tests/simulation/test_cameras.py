@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import toy_task
 from joblib import parallel_config
+from planted import LINEAR, small_spec
 from toy_task import DRAWN, watched
 
 import ddco_pyro
@@ -21,7 +22,7 @@ from ddco_pyro.fitting.rollouts import roll_out
 from ddco_pyro.simulation import collect as collecting
 from ddco_pyro.simulation.cameras import Encoded
 from ddco_pyro.simulation.episodes import run_episode
-from ddco_pyro.spec import DemonstrationsSpec, parse_spec
+from ddco_pyro.spec import DemonstrationsSpec
 from ddco_pyro.training.data import dimensions
 from ddco_pyro.training.networks import Dimensions, build_hierarchy
 
@@ -38,22 +39,17 @@ def own_cache(tmp_path, monkeypatch):
 
 
 def spec_of(*observations, **parts):
-    policy = {
-        "network": "conv",
-        "layers": [{"filters": 2, "kernel": 5, "stride": 2, "padding": 2}],
-        "pool": "spatial_softmax",
-        "hidden": [4],
-    }
-    return parse_spec(
-        {
-            "task": TASK,
-            "demonstrations": {"count": 4, "valid_fraction": 0.25},
-            "observations": list(observations),
-            "baseline": {"kind": "flat", "policy": policy if "camera" in observations else {"network": "linear"}},
-            "training": {"epochs": 1},
-            "rollout": {"episodes": 2},
-            **parts,
-        }
+    layers = [{"filters": 2, "kernel": 5, "stride": 2, "padding": 2}]
+    conv = {"network": "conv", "layers": layers, "pool": "spatial_softmax", "hidden": [4]}
+    return small_spec(
+        (),
+        conv if "camera" in observations else LINEAR,
+        task=TASK,
+        demonstrations={"count": 4, "valid_fraction": 0.25},
+        observations=list(observations),
+        training={"epochs": 1},
+        rollout={"episodes": 2},
+        **parts,
     )
 
 

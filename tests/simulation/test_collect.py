@@ -139,13 +139,10 @@ def test_what_never_changes_is_constant(path):
         "takes two values, 1 and 2",
         "constant (-0.25): no part of the model, emitted as it is",
     ]
-
-
-def test_a_control_that_never_changes_is_refused(path):
     with h5py.File(path, "r+") as file:
         for group in file["data"].values():
-            group["actions"][:] = [0.5, -0.0, 1]
-    with pytest.raises(DemonstrationsError, match=r"^actions: every dimension is constant \(0.5, 0, 1\) in all"):
+            group["actions"][:, :2] = 7.0
+    with pytest.raises(DemonstrationsError, match=r"every dimension is constant \(7, 7, -0\.25\)"):
         dimensions(spec(demonstrations={"path": str(path)}))
 
 
@@ -204,18 +201,9 @@ def own(options):
     ("changes", "message"),
     [
         ({"observations": ["offsets", "pose", "jaw"]}, r"^observations: there is no pose, jaw \(there are: camera, of"),
-        (
-            {"observations": ["visited"], "report": {"trajectory": "visited"}},
-            r"^report\.trajectory: 'visited' is 1 num",
-        ),
-        (
-            {"report": {"trajectory": ["offsets", "3:9"]}},
-            r"^report\.trajectory: 'offsets\[3:9\]' is 1 numbers, of shape",
-        ),
-        (
-            {"report": {"trajectory": ["offsets", "0:4"]}},
-            r"^report\.trajectory: 'offsets\[0:4\]' is 4 numbers, of shape",
-        ),
+        ({"observations": ["visited"], "report": {"trajectory": "visited"}}, r"^report\.trajectory: 'visited' is 1"),
+        ({"report": {"trajectory": ["offsets", "3:9"]}}, r"^report\.trajectory: 'offsets\[3:9\]' is 1 numbers, of"),
+        ({"report": {"trajectory": ["offsets", "0:4"]}}, r"^report\.trajectory: 'offsets\[0:4\]' is 4 numbers, of"),
         (
             {"report": {"trajectory": [["offsets", "0:3"], ["offsets", "2:4"]]}},
             r"^report\.trajectory: offsets\[2:4\] is in the plane, offsets\[0:3\] in space; name as many",

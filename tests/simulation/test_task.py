@@ -17,10 +17,6 @@ from ddco_pyro.simulation.task import Task, find_task
 from ddco_pyro.spec.base import TASKS
 
 
-def test_a_task_is_found_by_module_and_name():
-    assert find_task("toy_task:task") is toy_task.task
-
-
 def test_a_policy_sees_the_name_of_its_task():
     class Seeing:
         def reset(self, seed):

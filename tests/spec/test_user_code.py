@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import toy_task
 import yaml
-from command_line import call, with_set
+from command_line import call, refused, with_set
 
 import ddco_pyro
 from ddco_pyro.spec import SpecError, user_code, with_overrides
@@ -72,12 +72,9 @@ WORK = ["check", "collect", "fit", "select"]
 )
 def test_a_spec_that_names_code_is_refused(spec: Path, imported: Path, command: str, override: str, place: str) -> None:
     name = TASK if place.endswith("task") else NETWORK
-    line = (
-        f"ddco-pyro: {spec}: {place}: would import user code ({name}); pass --allow-code if you trust it "
-        "(in Python: allow_code=True)\n"
-    )
     before = sorted(imported.parent.iterdir())
-    assert call(command, spec, *with_set(override)) == (2, "", line)
+    said = f"{spec}: {place}: would import user code ({name}); pass --allow-code if you trust it (in Python: allow_code"
+    assert refused(said, command, spec, *with_set(override)).out == ""
     assert sorted(imported.parent.iterdir()) == before
 
 
@@ -128,9 +125,7 @@ def test_a_baseline_in_a_run_that_names_code_which_the_run_does_not(
     other = run / "baselines" / "flat" / "spec.yaml"
     baseline = {"kind": "flat", "policy": {"network": NETWORK}}
     other.write_text(yaml.safe_dump(yaml.safe_load(other.read_text()) | {"baseline": baseline}))
-    ended = call("report", run)
-    assert ended.status == 2
-    assert f"{other}: baseline.policy.network: would import user code ({NETWORK})" in ended.err
+    refused(f"{other}: baseline.policy.network: would import user code ({NETWORK})", "report", run)
     assert not imported.exists()
 
 

@@ -8,16 +8,14 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from planted import small_spec
 
 from ddco_pyro.exporting import write_numpy
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.model.hierarchy import Hierarchy
-from ddco_pyro.spec import parse_spec
 from studies import arena_recording
 from studies.arena_phases import Phases
 from studies.arena_playing import exported, play
-
-# --- episodes ---------------------------------------------------------------------------------------------------------
 
 
 class World:
@@ -42,9 +40,8 @@ class World:
 @pytest.fixture(scope="module")
 def fitted():
     """Never trained: random networks, and controls of other units."""
-    hierarchy = {"levels": [{"count": 3, "policy": {"network": "mlp"}}], "meta_policy": {"network": "linear"}}
-    data = {"demonstrations": {"path": "unused.hdf5"}, "observations": [{"key": "state", "differences": True}]}
-    spec = parse_spec(data | {"control": {"std": 0.5}, "hierarchy": hierarchy})
+    seen = [{"key": "state", "differences": True}]
+    spec = small_spec((3,), {"network": "mlp"}, observations=seen, control={"std": 0.5})
     torch.manual_seed(0)
     hierarchy = Hierarchy(spec, {"state": (3,)}, 2, 30)
     hierarchy.scaling.scale.copy_(torch.tensor([2.0, 0.5]))
@@ -74,9 +71,6 @@ def test_an_exported_controller_plays_as_its_fit_does(fitted, runner, goal, succ
         np.testing.assert_allclose(played.received, expected, atol=1e-5)
 
 
-# --- recording --------------------------------------------------------------------------------------------------------
-
-
 def episode(seed):
     """Those of every third seed fail; observations named after what they are."""
     if seed % 3 == 2:
@@ -100,9 +94,6 @@ def test_the_first_successes_are_recorded(tmp_path):
         assert (list(file["mask/valid"]), list(file["mask/train"])) == ([b"demo_0"], [b"demo_1", b"demo_2", b"demo_3"])
         assert file["data/demo_2/dones"][()].tolist() == [False] * 6 + [True]
         assert file["data"].attrs["total"] == 4 + 5 + 7 + 8
-
-
-# --- phases -----------------------------------------------------------------------------------------------------------
 
 
 class Expert:
@@ -131,10 +122,7 @@ class Expert:
         return self._desired_pos(x)
 
 
-PLACES = {-0.5: 0, 0.5: 1, 1.5: 2, 2.5: 2, 7.0: 3}
-
-
-@pytest.mark.parametrize(("x", "phase"), PLACES.items())
+@pytest.mark.parametrize(("x", "phase"), {-0.5: 0, 0.5: 1, 1.5: 2, 2.5: 2, 7.0: 3}.items())
 def test_a_phase_is_the_return_statement_that_was_reached(x, phase):
     phases, expert = Phases(Expert._desired_pos), Expert()
     assert len(phases.lines) == 4

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from planted import small_spec
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.errors import BadInput
-from ddco_pyro.spec import parse_spec
 from studies import apart, arena_playing, policies
 from studies.cells import Cell, Job
 
@@ -170,13 +170,8 @@ def test_a_world_trains_with_the_settings_of_a_cell_and_plays_what_it_wrote(tmp_
     rng = np.random.default_rng(0)
     places = (np.cumsum(rng.normal(size=(20, 1)), 0) for _ in range(6))
     demos = demonstrations(*(({"x": x}, x * [[1.0, -2.0]]) for x in places))
-    spec = parse_spec({
-        "demonstrations": {"path": "none.hdf5"},
-        "observations": ["x"],
-        "control": {"kind": "gaussian", "std": 0.1},
-        "hierarchy": {"levels": [{"count": 2, "policy": {"network": "linear"}}], "meta_policy": {"network": "linear"}},
-        "training": {"epochs": 60, "optimizer": {"name": "em"}},
-    })  # fmt: skip
+    training = {"epochs": 60, "optimizer": {"name": "em"}}
+    spec = small_spec(observations=["x"], control={"kind": "gaussian", "std": 0.1}, training=training)
     world, cell = apart.World(Here(demos[0], tmp_path)), Cell("test", "PushT", "", 6, 0)
 
     def measured(method, **settings):

@@ -94,6 +94,8 @@ TUNED = {
     "demonstrations": {"counts": [3], "held_out": 2, "test": {"count": 6}, "development": {"first": 6, "count": 6}},
     "contrasts": [],
 }
+GRID, FLAT = {"options": {"grid": {"control.std": [0.1, 0.2]}}}, {"flat": {"baseline": "flat"}}
+SAME = {"grid": {"control.std": [0.1, 0.1]}}
 RECORDED = {"counts": [10], "held_out": 5, "test": {"first": 0, "count": 20}}
 
 
@@ -102,37 +104,19 @@ RECORDED = {"counts": [10], "held_out": 5, "test": {"first": 0, "count": 20}}
     [
         ({"seed": {}}, "seed: unknown key; did you mean seeds?"),
         ({"seeds": {"test": {"count": 3}, "development": {"first": 2, "count": 1}}}, "seeds.development: 2 to 2 "),
-        (
-            {"demonstrations": RECORDED, "starts": {"test": {"first": 39, "count": 10}}},
-            "starts.test: 39 to 58 overlaps demonstrations.test (0 to 39)",
-        ),
+        ({"demonstrations": RECORDED, "starts": {"test": {"first": 39, "count": 10}}}, "starts.test: 39 to 58"),
         ({"demonstrations": {**RECORDED, "test": {"count": 14}}}, "must be at least 15"),
         ({"measures": ["nat"]}, "there is no measure 'nat' (did you mean 'nats'?)"),
         ({"contrasts": [{"contrast": "options - flat", "measure": "nats"}]}, "must be one of 4, 6"),
         ({"contrasts": [{"contrast": "options - flat", "measure": "ari", "demonstrations": 6}]}, "not among measures"),
         ({"failed": {"success": 0.0}}, "failed.success: 'success' is not among measures"),
-        (
-            {"contrasts": [{**STUDY["contrasts"][0], "kind": "equivalence"}]},
-            "contrasts.0.margin: missing; say which differences are none",
-        ),
+        ({"contrasts": [{**STUDY["contrasts"][0], "kind": "equivalence"}]}, "contrasts.0.margin: missing; say which"),
         ({"families": {"door": ["open", "close"]}}, "families: must have tasks of the study, each once"),
         ({"choose": "nats"}, "choose: goes together with seeds.development"),
-        (
-            {**TUNED, "methods": {"options": {"grid": {"control.std": [0.1, 0.2]}}, "flat": {"baseline": "flat"}}},
-            "unequal numbers of points to choose from (options 2, flat 1)",
-        ),
-        (
-            {**TUNED, "methods": {"options": {"grid": {"control.std": [0.1, 0.1]}}, "flat": {"baseline": "flat"}}},
-            "methods: have nothing to choose from; give each a grid",
-        ),
-        (
-            {"methods": {"options": {"overrides": {"control.std": 0.2}, "grid": {"control.std": [0.1]}}}},
-            "methods.options.overrides: has 'control.std', which the grid has, too",
-        ),
-        (
-            {"methods": {"options": {"grid": {"control.std": [0.1, 0.2]}}}, "contrasts": []},
-            "choose: missing; name the measure that chooses among the points",
-        ),
+        ({**TUNED, "methods": GRID | FLAT}, "unequal numbers of points to choose from (options 2, flat 1)"),
+        ({**TUNED, "methods": {"options": SAME} | FLAT}, "methods: have nothing to choose from; give each a grid"),
+        ({"methods": {"options": SAME | {"overrides": {"control.std": 0.2}}}}, "has 'control.std', which the grid has"),
+        ({"methods": GRID, "contrasts": []}, "choose: missing; name the measure that chooses among the points"),
         ({"overrides": {"control.stdd": 0.1}}, "options: control.stdd: unknown key; did you mean control.std?"),
     ],
 )
@@ -155,10 +139,7 @@ def test_the_page_names_every_key():
     [
         ({"kept": [{"table": "spec.yaml"}]}, "spec.yaml: is damaged"),
         ({"world": "nowhere:WORLD"}, "world: nowhere:WORLD cannot be loaded: No module named"),
-        (
-            {"world": "simulated:WORLD", "methods": {"on": {"by": "flo"}}, "contrasts": []},
-            "simulated:WORLD has no method 'flo' (did you mean 'flow'?)",
-        ),
+        ({"world": "simulated:WORLD", "methods": {"on": {"by": "flo"}}, "contrasts": []}, "has no method 'flo' (did"),
     ],
 )
 def test_worlds_and_tables_that_cannot_be_used_are_refused_before_any_work(made, changes, said):
@@ -488,18 +469,14 @@ def test_the_commit_of_the_code_is_that_of_library_and_study(tmp_path, monkeypat
 
 def test_the_best_point_on_development_seeds_is_tested(made):
     """With σ of 50 every method explains the demonstrations worse than with 0.5. Options have a grid of their own."""
-    methods = {
-        "options": {"grid": {"control.std": [50.0, 0.5]}},
-        "flat": {"baseline": "flat", "grid": {"control.std": [0.5, 50.0]}},
-    }
+    flat = {"baseline": "flat", "grid": {"control.std": [0.5, 50.0]}}
+    methods = {"options": {"grid": {"control.std": [50.0, 0.5]}}, "flat": flat}
     folder = made(**TUNED, methods=methods)
     state = folder.run(HERE)
     parts = [cell.part for cell in state.cells]
     assert (parts.count("development"), parts.count("test"), len(state.done)) == (4, 2, 6)
-    assert {(cell.method, cell.point["control.std"]) for cell in state.cells if cell.part == "test"} == {
-        ("options", 0.5),
-        ("flat", 0.5),
-    }
+    tested = {(cell.method, cell.point["control.std"]) for cell in state.cells if cell.part == "test"}
+    assert tested == {("options", 0.5), ("flat", 0.5)}
     report(folder, state)
     rows = read_tidy(folder.path / "table.csv")
     names = {"options", "flat", *(f"{name} (std = {std})" for name in ("options", "flat") for std in (0.5, 50.0))}
@@ -510,22 +487,17 @@ def test_the_best_point_on_development_seeds_is_tested(made):
 
 
 def test_a_measure_of_nothing_is_better_than_less(made):
-    """Means over development cells: −1 and 0 at the first point, −0.4 at the second; the best is the second."""
+    """Means over development cells: of two values at the first point, one of them 0; −0.4 at the second."""
     seeds = {"test": {"count": 1}, "development": {"first": 7, "count": 2}}
     folder = made(**{**TUNED, "seeds": seeds}, methods={"options": {"grid": {"control.std": [0.5, 1.0]}}})
-    values = {(7, 0.5): -1.0, (8, 0.5): 0.0, (7, 1.0): -0.4, (8, 1.0): -0.4}
     places = folder.cells("development")
-    results = [cells.Done(values={"nats": values[one.seed, one.point["control.std"]]}) for one in places]
-    state = cells.State(places, dict(zip(places, results, strict=True)), {})
-    assert folder.chosen(state) == {"options": {"control.std": 1.0}}
-    results[0] = cells.Done(values={"nats": -0.7})
-    assert folder.chosen(cells.State(places, dict(zip(places, results, strict=True)), {})) == {
-        "options": {"control.std": 0.5}
-    }
-    results[0] = cells.Done(values={"nats": None})  # a measure that applies to no episode is the least
-    assert folder.chosen(cells.State(places, dict(zip(places, results, strict=True)), {})) == {
-        "options": {"control.std": 1.0}
-    }
+
+    def chosen(first):
+        values = {(7, 0.5): first, (8, 0.5): 0.0, (7, 1.0): -0.4, (8, 1.0): -0.4}
+        done = {one: cells.Done(values={"nats": values[one.seed, one.point["control.std"]]}) for one in places}
+        return folder.chosen(cells.State(places, done, {}))["options"]["control.std"]
+
+    assert [chosen(first) for first in (-1.0, -0.7, None)] == [1.0, 0.5, 1.0]  # None: it applies to no episode
 
 
 def test_some_tasks_choose_for_all(made):
@@ -541,17 +513,6 @@ def test_some_tasks_choose_for_all(made):
     assert {cell.task for cell in folder.cells("test")} == {"needle", "pushing"}
     with pytest.raises(SpecError, match=r"choose_on\.0: 'needles' is not among tasks"):
         made(**study | {"choose_on": ["needles"]})
-
-
-def test_cells_of_an_earlier_table_are_not_done(made, done, tmp_path):
-    report(done, done.state())
-    shutil.copy(done.path / "table.csv", tmp_path)
-    folder = made(kept=[{"table": "table.csv"}])
-    assert not folder.state().missing
-    table = tmp_path / "table.csv"
-    table.write_text(re.sub(r"(?m)^.*,flat,\d+,1,.*\n", "", table.read_text()))
-    folder = made(kept=[{"table": "table.csv"}])
-    assert {(cell.method, cell.seed) for cell in folder.state().missing} == {("flat", 1)}
 
 
 @pytest.mark.parametrize(

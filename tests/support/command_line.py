@@ -38,5 +38,19 @@ def call(*arguments):
     return Ended(ended.value.code, out.getvalue(), err.getvalue())
 
 
+def done(*arguments):
+    """The command line in this process, which does what it is asked."""
+    ended = call(*arguments)
+    assert ended.status == 0, ended.err
+    return ended
+
+
+def refused(says, *arguments):
+    """The command line in this process, which refuses and says this in its one line."""
+    ended = call(*arguments)
+    assert (ended.status, ended.err.count("\n"), says in ended.err) == (2, 1, True), ended
+    return ended
+
+
 def with_set(*overrides):
     return [argument for override in overrides for argument in ("--set", override)]

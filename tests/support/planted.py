@@ -24,9 +24,13 @@ CONTROL = {"std": SIGMA}
 TRAINING = {"epochs": 900, "starts": ["vq_controls"] * 3, "patience": 25}
 
 
-def small_spec(counts=(2,), policy=LINEAR, **sections):
-    """Levels whose policies are of one kind, terminations and meta-policy linear; no counts: a flat policy."""
-    levels = [{"name": f"level-{d}", "count": k, "policy": policy} for d, k in enumerate(counts, 1)]
+def small_spec(counts=(2,), policy=LINEAR, name="level", **sections):
+    """Levels whose policies are of one kind, terminations and meta-policy linear; no counts: a flat policy.
+
+    :param name: of the level; of several levels each has its number behind it.
+    """
+    names = [name] if len(counts) == 1 and name != "level" else [f"{name}-{d}" for d in range(1, 1 + len(counts))]
+    levels = [{"name": own, "count": k, "policy": policy} for own, k in zip(names, counts, strict=True)]
     flat = {"baseline": {"kind": "flat", "policy": policy}}
     return parse_spec(
         {
@@ -85,21 +89,16 @@ def preferences(callers, options):
     return torch.where(offset < 2, 4.0, -4.0).unsqueeze(1)
 
 
-def make_truth(spec, ending=-1.7, parts=None):
-    """Options that each head for a corner of their own; callers that each select among some of the options below.
-
-    :param parts: how the control is modelled, if not as two Gaussian dimensions; further ones are 0.
-    """
-    size = 2 if parts is None else sum(len(part.dims) for part in parts)
-    truth = build_hierarchy(spec, Dimensions({"state": (2,)}, size, 1, parts=parts))
+def make_truth(spec, ending=-1.7):
+    """Options that each head for a corner of their own; callers that each select among some of the options below."""
+    truth = build_hierarchy(spec, Dimensions({"state": (2,)}, 2, 1))
     truth.encoder.requires_grad_(False)
     corners = torch.tensor([[0.8, 0.8], [-0.8, 0.8], [-0.8, -0.8], [0.8, -0.8]])
     with torch.no_grad():
         for number, level in enumerate(truth.levels):
             if number == 0:
-                level.policy.network.layers[0].weight[:] = -0.35 * torch.eye(2, size)
-                level.policy.network.layers[0].bias[..., :2] = 0.35 * corners[: level.count, None]
-                level.policy.network.layers[0].bias[..., 2:] = 0.0
+                level.policy.network.layers[0].weight[:] = -0.35 * torch.eye(2)
+                level.policy.network.layers[0].bias[:] = 0.35 * corners[: level.count, None]
             else:
                 level.policy.network.layers[0].weight.zero_()
                 level.policy.network.layers[0].bias[:] = preferences(level.count, truth.levels[number - 1].count)

@@ -50,13 +50,16 @@ def supervised(task: Task) -> Iterator[tuple[dm_env.Environment, list[dm_env.Tim
     environment.close()
 
 
-def test_observations_follow_their_spec(supervised) -> None:
-    environment, steps, _ = supervised
+def test_observations_and_actions_follow_their_spec(supervised) -> None:
+    environment, steps, actions = supervised
     spec = environment.observation_spec()
     for step in steps:
         assert set(step.observation) == set(spec)
         for key, value in step.observation.items():
             spec[key].validate(value)
+    spec = environment.action_spec()
+    for action in actions:
+        spec.validate(action.astype(spec.dtype))
 
 
 def test_observations_are_finite_and_change(task: Task, supervised) -> None:
@@ -76,13 +79,6 @@ def at_starts(task: Task, key: str) -> list[np.ndarray]:
         seen.append(environment.reset().observation[key])
         environment.close()
     return seen
-
-
-def test_actions_follow_their_spec(supervised) -> None:
-    environment, _, actions = supervised
-    spec = environment.action_spec()
-    for action in actions:
-        spec.validate(action.astype(spec.dtype))
 
 
 def test_the_outcome_is_what_was_declared_with_success_among_it(task: Task, supervised) -> None:

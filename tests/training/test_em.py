@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from bimanual import bimanual
 from linear import (
     ACTIONS,
     CLIPPED,
@@ -22,7 +21,7 @@ from linear import (
     score,
 )
 from planted import LINEAR, make_spec, make_trainer, small_spec
-from random_demonstrations import demonstrations
+from random_demonstrations import demonstrations, numbered
 from scipy import optimize, stats
 from sklearn.linear_model import LogisticRegression
 from sklearn.metrics import normalized_mutual_info_score
@@ -295,16 +294,11 @@ def test_a_fit_by_em_says_so_and_trains_what_is_not_linear_by_gradients():
     assert "(L-BFGS)" in verdicts.effort(trained["flat"])
 
 
-def flat_spec(kind="flat", **control):
-    baseline = {"kind": kind, "policy": {"network": "mlp", "hidden": [4] if kind == "flat" else []}}
-    own = em_spec().model_dump(exclude_unset=True)
-    return parse_spec({**own, "hierarchy": None, "compare_with": [], "baseline": baseline, "control": control})
-
-
 def test_a_flat_policy_for_each_time_step_is_least_squares_at_that_step():
     demos = demonstrations(40)
-    spec = flat_spec("per_timestep", std=1.0)
-    spec = with_overrides(spec, {"training.tune_fraction": 0.1, "training.patience": 300, "training.epochs": 300})
+    training = {"optimizer": {"name": "em"}, "tune_fraction": 0.1, "patience": 300, "epochs": 300}
+    policy = {"kind": "per_timestep", "policy": {"network": "mlp", "hidden": []}}
+    spec = small_spec((), observations=["pose"], control={"std": 1.0}, baseline=policy, training=training)
     trainer = make_trainer(spec, demos, None)
     trainer.run()
     batch, units = trainer.data.train, trainer.data.hierarchy(0).scaling.scale.log().sum()
@@ -359,6 +353,24 @@ def test_tuning_demonstrations_decide_nothing_before_the_last_stage():
         assert all(end["rising"] == 0 for end in restart.progress.ended[:-1])  # EM has converged
     without_tuning = [[{**row, "tune": 0} for row in history] for history in histories]
     assert without_tuning[0] == without_tuning[1] == without_tuning[2]
+
+
+def bimanual(number=20, steps=60, seed=0):
+    """Fourteen joint positions of two arms, through six poses that vary with the demonstration, as objects do."""
+    random = np.random.default_rng(seed)
+    poses, rows = 0.5 * random.normal(size=(6, 14)), []
+    for _ in range(number):
+        own = poses + 0.1 * random.normal(size=poses.shape)
+        times = np.r_[0, np.sort(random.choice(np.arange(5, steps - 5), 4, replace=False)), steps - 1]
+        path = np.stack([np.interp(np.arange(steps), times, joint) for joint in own.T], axis=1)
+        commands, place = path + 0.002 * random.normal(size=path.shape), np.zeros((steps, 14))
+        place[0] = path[0]
+        for step in range(1, steps):
+            place[step] = (place[step - 1] + commands[step - 1]) / 2
+        effort = 5 * (commands - place) + 0.05 * random.normal(size=place.shape)
+        objects = own[2:4, :6].ravel() + 0.001 * random.normal(size=(steps, 12))
+        rows.append(({"place": place, "effort": effort, "objects": objects}, commands))
+    return numbered(rows)
 
 
 def test_ridges_are_raised_where_demonstrations_are_few_for_their_observations(tmp_path):

@@ -20,7 +20,6 @@ from ddco_pyro.training.objective import Objective
 from ddco_pyro.training.stages import plan
 
 LENGTHS = (7, 4, 6)
-PLACES = np.array([[0.0, 0.0, 4.0], [4.0, 0.0, 0.0], [0.0, 4.0, 0.0]])
 
 
 def make_batch(vector, actions, images=None, lengths=LENGTHS):
@@ -43,9 +42,6 @@ def alive(choices, lengths=LENGTHS):
 
 def random_rows(seed, columns):
     return np.random.default_rng(seed).normal(size=(sum(LENGTHS), columns))
-
-
-# --- which steps belong together --------------------------------------------------------------------------------------
 
 
 def test_equal_parts_cut_each_demonstration_for_itself():
@@ -75,8 +71,6 @@ def test_what_policies_of_options_do_not_read_does_not_begin_them(read, found):
     truths = np.concatenate([np.split(truth[found], cuts)[number] for number in known])
     assert adjusted_rand_score(truths, alive(objective.known[0][1], [LENGTHS[number] for number in known])) == 1
 
-
-# --- k-means itself ---------------------------------------------------------------------------------------------------
 
 FEW = (3, 2, 4)
 
@@ -126,7 +120,7 @@ def test_images_are_seen_as_block_means():
 @pytest.mark.filterwarnings("error")
 def test_there_are_no_more_clusters_than_distinct_observations():
     place = np.arange(sum(LENGTHS)) % 3
-    batch = make_batch(PLACES[place], random_rows(1, 2))
+    batch = make_batch(np.array([[0.0, 0.0, 4.0], [4.0, 0.0, 0.0], [0.0, 4.0, 0.0]])[place], random_rows(1, 2))
     assert adjusted_rand_score(place, alive(Clusters(batch, 5, seed=0).choices(batch))) == 1
     assert set(alive(Clusters(batch, 5, seed=0, controls=True).choices(batch))) == {1, 2, 3, 4, 5}
 

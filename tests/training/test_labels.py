@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from command_line import call
+from command_line import call, done
 from oracle import brute_force, paths
 from planted import CONTROL, LINEAR, in_units_of, make_spec, make_trainer, make_truth, plant, small_spec, tabulated
 from random_demonstrations import numbered
@@ -430,6 +430,6 @@ def test_each_level_is_measured_with_its_own_labels(tmp_path, labels, names):
     for level, name in zip(("level-1", "level-2"), names, strict=True):
         assert f"Where each label’s steps lie: level “{level}”, label “{name}”" in page
     demos.write(tmp_path / "demos.hdf5")
-    assert call("segment", fit.folder, tmp_path / "demos.hdf5", "--html", tmp_path / "page.html").status == 0
+    done("segment", fit.folder, tmp_path / "demos.hdf5", "--html", tmp_path / "page.html")
     shown = (tmp_path / "page.html").read_text()
     assert [shown.count(f"Agreement with the label “{name}”") for name in names] == [names.count(one) for one in names]

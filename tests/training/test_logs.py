@@ -8,19 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
-from command_line import call
+from command_line import call, done
+from planted import LINEAR, small_spec
 from random_demonstrations import demonstrations
 
 import ddco_pyro
 from ddco_pyro.events import LOGS, DemonstrationsDone, EpochEnded, Log, TrainingBegan
-
-SPEC = {
-    "observations": ["pose"],
-    "hierarchy": {"levels": [{"count": 2, "policy": {"network": "linear"}}], "meta_policy": {"network": "linear"}},
-    "compare_with": [{"kind": "flat", "policy": {"network": "linear"}}],
-    "training": {"epochs": 4, "starts": ["random"], "layerwise": False},
-}
+from ddco_pyro.spec import dump_spec
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +22,13 @@ def spec(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("logs")
     demonstrations(8).write(folder / "demos.hdf5")
     path = folder / "spec.yaml"
-    path.write_text(yaml.safe_dump(SPEC | {"demonstrations": {"path": str(folder / "demos.hdf5")}}))
+    spec = small_spec(
+        demonstrations={"path": str(folder / "demos.hdf5")},
+        observations=["pose"],
+        compare_with=[{"kind": "flat", "policy": LINEAR}],
+        training={"epochs": 4, "starts": ["random"], "layerwise": False},
+    )
+    path.write_text(dump_spec(spec))
     return path
 
 
@@ -89,8 +89,7 @@ def test_restarts_have_names_of_their_own_and_numbers_are_finite(tmp_path, monke
 
 def test_the_fit_goes_on_where_a_log_fails(spec: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(LOGS, "tensorboard", (Kept(fails=2), "ddco_pyro"))
-    ended = call("fit", spec, "--out", tmp_path / "run", "--log", "tensorboard")
-    assert ended.status == 0, ended.err
+    ended = done("fit", spec, "--out", tmp_path / "run", "--log", "tensorboard")
     assert ended.out.count("the fit goes on without this log") == 1
 
 
@@ -111,7 +110,7 @@ def test_tensorboards_own_reader_reads_the_history(spec: Path, tmp_path: Path) -
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     run = tmp_path / "run"
-    assert call("fit", spec, "--out", run, "--log", "tensorboard").status == 0
+    done("fit", spec, "--out", run, "--log", "tensorboard")
     read = EventAccumulator(str(run / "tensorboard")).Reload()
     expected = history(run) | {name: [(0, value)] for name, value in held_out(run).items()}
     assert set(read.Tags()["scalars"]) == set(expected)
@@ -123,6 +122,6 @@ def test_tensorboards_own_reader_reads_the_history(spec: Path, tmp_path: Path) -
 def test_wandb_writes_a_run_to_upload_later(spec: Path, tmp_path: Path) -> None:
     pytest.importorskip("wandb")
     run = tmp_path / "run"
-    assert call("fit", spec, "--out", run, "--log", "wandb-offline").status == 0
+    done("fit", spec, "--out", run, "--log", "wandb-offline")
     (written,) = (run / "wandb").glob("offline-run-*/run-*.wandb")
     assert written.stat().st_size > 0

@@ -23,9 +23,6 @@ def random_constants(tables):
     return Constants.drawn(tables, np.random.default_rng(0))
 
 
-# --- an iteration -----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("counts", "hybrid"),
     [
@@ -68,9 +65,6 @@ def _count(h, b, weight, depth, selected, ended):
             ended[level - 1][h[t - 1][level] - 1, b[t][level]] += weight
 
 
-# --- what networks take over ------------------------------------------------------------------------------------------
-
-
 def test_networks_are_scored_by_what_they_say_of_every_path_of_the_constants():
     """Σ over paths of their probability under the constants times the log-probability of what they select and end."""
     counts, lengths = (2, 2), torch.tensor([STEPS, STEPS - 1])
@@ -103,9 +97,6 @@ def test_the_gradient_stays_finite_where_callers_have_no_control():
     expected(said, lengths, random_constants(tables)).sum().backward()
     assert torch.isfinite(logits.grad).all()
     assert logits.grad.abs().max() > 0
-
-
-# --- planted levels ---------------------------------------------------------------------------------------------------
 
 
 def planted_pairs(demonstrations=20, steps=40, seed=0):

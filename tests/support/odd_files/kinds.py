@@ -131,9 +131,7 @@ ROWS: dict[str, Row] = {
         says="demo_1 is in mask/train and in mask/valid",
         masks={"train": [b"demo_0", b"demo_1", b"demo_2"], "valid": [b"demo_1", b"demo_3"]},
     ),
-    "a mask names a stranger": _row(
-        says="mask/valid: there is no demonstration 'demo_9'", masks={"valid": [b"demo_9"]}
-    ),
+    "a mask names a stranger": _row(says="valid: there is no demonstration 'demo_9'", masks={"valid": [b"demo_9"]}),
     "an empty mask": _row(says="no demonstration is left to validate with", masks={"valid": []}),
     "a mask of all": _row(
         says="no demonstration is left to train with", masks={"valid": [b"demo_%d" % n for n in range(NUMBER)]}
@@ -169,9 +167,7 @@ ROWS: dict[str, Row] = {
     "two conventions of a switch": _row(
         with_switch(lambda steps, number: np.where(_half(steps), -1 if number < 3 else 0, 1))
     ),
-    "controls of another size in one": _row(
-        _another_size, says=r"actions (is in 4 of 5 demonstrations|has shape \(1,\))"
-    ),
+    "controls of another size in one": _row(_another_size, says=r"actions (is in 4 of 5 demonstra|has shape \(1,\))"),
     "a number that single precision does not hold": _row(_huge),
     "no control that moves": _row(
         put("actions", lambda steps, number: np.ones((steps, 2))), says="every dimension is constant"

@@ -168,7 +168,7 @@ ROWS = {
         r"conversion\.convert_robosuite --dataset .* && .*dataset_states_to_obs --dataset",
     ),
     "robosuite prepared": Row(
-        partial(robosuite, attribute="env_args"), r"makes them: python -m robomimic\.scripts\.dataset_states_to_obs"
+        partial(robosuite, attribute="env_args"), r"python -m robomimic\.scripts\.dataset_states"
     ),
     "zarr": Row(zarr, r"is a zarr store, as diffusion policy writes them; .*docs/own\.md"),
     "tfds": Row(tfds, r"is a TensorFlow dataset \(RLDS\); .*docs/own\.md"),
@@ -182,8 +182,6 @@ ROWS = {
         "has the layout of AgiBot World, with observations in state and controls in action",
     ),
     "RoboSet": Row(lambda folder: hdf5(folder, "Trial0/data/qp_arm"), "has the layout of RoboSet"),
-    "lerobot v2": Row(
-        lerobot_v2, r"v2\.1, and v3\.x can be read; .*: python -m lerobot\.scripts\.convert_dataset_v21_to_v30"
-    ),
+    "lerobot v2": Row(lerobot_v2, r"v2\.1, and v3\.x can be read; .*: python -m lerobot\..*convert_dataset_v21_to_v30"),
     "strange name": Row(strange, "is a folder of no known format"),
 }
