@@ -8,12 +8,10 @@ import time
 
 import pytest
 from killing import alive
+from labelled import until
 
 from ddco_pyro.events import EpochEnded, TrainingBegan
 from ddco_pyro.labelling.background import Background
-
-PATIENCE = 20
-"""Seconds that another process has to start."""
 
 
 @pytest.fixture
@@ -21,13 +19,6 @@ def background():
     begun = Background(threading.RLock(), lambda: None, "colorsys")
     yield begun
     begun.close()
-
-
-def until(holds):
-    end = time.monotonic() + PATIENCE
-    while not holds():
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 def training(folder, epochs=10, stop=True):

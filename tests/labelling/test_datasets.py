@@ -9,24 +9,17 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as parquet
 import pytest
+from labelled import paint
+from planted import small_spec
 
 from ddco_pyro.data.importing import import_demonstrations
 from ddco_pyro.data.sources import open_source
 from ddco_pyro.errors import BadInput
 from ddco_pyro.fitting.fit import fit
-from ddco_pyro.labelling.session import Session
 from ddco_pyro.labelling.team import Team
-from ddco_pyro.spec import parse_spec
 
 HERE = Path(__file__).parents[1]
 TOOLS = Path(os.environ.get("DDCO_PYRO_TOOLS", HERE.parent / ".venv-tools")) / "bin" / "python"
-LINEAR = {"network": "linear"}
-SPEC = {
-    "observations": ["state"],
-    "hierarchy": {"levels": [{"count": 2, "policy": LINEAR, "termination": LINEAR}], "meta_policy": LINEAR},
-    "training": {"epochs": 3, "optimizer": {"name": "em"}, "tune_fraction": 0},
-    "compare_with": [],
-}
 
 
 @pytest.fixture
@@ -35,26 +28,19 @@ def dataset(tmp_path):
 
 
 @pytest.fixture
-def begin(dataset, tmp_path):
-    """Begins a session with the dataset, or with another one, and closes it."""
+def begin(dataset, tmp_path, begun):
+    """Begins a session with the dataset."""
     import_demonstrations(dataset, tmp_path / "numbers.hdf5")
     known = {"path": str(tmp_path / "numbers.hdf5"), "valid_fraction": 0}
-    run = fit(parse_spec({**SPEC, "demonstrations": known}), out=tmp_path / "run")
-    begun = []
-
-    def one(out, path=dataset, me="ann"):
-        begun.append(Session(run, path, out, skills=["reach", "lift"], team=Team(me)))
-        return begun[-1]
-
-    yield one
-    for session in begun:
-        session.journal.close()
+    training = {"epochs": 3, "optimizer": {"name": "em"}, "tune_fraction": 0}
+    run = fit(small_spec(demonstrations=known, training=training), out=tmp_path / "run")
+    return lambda out, me="ann": begun(out, dataset, run, skills=["reach", "lift"], team=Team(me))
 
 
 def labelled(session):
     """Labels with a gap in the first episode, open steps in the second, and a third that is left out."""
-    for demo, start, stop, option in ((0, 0, 2, 1), (0, 3, 5, 2), (1, 0, 3, 0), (1, 3, 6, 2)):
-        session.edit({"do": "paint", "demo": demo, "start": start, "stop": stop, "option": option})
+    for stretch in ((0, 0, 2, 1), (0, 3, 5, 2), (1, 0, 3, 0), (1, 3, 6, 2)):
+        paint(session, *stretch)
     session.edit({"do": "mark", "demo": 2, "mark": "exclude", "value": True})
     session.edit({"do": "mark", "demo": 2, "mark": "note", "value": "dropped it"})
     session.save()

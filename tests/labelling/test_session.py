@@ -1,94 +1,23 @@
-"""A session of labelling: what is shown, changed and saved, against the fit, the planted truth, and files read back."""
+"""A session of labelling: what is shown, changed and proposed anew, against the fit and the planted truth."""
 
 import csv
 import json
-import shutil
 import threading
-import time
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
-from itertools import pairwise
-from xml.etree import ElementTree
 
-import h5py
 import numpy as np
 import pytest
-from command_line import call
+from labelled import accept, here, label, refitted, stretches
 from time_lines import unpacked
 
-from ddco_pyro.cli.label import _fitted
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.inspection import inspect
-from ddco_pyro.data.labels import LABEL_NAMES, UNKNOWN
 from ddco_pyro.data.starting import starting_spec
 from ddco_pyro.errors import BadInput
-from ddco_pyro.fitting.fitted import load
 from ddco_pyro.labelling.background import Background
 from ddco_pyro.labelling.document import FREE, OPEN
 from ddco_pyro.labelling.proposals import USUAL, Proposals
-from ddco_pyro.labelling.session import Session
 
 COUNT, NAMES = 4, ("let go", "carry", "close", "come")
-
-
-@pytest.fixture(scope="module")
-def demos(file):
-    return Demonstrations.read(file)
-
-
-@pytest.fixture
-def begin(run, demos, tmp_path, monkeypatch):
-    """Begins a session with the fit; refits are made by this process."""
-    monkeypatch.setattr(Background, "_submit", here)
-    path = tmp_path / "demos.hdf5"
-    demos.write(path)
-    begun = []
-
-    def one(out="out.hdf5"):
-        begun.append(Session(replace(run, named={}), path, tmp_path / out))
-        return begun[-1]
-
-    yield one
-    for session in begun:
-        refitted(session)
-        session.journal.close()
-
-
-@pytest.fixture(scope="module")
-def unchanged(run, demos, tmp_path_factory):
-    """A session in which nothing is done."""
-    path = tmp_path_factory.mktemp("unchanged") / "demos.hdf5"
-    demos.write(path)
-    session = Session(replace(run, named={}), path, path.with_name("out.hdf5"))
-    yield session
-    session.journal.close()
-
-
-@pytest.fixture
-def quiet(monkeypatch):
-    """No refit follows an accepted demonstration."""
-    monkeypatch.setattr(Session, "refit", lambda session: None)
-
-
-POOL = ThreadPoolExecutor()
-
-
-def here(background, call):
-    """Have a call made by this process."""
-    return POOL.submit(call)
-
-
-def refitted(session):
-    """What is said of refits once nothing is under way."""
-    while (known := session.progress())["refit"]["running"] or known["behind"]:
-        time.sleep(0.01)
-    return known["refit"]
-
-
-def accept(session, index):
-    """Accept what is shown of a demonstration."""
-    seen = [[own["start"], own["option"]] for own in session.demo(index)["segments"]]
-    return session.edit({"do": "accept", "demo": index, "segments": seen})
 
 
 def shown(session):
@@ -284,16 +213,14 @@ def test_names_that_go_on_leave_alone_what_a_person_said(begin, demos):
     np.testing.assert_array_equal(session.document.labels["demo_0"], expected)
 
 
-def test_skills_are_named_at_the_start_and_coloured(run, demos, tmp_path):
-    demos.write(tmp_path / "demos.hdf5")
-    session = Session(replace(run, named={}), tmp_path / "demos.hdf5", tmp_path / "o.hdf5", skills=[*NAMES, "wait"])
+def test_skills_are_named_at_the_start_and_coloured(begun):
+    session = begun(skills=[*NAMES, "wait"])
     assert session.state()["names"] == [*NAMES, "wait"]
     session.edit({"do": "colour", "option": 5, "colour": "#123456"})
     session.edit({"do": "rename", "option": 5, "text": "idle"})
     assert session.state()["colours"][4] == "#123456"
     session.edit({"do": "undo"})
     assert session.state()["colours"][4] == "#123456"
-    session.journal.close()
 
 
 @pytest.mark.usefixtures("quiet")
@@ -374,8 +301,8 @@ def test_an_edit_waits_for_no_other_demonstration(begin, demos, monkeypatch):
     ],
     ids=json.dumps,
 )
-def test_a_command_that_cannot_be_done_is_one_line_and_changes_nothing(unchanged, command):
-    session = unchanged
+def test_a_command_that_cannot_be_done_is_one_line_and_changes_nothing(begun, command):
+    session = begun()
     before, content = shown(session), session.journal.path.read_bytes()
     with pytest.raises(BadInput) as error:
         session.edit(command)
@@ -384,18 +311,6 @@ def test_a_command_that_cannot_be_done_is_one_line_and_changes_nothing(unchanged
 
 
 # --- refits -----------------------------------------------------------------------------------------------------------
-
-
-def stretches(truth):
-    """Each stretch of equal labels as (first step, step after the last, option)."""
-    edges = [0, *(np.flatnonzero(np.diff(truth)) + 1).tolist(), len(truth)]
-    return [(start, stop, int(truth[start]) + 1) for start, stop in pairwise(edges)]
-
-
-def label(session, index, truth):
-    """Say the truth of a demonstration."""
-    for start, stop, option in stretches(truth):
-        session.edit({"do": "paint", "demo": index, "start": start, "stop": stop, "option": option})
 
 
 def right(session, demos, rest):
@@ -468,7 +383,7 @@ def test_without_labels_there_is_no_refit(begin):
 
 
 @pytest.mark.usefixtures("quiet")
-def test_after_a_kill_the_refit_is_made_again_and_what_the_file_lacks_can_be_saved(begin, run, tmp_path, monkeypatch):
+def test_after_a_kill_the_refit_is_made_again_and_what_the_file_lacks_can_be_saved(begin, monkeypatch):
     session = begin()
     session.edit(paint)
     accept(session, 0)
@@ -486,197 +401,3 @@ def test_after_a_kill_the_refit_is_made_again_and_what_the_file_lacks_can_be_sav
     third.edit({"do": "undo"})
     third.journal.close()
     assert begin().state()["dirty"]
-
-
-# --- exports ----------------------------------------------------------------------------------------------------------
-
-GIVEN, LEFT = range(10), range(10, 25)
-"""The steps of a demonstration that a person gives and leaves open; the others are accepted or left to the model."""
-
-
-@pytest.fixture
-def mixed(begin, monkeypatch):
-    """A session with two demonstrations of these steps, the first accepted."""
-    monkeypatch.setattr(Session, "refit", lambda session: None)
-    session = begin()
-    for index in (0, 1):
-        session.edit({**paint, "demo": index, "start": 0, "stop": 10})
-        session.edit({**paint, "demo": index, "start": 10, "stop": 25, "option": 0})
-    accept(session, 0)
-    refitted(session)
-    return session
-
-
-def sources_of(index, demos):
-    return ["given"] * 10 + ["open"] * 15 + [["accepted", "proposed"][index]] * (len(demos[index]) - 25)
-
-
-def test_tables_say_who_says_each_step_and_have_no_option_where_steps_are_open(mixed, demos, tmp_path):
-    rows = list(csv.DictReader(mixed.export("csv", tmp_path).read_text().splitlines()))
-    for index in (0, 1):
-        own = [row for row in rows if row["demonstration"] == f"demo_{index}"]
-        assert [row["skill_source"] for row in own] == sources_of(index, demos)
-        assert {(own[step]["skill"], own[step]["skill_name"], own[step]["skill_probability"]) for step in LEFT} == {
-            ("-1", "", "0.0")
-        }
-        assert {own[step]["skill"] for step in GIVEN} == {"3"}
-        assert all(int(row["skill"]) > 0 for row in own[25:])
-    page = mixed.export("html", tmp_path).read_text()
-    assert '"name":"skill_source","names":{"0":"open"' in page
-    assert '"-1":"open"' in page
-
-
-def test_other_programs_get_a_gap_where_steps_are_open_and_who_says_each_segment(mixed, demos, tmp_path):
-    (tmp_path / "elan").mkdir()
-    folder = mixed.export("elan", tmp_path / "elan")
-    tasks = json.loads((mixed.export("label-studio", tmp_path) / "tasks.json").read_text())
-    for index in (0, 1):
-        root = ElementTree.parse(folder / f"demo_{index}.eaf").getroot()
-        slots = {own.get("TIME_SLOT_ID"): int(own.get("TIME_VALUE")) // 1000 for own in root.iter("TIME_SLOT")}
-        tiers = {
-            tier.get("TIER_ID"): {
-                step: own.findtext("ANNOTATION_VALUE")
-                for own in tier.iter("ALIGNABLE_ANNOTATION")
-                for step in range(slots[own.get("TIME_SLOT_REF1")], slots[own.get("TIME_SLOT_REF2")])
-            }
-            for tier in root.iter("TIER")
-        }
-        assert tiers["skill"].keys() == {*GIVEN, *range(25, len(demos[index]))}
-        said = {step: source for step, source in enumerate(sources_of(index, demos)) if source != "open"}
-        assert tiers["skill_source"] == said
-        regions = {
-            step: own["meta"]["text"]
-            for own in tasks[index]["predictions"][0]["result"]
-            for step in range(own["value"]["start"], own["value"]["end"] + 1)
-        }
-        assert regions == {step: [source] for step, source in said.items()}
-
-
-def test_a_saved_file_is_gone_on_with_by_anyone(mixed, run, tmp_path, monkeypatch):
-    mixed.edit({"do": "rename", "option": 3, "text": "carry"})
-    mixed.save()
-    saved = tmp_path / "handed_over.hdf5"
-    shutil.copyfile(mixed.out, saved)
-    other = Session(replace(run, named={}), saved, tmp_path / "mine.hdf5")
-    assert other.document.names == mixed.document.names
-    for name, own in mixed.document.labels.items():
-        np.testing.assert_array_equal(other.document.labels[name], own)
-        np.testing.assert_array_equal(other.document.given[name], mixed.document.given[name])
-    other.journal.close()
-    segments = tmp_path / "segments.hdf5"  # a model's proposals are nobody's labels
-    assert call("segment", run.folder, mixed.path, "--out", segments).status == 0
-    another = Session(replace(run, named={}), segments, tmp_path / "other.hdf5")
-    assert not another.document.done
-    another.journal.close()
-
-
-def test_labels_of_another_program_are_gone_on_with_by_their_names(run, demos, tmp_path):
-    """As ``import --labels`` reads them, with a name that the run does not have."""
-    path, names = tmp_path / "imported.hdf5", [*NAMES, "wait"]
-    truth = [np.where(np.arange(len(demo)) < 5, UNKNOWN, demo.labels["phase"]) for demo in demos]
-    truth[0][-3:] = 4
-    each = (replace(demo, labels={"skill": own}) for demo, own in zip(demos, truth, strict=True))
-    Demonstrations(tuple(each), attributes={LABEL_NAMES: json.dumps({"skill": names})}).write(path)
-    session = Session(
-        replace(run, named={"skill": ("carry", "option 2", "option 3", "option 4")}), path, tmp_path / "o.hdf5"
-    )
-    own = session.document.names
-    assert (own[0], {*own}) == ("carry", {*names})
-    for name, expected in zip(demos.names, truth, strict=True):
-        labels = session.document.labels[name]
-        assert [own[label - 1] if label > 0 else "" for label in labels] == [
-            names[value] if value >= 0 else "" for value in expected
-        ]
-    session.journal.close()
-
-
-# --- files ------------------------------------------------------------------------------------------------------------
-
-
-def test_saved_labels_are_read_back_with_minus_one_where_nothing_is_said(begin, demos, tmp_path):
-    session, source = begin(), tmp_path / "demos.hdf5"
-    content = source.read_bytes()
-    session.edit(paint)
-    session.edit({**paint, "start": 12, "stop": 14, "option": 0})
-    session.edit({"do": "rename", "option": 3, "text": "carry"})
-    assert session.state()["dirty"]
-    session.save()
-    assert not session.state()["dirty"]
-    expected = np.full(len(demos[0]), -1)
-    expected[10:20], expected[12:14] = 3, -1
-    with h5py.File(tmp_path / "out.hdf5") as file:
-        np.testing.assert_array_equal(file["data/demo_0/labels/skill"], expected)
-        assert file["data/demo_0/labels/skill"].dtype.kind == "i"
-        assert (file["data/demo_1/labels/skill"][:] == -1).all()
-        names = json.loads(file["data"].attrs.get("label_names", file.attrs.get("label_names")))
-        assert names["skill"][3] == "carry"
-        assert names["phase"] == ["reach", "grasp", "carry", "release"]
-    read = Demonstrations.read(tmp_path / "out.hdf5")
-    np.testing.assert_array_equal(read[0].labels["skill"], expected)
-    np.testing.assert_array_equal(read[0].labels["phase"], demos[0].labels["phase"])
-    assert source.read_bytes() == content
-    session.edit({"do": "undo"})
-    session.edit({"do": "undo"})
-    session.save()
-    expected[10:20] = 3
-    np.testing.assert_array_equal(Demonstrations.read(tmp_path / "out.hdf5")[0].labels["skill"], expected)
-
-
-def test_labels_go_into_the_file_itself_again_and_again(begin, tmp_path):
-    session = begin("demos.hdf5")
-    for start in (0, 5):
-        session.edit({**paint, "start": start, "stop": start + 5, "option": 1})
-        session.save()
-        assert session.state()["warnings"] == []
-    labels = Demonstrations.read(tmp_path / "demos.hdf5")[0].labels["skill"]
-    assert labels[:10].tolist() == [1] * 10
-    assert (labels[10:] == -1).all()
-
-
-def test_a_source_that_changed_underneath_is_said_and_nothing_is_saved(begin, demos, tmp_path):
-    session = begin()
-    session.edit(paint)
-    session.save()
-    content = (tmp_path / "out.hdf5").read_bytes()
-    session.edit({"do": "undo"})
-    Demonstrations(demos[:3]).write(tmp_path / "demos.hdf5")
-    (warning,) = session.state()["warnings"]
-    assert str(tmp_path / "demos.hdf5") in warning
-    with pytest.raises(BadInput, match="changed"):
-        session.save()
-    assert (tmp_path / "out.hdf5").read_bytes() == content
-
-
-def test_an_out_of_something_else_is_refused(begin, tmp_path):
-    (tmp_path / "other.hdf5").write_text("mine")
-    with pytest.raises(BadInput, match="not a labelled copy"):
-        begin("other.hdf5")
-    assert not list(tmp_path.glob("*.journal"))
-
-
-def test_what_is_closed_is_saved_and_left_to_others(begin, tmp_path):
-    session = begin()
-    session.edit(paint)
-    with pytest.raises(BadInput, match="is open in a process"):
-        begin()
-    session.close()
-    assert Demonstrations.read(tmp_path / "out.hdf5")[0].labels["skill"][10] == 3
-    assert begin().state()["demos"][0]["labelled"] == 10
-
-
-@pytest.mark.usefixtures("undecided")
-def test_without_a_run_one_is_fitted_for_its_proposals_alone_and_used_again(demos, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    demos.write(tmp_path / "mine.hdf5")
-    run = _fitted(tmp_path / "mine.hdf5")
-    first = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
-    assert not {path.name for path in first} & {"baselines", "report.html", "figures"}
-    session = Session(load(run), tmp_path / "mine.hdf5", tmp_path / "out.hdf5")
-    assert sorted(session.state()["order"]) == [*range(len(demos))]
-    session.close()
-    assert _fitted(tmp_path / "mine.hdf5") == run
-    assert {path: path.stat().st_mtime_ns for path in run.rglob("*")} == first
-    (tmp_path / "other").mkdir()
-    demos.write(tmp_path / "other" / "mine.hdf5")
-    with pytest.raises(BadInput, match="copy the file under another name"):
-        _fitted(tmp_path / "other" / "mine.hdf5")

@@ -1,14 +1,13 @@
 """Several annotators: what is shared out, what each sees of the others, and whose edits an undo takes back."""
 
 from collections import Counter
-from dataclasses import replace
 
 import numpy as np
 import pytest
+from labelled import paint
 from sklearn.metrics import cohen_kappa_score
 
 from ddco_pyro.errors import BadInput
-from ddco_pyro.labelling.session import Session
 from ddco_pyro.labelling.team import Team
 
 NAMES = [f"demo_{number}" for number in range(10)]
@@ -32,32 +31,21 @@ def test_a_team_without_me_or_with_a_name_twice_is_refused(wrong):
 
 
 @pytest.fixture
-def join(run, file, tmp_path):
+def join(begun):
     """Begins a session of an annotator, with names of skills."""
-    begun = []
-
-    def one(me, skills=()):
-        out = tmp_path / f"labels_{me}.hdf5"
-        begun.append(Session(replace(run, named={}), file, out, skills=skills, team=Team(me, ("ann", "bob"), 1.0)))
-        return begun[-1]
-
-    yield one
-    for session in begun:
-        session.journal.close()
-
-
-def paint(session, start, stop, option):
-    session.edit({"do": "paint", "demo": 0, "start": start, "stop": stop, "option": option})
+    return lambda me, skills=(), share=1.0: begun(
+        f"labels_{me}.hdf5", skills=skills, team=Team(me, ("ann", "bob"), share)
+    )
 
 
 def test_annotators_see_each_other_agree_by_names_and_take_labels_over(join):
     ann, bob = join("ann", ["come", "close", "carry"]), join("bob", ["close", "come", "lift"])
     assert (ann.state()["demos"][0]["people"], ann.demo(0)["others"][0]["agreement"]) == (["ann", "bob"], None)
-    paint(ann, 0, 20, 1)
-    paint(ann, 20, 40, 2)
-    paint(bob, 0, 26, 2)  # come
-    paint(bob, 26, 36, 1)  # close
-    paint(bob, 36, 40, 3)  # lift, which ann does not have
+    paint(ann, 0, 0, 20, 1)
+    paint(ann, 0, 20, 40, 2)
+    paint(bob, 0, 0, 26, 2)  # come
+    paint(bob, 0, 26, 36, 1)  # close
+    paint(bob, 0, 36, 40, 3)  # lift, which ann does not have
     (seen,) = ann.demo(0)["others"]
     assert [(own["start"], own["stop"], seen["names"][own["option"] - 1]) for own in seen["segments"][:3]] == [
         (0, 26, "come"),
@@ -79,13 +67,11 @@ def test_annotators_see_each_other_agree_by_names_and_take_labels_over(join):
         ann.edit({"do": "take", "demo": 0, "annotator": "eve"})
 
 
-def test_the_journal_says_who_and_when_and_the_queue_begins_with_ones_own(run, file, tmp_path):
-    team = Team("ann", ("ann", "bob"))
-    session = Session(replace(run, named={}), file, tmp_path / "labels_ann.hdf5", team=team)
-    paint(session, 0, 5, 1)
+def test_the_journal_says_who_and_when_and_the_queue_begins_with_ones_own(join):
+    session = join("ann", share=0.0)
+    paint(session, 0, 0, 5, 1)
     line = session.journal.path.read_text().splitlines()[-1]
     assert '"by":"ann","at":"20' in line
     shares = [session.shares[session.demos.names[place]] for place in session.state()["order"]]
     assert shares == [("ann",)] * 3 + [("bob",)] * 3
     assert [(own["name"], own["done"], own["of"]) for own in session.state()["team"]] == [("ann", 0, 3)]
-    session.journal.close()
