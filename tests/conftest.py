@@ -3,8 +3,6 @@
 No test depends on how busy the machine is, and every run draws the same examples.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``make release-check``: install an sdist or a wheel into an environment of its own, and use it without a clone."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import subprocess

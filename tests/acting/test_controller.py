@@ -1,7 +1,5 @@
 """The controller against hand-set weights, the model's own means, and the latents' marginals by enumeration."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

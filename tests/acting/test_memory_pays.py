@@ -6,8 +6,6 @@ observations and controls, since those of observations cannot tell apart what lo
 Seeds are those that the library counts from by default; none is chosen for what it gives.
 """
 
-from __future__ import annotations
-
 from functools import cache, partial
 from pathlib import Path
 

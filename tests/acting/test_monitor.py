@@ -1,7 +1,5 @@
 """The live monitor against the model's likelihood and posterior of the same demonstration."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

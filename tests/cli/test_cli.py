@@ -1,7 +1,5 @@
 """The command line as a user runs it: what it prints, how it ends, and what it says of bad input."""
 
-from __future__ import annotations
-
 import ast
 import json
 import os

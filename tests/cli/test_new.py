@@ -1,7 +1,5 @@
 """From a file to a page in one command, on generated demonstrations whose skills are known."""
 
-from __future__ import annotations
-
 import re
 import shutil
 from pathlib import Path

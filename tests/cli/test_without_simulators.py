@@ -1,7 +1,5 @@
 """One's own demonstrations need no simulator: the commands run where none can be imported."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

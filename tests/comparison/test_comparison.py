@@ -1,7 +1,5 @@
 """Runs compared: against sums by hand, and refused with the reason where their data are not the same."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re

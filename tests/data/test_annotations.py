@@ -1,7 +1,5 @@
 """Segments in tables, read as labels: the columns are those that ELAN, BORIS and Label Studio export."""
 
-from __future__ import annotations
-
 import json
 
 import h5py

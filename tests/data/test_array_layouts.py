@@ -1,7 +1,5 @@
 """Pictures, labels and controls are read by their type and layout, alike from files and from memory."""
 
-from __future__ import annotations
-
 import contextlib
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What is said of each control dimension, against counts by hand, however it is divided into demonstrations."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What kind each control dimension is decided to be, what is refused, and that nothing impossible is emitted."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Demonstrations: what is read is what was written; as a sequence; splits."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 ``fixtures/README.md`` says how these files were made.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

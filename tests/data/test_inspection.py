@@ -1,7 +1,5 @@
 """What ``inspect`` says of a file, against what was put into it."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path

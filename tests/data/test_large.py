@@ -1,7 +1,5 @@
 """Files that are larger than memory: streamed where that can be, else refused before they are read."""
 
-from __future__ import annotations
-
 import math
 import zlib
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Layouts of other libraries: read where they are a few other names, else named with what converts them."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path

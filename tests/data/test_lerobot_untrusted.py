@@ -1,7 +1,5 @@
 """LeRobot datasets that lie: nothing outside them is read or written, and nothing that is not there is made up."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Demonstrations unlike the others of their file, or unlike those of a fit, are named with the reason."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """What no policy should read, by its numbers or its name: left out by ``init``, told by ``inspect``."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Every odd file with every command that takes one: done or refused in a line, within limits, nothing else changed."""
 
-from __future__ import annotations
-
 import re
 import time
 from collections.abc import Iterator

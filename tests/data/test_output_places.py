@@ -1,7 +1,5 @@
 """Outputs are places: what may be written is asked for all outputs of a command before it does anything."""
 
-from __future__ import annotations
-
 import os
 import shlex
 import shutil

@@ -1,7 +1,5 @@
 """HDF5 files of which parts are elsewhere or were never stored: refused, with the command that mends them."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Pictures stay in their file: what is read of them, what networks see, and that a fit is the same bit for bit."""
 
-from __future__ import annotations
-
 import pickle
 from pathlib import Path
 from typing import Any

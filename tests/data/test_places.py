@@ -1,7 +1,5 @@
 """Places where nothing can be written: a full disk, a folder that is read-only, a folder that another process is at."""
 
-from __future__ import annotations
-
 import os
 import resource
 import shutil

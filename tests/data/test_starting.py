@@ -1,7 +1,5 @@
 """The spec that ``init`` writes fits as it is, and leaves out what cannot be fitted."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

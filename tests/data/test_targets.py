@@ -1,7 +1,5 @@
 """Controls that are targets of an observation are known by their numbers."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Tasks of demonstrations: how they are named, listed, asked for, divided, pooled, and seen by networks."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The changes that docs/architecture.md promises, made in a copy of the library: a new file each, and its row."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

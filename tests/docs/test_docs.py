@@ -1,7 +1,5 @@
 """What the documentation shows is so, its examples, commands and keys; turns of phrase that make readers stumble."""
 
-from __future__ import annotations
-
 import doctest
 import re
 import tomllib

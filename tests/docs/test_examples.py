@@ -1,7 +1,5 @@
 """Every public function and class has an example that runs."""
 
-from __future__ import annotations
-
 import doctest
 import inspect
 import os

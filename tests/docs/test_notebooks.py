@@ -1,7 +1,5 @@
 """The notebooks: pairs that say the same, with outputs, without logic, and runnable from a fresh clone."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import re

@@ -1,7 +1,5 @@
 """Pictures encoded as vectors: against timm, scikit-learn and planted places, in a file and while acting."""
 
-from __future__ import annotations
-
 import sys
 
 import h5py

@@ -1,7 +1,5 @@
 """Measures of segments, against scikit-learn, counts of sets of steps, every matching in turn, and cases by hand."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections import Counter

@@ -1,7 +1,5 @@
 """Use of options and paired differences, against counts made by hand."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

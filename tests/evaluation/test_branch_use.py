@@ -1,7 +1,5 @@
 """What each branch of the networks is worth, and how strongly it acts."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

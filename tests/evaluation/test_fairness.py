@@ -1,7 +1,5 @@
 """Models that are compared have the same budget, one of them the same size, and who needed more of it is named."""
 
-from __future__ import annotations
-
 import json
 import re
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """What ``metrics.json`` says, against sums of the models' own log-likelihoods; and that it is JSON."""
 
-from __future__ import annotations
-
 import json
 import pickle
 

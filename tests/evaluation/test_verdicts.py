@@ -1,7 +1,5 @@
 """What is said of a run: by hand-made likelihoods, beside what they mean."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

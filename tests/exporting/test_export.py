@@ -1,7 +1,5 @@
 """Exported controllers act as the original does, with numpy alone and as ONNX."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """A damaged file of a run: one line with the file and what to do, from every command that reads it."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A run folder knows its demonstrations: what goes on from it, or shows it, refuses others in one line."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

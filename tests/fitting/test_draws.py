@@ -1,7 +1,5 @@
 """Draws of options against sums over every path, the posterior marginals, and exact distributions of boundaries."""
 
-from __future__ import annotations
-
 import itertools
 from collections import Counter
 from copy import deepcopy

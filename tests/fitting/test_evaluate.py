@@ -1,7 +1,5 @@
 """Rollouts of a run against its own table, episode by episode."""
 
-from __future__ import annotations
-
 import csv
 import json
 import math

@@ -1,7 +1,5 @@
 """Commands that were killed go on when they are called again, to the results of an undisturbed run."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import time

@@ -1,7 +1,5 @@
 """The library calls: the same fit as the command's, in memory or in a folder; what is read, and in which pieces."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections import Counter

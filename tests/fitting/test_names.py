@@ -1,7 +1,5 @@
 """Names of options: where they come from, where they are shown, and which are refused."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re

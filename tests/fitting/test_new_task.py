@@ -1,7 +1,5 @@
 """A new task from one demonstration and a library: the command, the strength that tasks choose, and what is refused."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

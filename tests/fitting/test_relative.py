@@ -1,7 +1,5 @@
 """Controls that are targets of an observation: options are of the difference, and everything else of the targets."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

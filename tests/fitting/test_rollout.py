@@ -1,7 +1,5 @@
 """Episodes as recorded against the environment's own arithmetic; intervals and tests against their closed forms."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The run folder: what is in it, that its numbers can be computed again from it, and that it comes back bit for bit."""
 
-from __future__ import annotations
-
 import csv
 import json
 import shutil

@@ -1,7 +1,5 @@
 """A fit repeated with other training seeds."""
 
-from __future__ import annotations
-
 import csv
 import json
 import shutil

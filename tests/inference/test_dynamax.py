@@ -1,7 +1,5 @@
 """One level against dynamax's smoother of hidden Markov models, on the same tables (`pip install -e '.[bench]'`)."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """The compiled engine against the log-space recursion in float64, on tables made to break it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import product
 

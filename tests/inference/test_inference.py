@@ -1,7 +1,5 @@
 """Both engines and the posteriors against sums over every latent path."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 from pathlib import Path

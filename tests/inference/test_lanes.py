@@ -1,7 +1,5 @@
 """Trajectories side by side: unequal lengths, blocks that are not full, logits, and any number of threads."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The eliminated AHMM inside Pyro models: priors and guides see what they see with the enumerated model."""
 
-from __future__ import annotations
-
 import numpy as np
 import pyro
 import pyro.distributions as dist

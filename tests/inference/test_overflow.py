@@ -1,7 +1,5 @@
 """Numbers that overflow: refused in a line that names demonstration, key and step, never a likelihood that is none."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Most likely and sampled paths against sums over every path, and against Pyro's own answers on the same model."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

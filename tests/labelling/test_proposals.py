@@ -1,7 +1,5 @@
 """Proposals given what a person has said: against every path, one after another, and against planted options."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The model run forward: its sites, what its samples may be and how often, and the tables it is made of."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

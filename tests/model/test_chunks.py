@@ -1,7 +1,5 @@
 """Trajectories in chunks of time: the same values and gradients as in one piece, in the memory of a chunk."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

@@ -3,8 +3,6 @@
 The truth is a second file without those columns: fitted to it, the same numbers have to come out.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

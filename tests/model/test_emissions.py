@@ -1,7 +1,5 @@
 """Kinds of control against scipy, torch and brute force, and the Pyro program with controls that are given."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Features, scaled controls and batches against numpy and scipy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

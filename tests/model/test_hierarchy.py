@@ -1,7 +1,5 @@
 """The networks' tables, and the gradient of the likelihood against the paper's own gradient equation."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

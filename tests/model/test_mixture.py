@@ -1,7 +1,5 @@
 """A memoryless mixture: the same hierarchy with options that end after every step."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

@@ -1,7 +1,5 @@
 """LSTMs, with and without windows, against torch's own with the same weights."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from stacked_networks import COPIES, SHAPE, answer, assert_close, make, make_inputs, random_inputs, separate

@@ -1,7 +1,5 @@
 """The stacked networks against one separate torch network for each option and step."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from stacked_networks import (

@@ -1,7 +1,5 @@
 """A σ that depends on the state: density, start, what it is worth, and that it is no confound of options."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """A network that the whole hierarchy reads, against networks of their own with the same weights."""
 
-from __future__ import annotations
-
 import torch
 from hierarchies import SHAPES, make_batch
 from planted import LINEAR, small_spec

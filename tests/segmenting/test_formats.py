@@ -1,7 +1,5 @@
 """Planted segments in every format, read back by readers of their own: the tool's where it is installed."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """What ``segment`` writes, against the fit's own segments: into HDF5, tables, LeRobot's subtasks, a page."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re

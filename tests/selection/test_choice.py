@@ -1,7 +1,5 @@
 """From scores to a choice, against sums by hand: means, paired differences, standard errors, and the two rules."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections import ChainMap

@@ -1,7 +1,5 @@
 """A whole selection: scores against fits by hand, nothing done twice, and the same result however it was run."""
 
-from __future__ import annotations
-
 import json
 from xml.etree import ElementTree
 

@@ -1,7 +1,5 @@
 """Segments of a length that is asked for: small fits find the power and the gates."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Pictures of a task's cameras: drawn where a spec observes them, and nowhere else."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import h5py

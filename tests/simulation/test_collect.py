@@ -1,7 +1,5 @@
 """Demonstrations kept by content: what is the same is reused, whatever differs is collected anew."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import json
 import math

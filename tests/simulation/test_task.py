@@ -1,7 +1,5 @@
 """How a task is found, and the toy task itself."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from importlib.metadata import EntryPoint
 

@@ -1,7 +1,5 @@
 """Every setting is used by a spec, a study, a notebook, or what ``init`` writes, and there are at most so many."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from inspect import get_annotations

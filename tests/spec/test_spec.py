@@ -1,7 +1,5 @@
 """The spec: what it accepts, overrides, and files that hold none."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from copy import deepcopy

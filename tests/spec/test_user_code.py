@@ -1,7 +1,5 @@
 """User code (``module:name``) is imported only where that is allowed, and nothing is imported before that is known."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The arena without Meta-World: episodes of an exported controller, what is recorded, and the phases of an expert."""
 
-from __future__ import annotations
-
 import functools
 
 import h5py

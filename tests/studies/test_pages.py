@@ -1,7 +1,5 @@
 """Generated tables of pages: numbers by hand, README's by pandas alone, and Markdown as GitHub shows it."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Policies that a user would pick instead: what they learn of planted demonstrations, and how they act."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

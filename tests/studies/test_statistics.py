@@ -1,7 +1,5 @@
 """Statistics of studies against scipy's tests, hand-computed values, and planted truths."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Studies: refused declarations, cells that are kept, killed, moved and shared, worlds, and simulated people."""
 
-from __future__ import annotations
-
 import functools
 import json
 import re

@@ -1,7 +1,5 @@
 """A study of toy cells: what is done, kept and written."""
 
-from __future__ import annotations
-
 import csv
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Demonstrations of a dot that moves through pictures, and where it is."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations

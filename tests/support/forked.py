@@ -1,7 +1,5 @@
 """Work in a forked child, within limits of time and memory: no import is paid again."""
 
-from __future__ import annotations
-
 import os
 import pickle
 import resource

@@ -1,7 +1,5 @@
 """Random hierarchies over three features and two control dimensions, and batches for them."""
 
-from __future__ import annotations
-
 import torch
 from planted import LINEAR, small_spec
 

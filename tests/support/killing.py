@@ -1,7 +1,5 @@
 """Commands that are killed, and fits that are interrupted."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

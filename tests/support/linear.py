@@ -1,7 +1,5 @@
 """Random hierarchies of linear networks, which EM trains, with every kind of control."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from hierarchies import make_batch, make_hierarchy

@@ -1,7 +1,5 @@
 """Metrics of a fit that was never made."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from ddco_pyro.metrics import Metrics

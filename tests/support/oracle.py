@@ -1,7 +1,5 @@
 """Independent truth for the inference: every latent path of a small AHMM, one after another, in plain Python."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 import math

@@ -1,7 +1,5 @@
 """Planted hierarchies: a truth whose options are known, demonstrations of it, and how well training finds it again."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from random_demonstrations import numbered

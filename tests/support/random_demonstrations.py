@@ -1,7 +1,5 @@
 """Small random demonstrations with a vector, a camera and labels, for tests of files; others by their number."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any
 

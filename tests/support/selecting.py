@@ -1,7 +1,5 @@
 """A small selection for tests: demonstrations of a point, a grid, and fits of folds without any training."""
 
-from __future__ import annotations
-
 from dataclasses import astuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Small stacked networks, inputs for them, and ordinary torch networks with the same weights."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from pydantic import TypeAdapter

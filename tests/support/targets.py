@@ -1,7 +1,5 @@
 """Planted demonstrations with velocities as controls, and the same with targets in their place."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from ddco_pyro.data.demonstrations import Demonstrations

@@ -1,7 +1,5 @@
 """A small task for tests: a point in the plane has to pass by one place and then reach another."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Encoders as users write them: good ones, and what they get wrong."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

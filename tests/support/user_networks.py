@@ -1,7 +1,5 @@
 """Networks as a user might write them, right and wrong; a spec names them as ``user_networks:Own``."""
 
-from __future__ import annotations
-
 import torch
 from torch import nn
 

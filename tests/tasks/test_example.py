@@ -1,7 +1,5 @@
 """The worked example: a task, a network and labels of one's own in one spec."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import torch

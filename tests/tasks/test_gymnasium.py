@@ -1,7 +1,5 @@
 """The tasks as Gymnasium environments, by shimmy, as docs/tasks.md says."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The pushing task against independent truths: MuJoCo's poses, Coulomb friction, statics, brute-force collisions."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

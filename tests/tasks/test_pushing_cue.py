@@ -1,7 +1,5 @@
 """Pushing whose goal is shown once: what is seen after the cue does not tell the goal, and outcomes are the box's."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from ddco_tasks.pushing import cue, environment

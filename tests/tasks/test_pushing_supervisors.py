@@ -1,7 +1,5 @@
 """The pushing task's supervisors: goals, intentions, and plans that are functions of the state."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Every spec of a task is checked against the task; specs of pushing and bin picking are fitted, and act in it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Expectation-maximisation: closed forms, stationary points of the penalised likelihood, steps that never lower it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Clusters: planted ones are found, and hardly any others scatter less."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

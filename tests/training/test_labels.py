@@ -1,7 +1,5 @@
 """Labels of a few demonstrations say which options are active, and name them."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

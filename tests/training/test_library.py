@@ -1,7 +1,5 @@
 """The prior that a library is: closed forms, EM against the Pyro program, and a new task from one demonstration."""
 
-from __future__ import annotations
-
 import copy
 from functools import partial
 

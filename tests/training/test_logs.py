@@ -1,7 +1,5 @@
 """Logs of training, read back by the programs that they are for."""
 
-from __future__ import annotations
-
 import csv
 import sys
 from pathlib import Path

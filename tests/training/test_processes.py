@@ -1,7 +1,5 @@
 """Several processes that share each gradient step: the same bits for any number, after a kill too, and no hang."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

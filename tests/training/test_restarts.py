@@ -1,7 +1,5 @@
 """Restarts: every way to begin is tried, the likeliest in training is kept, and no hierarchy is below its mixture."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

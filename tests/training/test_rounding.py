@@ -3,8 +3,6 @@
 What rests is planted: a simulator's quaternion of an object that never turns, whose components are 1e-6 apart.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

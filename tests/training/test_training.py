@@ -1,7 +1,5 @@
 """Training: stages, resuming bit for bit, refusing what is not finite, and planted hierarchies recovered."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Levels above the lowest start from what follows what: EM against sums over every path, planted ones found."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import replace

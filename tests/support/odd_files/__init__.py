@@ -1,7 +1,5 @@
 """Odd and hostile files, a table in each module: how each is made, and what the commands say of it."""
 
-from __future__ import annotations
-
 import hashlib
 import importlib
 import pkgutil

@@ -1,7 +1,5 @@
 """HDF5 files of which parts are elsewhere, missing, or only claimed, and specs that are no small files."""
 
-from __future__ import annotations
-
 import os
 import zlib
 from collections.abc import Callable

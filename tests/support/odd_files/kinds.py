@@ -1,7 +1,5 @@
 """Files that are in order as HDF5 and odd in what they hold: masks, labels, layouts of pictures, kinds of controls."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Files and folders of other libraries, in their true layouts: some are read, others have to be converted."""
 
-from __future__ import annotations
-
 import json
 from functools import partial
 from pathlib import Path

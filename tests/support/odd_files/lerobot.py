@@ -1,7 +1,5 @@
 """LeRobot datasets whose metadata lie: paths and links that lead out, and episodes that are not whole."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable
