@@ -42,8 +42,8 @@ class Controller:
     """A policy from a fitted hierarchy: call :meth:`reset`, then :meth:`act` with each observation.
 
     At each step active options may terminate, new options are selected, and the lowest option emits the control.
-    After a step ``choices`` holds the active options, and ``terminations`` their ψ in the last state (1 for choice 0),
-    lowest level first. :meth:`reset_all` and :meth:`act_all` act in several episodes at once, with equal results.
+    After a step ``choices`` holds the active option of each level, 1 to k_d or 0 for control by the caller, and
+    ``terminations`` their ψ in the last state (1 for choice 0), lowest level first.
 
     >>> controller = ddco_pyro.Controller(fit.hierarchy, options="most_likely")  # or fit.controller()
     >>> controller.reset(seed=0)
@@ -75,27 +75,17 @@ class Controller:
         self.reset(seed)
 
     def reset(self, seed: int = 0) -> None:
-        """Begin an episode. Equal seeds and observations give equal controls."""
-        self.reset_all([seed])
+        """Begin an episode. Equal seeds and observations give equal controls.
 
-    def reset_all(self, seeds: Sequence[int]) -> None:
-        """Begin N episodes, each with its own seed.
-
-        :raises BadInput: a seed is not a whole number from 0 on.
+        :raises BadInput: the seed is not a whole number from 0 on.
         """
-        for seed in seeds:
-            check_whole("seed", seed)
-        self.seeds, self.time = list(seeds), 0
+        check_whole("seed", seed)
+        self.seed, self.time = seed, 0
+        self.choices: tuple[int, ...] = ()
+        self.terminations: tuple[float, ...] = ()
         self._window = Window(self.hierarchy.encoder)
-        self._choices: tuple[Tensor, ...] | None = None
         self._log_marginal: Tensor | None = None
         self._states: States | None = None
-        self.all_terminations = np.zeros((len(seeds), 0))
-
-    @property
-    def choices(self) -> tuple[int, ...]:
-        """The active choice of each level, lowest first: 1 to k_d, or 0 for control by the caller."""
-        return tuple(self.all_choices[0].tolist())
 
     @property
     def active(self) -> dict[str, str]:
@@ -103,86 +93,61 @@ class Controller:
         levels = zip(self.names.items(), self.choices, strict=False)
         return {level: option_name(choice, own) for (level, own), choice in levels}
 
-    @property
-    def terminations(self) -> tuple[float, ...]:
-        """ψ of each active choice, lowest level first."""
-        return tuple(self.all_terminations[0].tolist())
-
-    @property
-    def all_choices(self) -> np.ndarray:
-        """The active choices of every episode, [N, D], lowest level first."""
-        return _columns(self._choices or (), len(self.seeds)).astype(int)
-
     def act(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
         """The control [A], in the control's own units.
 
         :raises ObservationError: an observation is missing, not finite, or of another shape than in training.
         """
-        control: np.ndarray = self.act_all([observation])[0]
-        return control
-
-    def act_all(self, observations: Sequence[Mapping[str, np.ndarray]]) -> np.ndarray:
-        """The controls [N, A] of all episodes.
-
-        :raises ObservationError: an observation is missing, not finite, or of another shape than in training.
-        """
-        if len(observations) != len(self.seeds):
-            raise BadInput(
-                f"there are {len(self.seeds)} episodes and {len(observations)} observations; give one for each"
-            )
-        generators = [np.random.default_rng([seed, self.time]) for seed in self.seeds]
+        generator = np.random.default_rng([self.seed, self.time])
         with torch.no_grad():
-            outputs, self._states = self.hierarchy.advance(self._window.inputs(observations), self._states)
-            now = complete(outputs.tables(), torch.ones(len(self.seeds), dtype=torch.int64)).steps()[0]
-            self._choices = self._chosen(now, generators)
-            steps = (None if emission is None else emission.steps()[0] for emission in outputs.emissions)
-            acting = Acting(tuple(steps), self._choices)
+            outputs, self._states = self.hierarchy.advance(self._window.inputs(observation), self._states)
+            (now,) = complete(outputs.tables(), torch.tensor([1])).steps()
+            chosen = self._chosen(now, generator)
+            acting = Acting(
+                tuple(None if emission is None else emission.steps()[0] for emission in outputs.emissions), chosen
+            )
             if self.control == "mean":
                 control = acting.mode
             else:
-                noise = [generator.standard_normal(acting.noise) for generator in generators]
-                control = acting.draw(torch.from_numpy(np.stack(noise)))
-        rows = torch.arange(len(self.seeds))
-        ended = [table[rows, choice, 1].exp() for table, choice in zip(now.termination, self._choices, strict=True)]
-        self.all_terminations = _columns(ended, len(self.seeds))
+                control = acting.draw(torch.from_numpy(generator.standard_normal(acting.noise))[None])
+        self.choices = tuple(int(choice) for choice in chosen)
+        pairs = zip(now.termination, self.choices, strict=True)
+        self.terminations = tuple(float(table[0, choice, 1].exp()) for table, choice in pairs)
         self.time += 1
-        controls, key = self.hierarchy.scaling.emitted(control).numpy(), self.hierarchy.scaling.relative_to
-        return controls if key is None else controls + np.stack([seen[key] for seen in self._window.last])
+        emitted: np.ndarray = self.hierarchy.scaling.emitted(control).numpy()[0]
+        key = self.hierarchy.scaling.relative_to
+        return emitted if key is None else emitted + self._window.last[key]
 
-    def _chosen(self, now: Step, generators: Sequence[np.random.Generator]) -> tuple[Tensor, ...]:
+    def _chosen(self, now: Step, generator: np.random.Generator) -> tuple[Tensor, ...]:
+        """The choice of each level, [1], lowest first."""
         if self.options == "marginal":
             self._log_marginal = arrive(self._log_marginal, now)
             sizes = self._log_marginal.shape[1:]  # C_D, ..., C_1
-            if not sizes:
-                return ()
-            return tuple(reversed(torch.unravel_index(self._log_marginal.flatten(1).argmax(-1), sizes)))
-        with Chosen(None if self.options == "most_likely" else generators):
-            return choose(self.time, now, self._choices)
-
-
-def _columns(levels: Sequence[Tensor], number: int) -> np.ndarray:
-    """Values [N] of each level as [N, D]."""
-    return np.stack([level.numpy() for level in levels], axis=1) if levels else np.zeros((number, 0))
+            return (
+                tuple(reversed(torch.unravel_index(self._log_marginal.flatten(1).argmax(-1), sizes))) if sizes else ()
+            )
+        before = tuple(torch.tensor([choice]) for choice in self.choices)
+        with Chosen(None if self.options == "most_likely" else generator):
+            return choose(self.time, now, before or None)
 
 
 class Chosen(Messenger):
     """Make every sampled choice as exported controllers do.
 
-    :param generators: numpy's, one for each episode; None for the most likely values.
+    :param generator: numpy's; None for the most likely values.
     """
 
-    def __init__(self, generators: Sequence[np.random.Generator] | None) -> None:
+    def __init__(self, generator: np.random.Generator | None) -> None:
         super().__init__()
-        self.generators = generators
+        self.generator = generator
 
     def _pyro_sample(self, message: dict[str, Any]) -> None:
         distribution: Tabulated = message["fn"]
-        if self.generators is None:
+        if self.generator is None:
             message["value"] = distribution.logits.argmax(-1)
         else:
             total = distribution.logits.exp().cumsum(-1)
-            uniform = torch.tensor([[generator.random()] for generator in self.generators], dtype=total.dtype)
-            message["value"] = (total <= uniform * total[..., -1:]).sum(-1)
+            message["value"] = (total <= self.generator.random() * total[..., -1:]).sum(-1)
         message["done"] = True
 
 
@@ -194,33 +159,25 @@ class ObservationError(BadInput):
 
 
 class Window:
-    """A window over the last observations, for what the encoder makes of several.
+    """The last two observations, for what the encoder makes of both.
 
-    ``time`` counts the observations, of which ``last`` has the latest of each episode.
+    ``time`` counts the observations, of which ``last`` is the latest.
     """
 
     def __init__(self, encoder: ObservationEncoder) -> None:
         self.encoder, self.time = encoder, 0
-        self.last: list[dict[str, np.ndarray]] = []
+        self.last: dict[str, np.ndarray] = {}
 
-    def inputs(self, observations: Sequence[Mapping[str, np.ndarray]]) -> Inputs:
-        """The networks' inputs for an observation of each of N episodes, T = 1.
+    def inputs(self, observation: Mapping[str, np.ndarray]) -> Inputs:
+        """The networks' inputs for an observation, N = T = 1.
 
         :raises ObservationError: an observation is missing, has another shape than in training, is not finite, or too
             large for networks.
         """
-        now = [
-            {key: self._checked(observation, key, shape) for key, shape in self.encoder.shapes.items()}
-            for observation in observations
-        ]
-        if not now:
-            raise ObservationError("there are no observations; give one for each episode")
-        last = [self.last, now] if self.last else [now]  # differences are from the step before
-        episodes = zip(*last, strict=True)
-        recent = self.encoder.inputs(
-            ({key: np.stack([seen[key] for seen in episode]) for key in self.encoder.shapes} for episode in episodes),
-            np.full(len(last), self.time),
-        )
+        now = {key: self._checked(observation, key, shape) for key, shape in self.encoder.shapes.items()}
+        seen = [self.last, now] if self.time else [now]  # differences are from the step before
+        both = {key: np.stack([one[key] for one in seen]) for key in now}
+        recent = self.encoder.inputs([both], np.full(len(seen), self.time))
         latest = recent.part(slice(None), slice(-1, None)).loaded()
         inputs = Inputs(latest.vectors, latest.images, torch.tensor([self.time]))
         for key, vector in latest.vectors.items():

@@ -69,7 +69,7 @@ class Monitor:
             raise ObservationError("no control comes before the first observation: leave it out")
         scaled = None if self._outputs is None else self._scaled(control)
         with torch.no_grad():
-            inputs = self._window.inputs([observation])
+            inputs = self._window.inputs(observation)
             if self._outputs is not None:
                 assert scaled is not None
                 for each in {self._filter, self._alone}:
@@ -101,7 +101,7 @@ class Monitor:
             )
         row = numbers("the control", control, (scaling.size,))[None]
         if scaling.relative_to is not None:
-            row = row - self._window.last[0][scaling.relative_to]
+            row = row - self._window.last[scaling.relative_to]
         if problem := scaling.impossible("the control", row):
             raise ObservationError(f"{problem}; is it in the demonstrations' units?")
         scaled = scaling.scaled(row)

@@ -118,7 +118,6 @@ def test_what_cannot_be_acted_on_is_refused_in_a_line_and_changes_nothing(fault:
         (lambda fit: fit.controller(-1), "seed=-1: has to be a whole number from 0 on"),
         (lambda fit: ddco_pyro.Controller(fit), "a Fit in place of networks: give fit.hierarchy"),
         (lambda fit: ddco_pyro.Controller(fit.hierarchy, "average"), "control='average': has to be one of mean,"),
-        (lambda fit: fit.controller().act_all([SEEN, SEEN]), "there are 1 episodes and 2 observations"),
         (lambda fit: fit.draws(two_skills(), 0), "draws=0: has to be a whole number from 1 on"),
         (lambda fit: fit.draws(two_skills(), 2).boundaries("skill", 0, np.ones(8)), "there is no level 'skill'"),
         (lambda fit: fit.monitor().step(SEEN, np.zeros(2)), "no control comes before the first observation"),

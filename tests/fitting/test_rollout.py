@@ -5,16 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 import toy_task
 from scipy import stats
 from toy_task import task
 
-from ddco_pyro.acting.controller import Controller
 from ddco_pyro.metrics import Mean, Rate
-from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.simulation.episodes import run_episode, run_episodes, summarize
-from ddco_pyro.spec import RolloutSpec, parse_spec
 from ddco_pyro.statistics import paired_difference, rate
 
 
@@ -168,76 +164,3 @@ def test_a_measure_that_never_applies_is_unknown_and_of_its_own_kind():
     found = summarize(declared, [{"inserted": math.nan, "error": math.nan}] * 3)
     assert found["inserted"] == Rate(successes=0, trials=0, rate=None, interval=None)
     assert found["error"] == Mean(mean=None, std=None, trials=0, interval=None)
-
-
-# --- episodes played together -----------------------------------------------------------------------------------------
-
-
-SEEDS = (3, 4, 5, 6)
-MARGINAL = RolloutSpec(control="mean", options="marginal")
-SAMPLED = RolloutSpec(control="sample", options="sample")
-OBSERVATIONS = [{"key": "offsets", "differences": True}, "visited"]
-
-
-def make(model, weights=0, gain=1.0):
-    """A model of the toy task whose networks see differences, its weights drawn from this seed and that much larger."""
-    spec = parse_spec({"demonstrations": {"path": "unused.hdf5"}, "observations": OBSERVATIONS, **model})
-    torch.manual_seed(weights)
-    hierarchy = Hierarchy(spec, {"offsets": (4,), "visited": (1,)}, 2, steps=toy_task.STEPS)
-    with torch.no_grad():
-        for parameter in hierarchy.parameters():
-            parameter.mul_(gain)
-    return hierarchy
-
-
-def two_levels(emits):
-    """Two option levels whose callers all emit ``emits``."""
-    levels = [{"name": "low", "count": 3}, {"name": "high", "count": 2, "policy": {"emits": emits}}]
-    return {"hierarchy": {"levels": levels, "meta_policy": {"emits": emits}}}
-
-
-MODELS = {
-    "flat": {"baseline": "flat"},
-    "options": two_levels(["options"]),
-    "hybrid": two_levels(["options", "control"]),
-    "lstm": {"observations": [*OBSERVATIONS, "step"], "baseline": {"kind": "flat", "policy": {"network": "lstm"}}},
-    "windows": {"baseline": {"kind": "flat", "policy": {"network": "lstm", "horizon": 2}}},
-}
-
-
-def at(record, step):
-    """What is observed at a step, or at the last one."""
-    return {key: values[min(step, len(record) - 1)] for key, values in record.observations.items()}
-
-
-@pytest.mark.parametrize("spec", [MARGINAL, SAMPLED], ids=["marginal", "sampled"])
-@pytest.mark.parametrize(
-    ("name", "weights", "actors"),
-    [
-        *((name, (0,), {0}) for name in ("flat", "lstm", "windows")),
-        ("options", (4, 6, 8), {0}),
-        ("hybrid", (0, 2, 10), {0, 1, 2}),
-    ],
-)
-def test_together_as_alone(name, weights, actors, spec):
-    """With episodes of different lengths, and models in which options change within an episode and, in the hybrid, an
-    option of each level and the meta-policy act.
-    """
-    ragged, acted, changes = replace(task, load=lambda seed: toy_task.Point(seed, steps=seed)), set(), 0
-    for seed in weights:
-        hierarchy = make(MODELS[name], seed, gain=3.0)
-        alone = [run_episode(ragged, Controller(hierarchy, spec.control, spec.options), seed) for seed in SEEDS]
-        controller = Controller(hierarchy, spec.control, spec.options)
-        controller.reset_all(SEEDS)
-        for step in range(max(len(one.record) for one in alone)):
-            controls = controller.act_all([at(one.record, step) for one in alone])
-            for own, control, choices in zip(alone, controls, controller.all_choices, strict=True):
-                if step < len(own.record):
-                    np.testing.assert_array_equal(choices, own.choices[step])
-                    np.testing.assert_allclose(control, own.record.actions[step], atol=1e-5)
-        for own in alone:
-            assert len(own.choices) == len(own.record)
-            acted |= {next((d for d, choice in enumerate(row) if choice), len(row)) for row in own.choices.tolist()}
-            changes += (np.diff(own.choices, axis=0) != 0).any(1).sum()
-    assert acted == actors
-    assert changes > 1 or name in ("flat", "lstm", "windows")
