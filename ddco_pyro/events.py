@@ -123,42 +123,33 @@ def ignore(event: Event) -> None:
 # --- logs -------------------------------------------------------------------------------------------------------------
 
 
-class TensorBoard:
-    """An event file in ``tensorboard`` of the run folder."""
+Add = Callable[[Mapping[str, float], int], None]
+"""Gives numbers of a step to a program."""
 
-    def __init__(self, folder: Path, spec: Mapping[str, Any]) -> None:
-        from torch.utils.tensorboard import SummaryWriter
 
-        self._writer: Any = SummaryWriter(str(folder / "tensorboard"))
-        self._writer.add_text("spec", f"```\n{spec}\n```")
+def tensorboard(folder: Path, spec: Mapping[str, Any]) -> tuple[Add, Callable[[], None]]:
+    """An event file in ``tensorboard`` of the run folder: what adds numbers, and what closes it."""
+    from torch.utils.tensorboard import SummaryWriter
 
-    def add(self, values: Mapping[str, float], step: int) -> None:
+    writer: Any = SummaryWriter(str(folder / "tensorboard"))
+    writer.add_text("spec", f"```\n{spec}\n```")
+
+    def add(values: Mapping[str, float], step: int) -> None:
         for name, value in values.items():
-            self._writer.add_scalar(name, value, step)
+            writer.add_scalar(name, value, step)
 
-    def close(self) -> None:
-        self._writer.close()
+    return add, writer.close
 
 
-class WandbOffline:
+def wandb_offline(folder: Path, spec: Mapping[str, Any]) -> tuple[Add, Callable[[], None]]:
     """A run in ``wandb`` of the run folder, which ``wandb sync`` uploads; nothing is sent before."""
+    import wandb
 
-    def __init__(self, folder: Path, spec: Mapping[str, Any]) -> None:
-        import wandb
-
-        self._run: Any = wandb.init(project="ddco-pyro", name=folder.name, dir=str(folder), mode="offline", config=spec)
-
-    def add(self, values: Mapping[str, float], step: int) -> None:
-        self._run.log({**values, "epoch": step})
-
-    def close(self) -> None:
-        self._run.finish()
+    run: Any = wandb.init(project="ddco-pyro", name=folder.name, dir=str(folder), mode="offline", config=dict(spec))
+    return lambda values, step: run.log({**values, "epoch": step}), run.finish
 
 
-LOGS: dict[str, tuple[type[TensorBoard | WandbOffline], str]] = {
-    "tensorboard": (TensorBoard, "tensorboard"),
-    "wandb-offline": (WandbOffline, "wandb"),
-}
+LOGS = {"tensorboard": (tensorboard, "tensorboard"), "wandb-offline": (wandb_offline, "wandb")}
 """The logs by name, each with the package that it needs, which is also its extra."""
 
 
@@ -184,7 +175,7 @@ class Log:
         if find_spec(package) is None:
             raise BadInput(f"--log {name}: needs {package}; install it with: pip install 'ddco-pyro[{package}]'")
         self._name, self._of, self._say = name, (Path(folder), spec), say
-        self._program: TensorBoard | WandbOffline | None = None
+        self._program: tuple[Add, Callable[[], None]] | None = None
         self._model, self._failed = "", False
 
     def __call__(self, event: Event) -> None:
@@ -199,22 +190,22 @@ class Log:
     def add(self, values: Mapping[str, float], step: int = 0) -> None:
         """Log the finite ones of these numbers."""
         finite = {name: value for name, value in values.items() if math.isfinite(value)}
-        self._tried(lambda program: program.add(finite, step))
+        self._tried(lambda add, _: add(finite, step))
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:
         if self._program is not None:
-            self._tried(lambda program: program.close())
+            self._tried(lambda _, close: close())
 
-    def _tried(self, call: Callable[[TensorBoard | WandbOffline], None]) -> None:
+    def _tried(self, call: Callable[[Add, Callable[[], None]], None]) -> None:
         """Call the program, which is made first; after an error it is left alone."""
         if self._failed:
             return
         try:
             self._program = self._program or self._make(*self._of)
-            call(self._program)
+            call(*self._program)
         except Exception as error:  # whatever the other program raises
             self._failed = True
             why = " ".join(str(error).split()) or type(error).__name__

@@ -17,7 +17,7 @@ from ddco_pyro.data.controls import ControlPart, all_gaussian
 from ddco_pyro.model.batch import STEPS_AT_ONCE, Batch
 from ddco_pyro.model.controls import ControlScaling, ControlStd
 from ddco_pyro.model.encoder import ObservationEncoder, Shapes
-from ddco_pyro.model.networks import Inputs, InputShape, Network, State, States, build, build_trunk, named
+from ddco_pyro.model.networks import Inputs, InputShape, Network, State, States, build, named
 from ddco_pyro.model.networks.perceptrons import linear_maps
 from ddco_pyro.model.networks.probe import training_bytes
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
@@ -149,7 +149,7 @@ class Hierarchy(nn.Module):
         self.trunk: Network | None = None
         if spec.hierarchy is not None and spec.hierarchy.trunk is not None:
             with named("hierarchy.trunk"):
-                self.trunk = build_trunk(spec.hierarchy.trunk, self.input_shape, 1)
+                self.trunk = build(spec.hierarchy.trunk, self.input_shape, None, 1)
         shape = self.read_shape
         levels, below = [], 0
         for number, level in enumerate(spec.hierarchy.levels if spec.hierarchy else ()):

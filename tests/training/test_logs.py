@@ -56,7 +56,7 @@ class Kept:
 
     def __call__(self, folder, spec):
         self.got.append((folder, spec))
-        return self
+        return self.add, self.close
 
     def add(self, values, step):
         if step == self.fails:

@@ -1,4 +1,4 @@
-"""The networks that a spec can name: :func:`build` makes one that gives outputs, :func:`build_trunk` one to be read."""
+"""The networks that a spec can name, made by :func:`build`."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ __all__ = [
     "States",
     "UserNetwork",
     "build",
-    "build_trunk",
     "named",
 ]
 
@@ -42,51 +41,35 @@ CLASSES: dict[str, type[Network]] = {
 are those of :mod:`ddco_pyro.spec.networks`."""
 
 
-def build(spec: NetworkSpec, shape: InputShape, outputs: int, copies: int) -> Network:
-    """``copies`` independent networks that give ``outputs`` numbers.
+def build(spec: NetworkSpec, shape: InputShape, outputs: int | None, copies: int) -> Network:
+    """``copies`` independent networks that give ``outputs`` numbers; None for a trunk, which others read.
 
-    :param shape: of the observations.
-    :raises ShapeError: as :func:`build_trunk`.
-    """
-    if isinstance(spec, UserNetworkSpec):
-        return _of_user(spec, shape, outputs, copies)
-    return build_trunk(spec, shape, copies).add_head(outputs)
-
-
-def build_trunk(spec: NetworkSpec, shape: InputShape, copies: int) -> Network:
-    """``copies`` independent networks for others to read.
+    A network with ``inputs`` is given no other observations.
 
     :param shape: of the observations.
     :raises ShapeError: the network cannot read these observations, cannot be imported or made, or is refused by
         :func:`ddco_pyro.model.networks.probe.try_network`.
     """
+    settings, seen = dict(spec.settings), shape.select(spec.inputs) if spec.inputs else shape
     if isinstance(spec, UserNetworkSpec):
-        return _of_user(spec, shape, None, copies)
-    settings, seen = spec.settings, shape.select(spec.inputs) if spec.inputs else shape
-    if settings.get("over"):
-        with named("over"):
-            settings["over"] = build_trunk(settings["over"], seen, copies)
-    if "of" in settings:
-        settings["of"] = {name: _branch(name, branch, seen, copies) for name, branch in settings["of"].items()}
-    return _selecting(spec, CLASSES[spec.network](seen, copies, **settings))
-
-
-def _of_user(spec: UserNetworkSpec, shape: InputShape, outputs: int | None, copies: int) -> Network:
-    seen = shape.select(spec.inputs) if spec.inputs else shape
-    return _selecting(spec, UserNetwork.made(spec.network, seen, outputs, copies, spec.options))
+        network: Network = UserNetwork.made(spec.network, seen, outputs, copies, settings)
+    else:
+        if settings.get("over"):
+            with named("over"):
+                settings["over"] = build(settings["over"], seen, None, copies)
+        if "of" in settings:
+            settings["of"] = {name: _branch(name, branch, seen, copies) for name, branch in settings["of"].items()}
+        network = CLASSES[spec.network](seen, copies, **settings)
+        network = network if outputs is None else network.add_head(outputs)
+    if spec.inputs:
+        network.register_forward_pre_hook(partial(_select, spec.inputs))
+    return network
 
 
 def _branch(name: str, spec: NetworkSpec, shape: InputShape, copies: int) -> Network:
     """A branch reads the observation that it is named after, or those in its ``inputs``."""
     with named(f"of.{name}"):
-        return build_trunk(spec.model_copy(update={"inputs": spec.inputs or (name,)}), shape, copies)
-
-
-def _selecting(spec: NetworkSpec, network: Network) -> Network:
-    """The network, which is given no other observations than those in its ``inputs``."""
-    if spec.inputs:
-        network.register_forward_pre_hook(partial(_select, spec.inputs))
-    return network
+        return build(spec.model_copy(update={"inputs": spec.inputs or (name,)}), shape, None, copies)
 
 
 def _select(names: Sequence[str], network: Network, arguments: tuple[Any, ...]) -> tuple[Any, ...]:
