@@ -23,38 +23,3 @@ from ddco_pyro.spec.settings import (
 from ddco_pyro.spec.spec import Spec, parse_spec, with_overrides
 from ddco_pyro.spec.training import OptimizerSpec, RidgeSpec, Start, TrainingSpec
 from ddco_pyro.spec.yaml import dump_spec, load_spec, spec_schema, user_code
-
-__all__ = [
-    "DISCRETE",
-    "EACH",
-    "STEP",
-    "TASK",
-    "Activation",
-    "BaselineSpec",
-    "ControlSpec",
-    "ConvolutionLayer",
-    "DemonstrationsSpec",
-    "HierarchySpec",
-    "Kind",
-    "LearnedStd",
-    "LevelSpec",
-    "NetworkSpec",
-    "ObservationSpec",
-    "OptimizerSpec",
-    "OptionExecution",
-    "PathSpec",
-    "PolicySpec",
-    "Pool",
-    "RidgeSpec",
-    "RolloutSpec",
-    "Spec",
-    "SpecError",
-    "Start",
-    "TrainingSpec",
-    "dump_spec",
-    "load_spec",
-    "parse_spec",
-    "spec_schema",
-    "user_code",
-    "with_overrides",
-]

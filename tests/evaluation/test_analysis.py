@@ -16,7 +16,7 @@ from ddco_pyro.fitting.evaluation import decompose
 from ddco_pyro.inference import Posterior, posterior
 from ddco_pyro.metrics import Alike, Segments, Use
 from ddco_pyro.model.batch import Batch, encode
-from ddco_pyro.model.emissions import Gaussian
+from ddco_pyro.model.emissions.gaussian import Gaussian
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
 from ddco_pyro.spec import TrainingSpec

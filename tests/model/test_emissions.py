@@ -13,8 +13,12 @@ from scipy import special, stats
 from ddco_pyro.inference import log_likelihood
 from ddco_pyro.inference.engines import compare_engines
 from ddco_pyro.model.ahmm import ahmm
-from ddco_pyro.model.emissions import Binary, Categorical, Clipped, Gaussian, Hurdle, Product
-from ddco_pyro.model.emissions.clipped import LogNormal
+from ddco_pyro.model.emissions import Product
+from ddco_pyro.model.emissions.binary import Binary
+from ddco_pyro.model.emissions.categorical import Categorical
+from ddco_pyro.model.emissions.clipped import Clipped, LogNormal
+from ddco_pyro.model.emissions.gaussian import Gaussian
+from ddco_pyro.model.emissions.hurdle import Hurdle
 from ddco_pyro.model.emissions.student import Student, student_control
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
 from ddco_pyro.model.tables import complete

@@ -12,11 +12,6 @@ from typing import get_args
 import numpy as np
 
 from ddco_pyro.model.emissions.base import Emission, Information, Part, Steps
-from ddco_pyro.model.emissions.binary import Binary
-from ddco_pyro.model.emissions.categorical import Categorical
-from ddco_pyro.model.emissions.clipped import Clipped
-from ddco_pyro.model.emissions.gaussian import Gaussian
-from ddco_pyro.model.emissions.hurdle import Hurdle
 from ddco_pyro.model.emissions.product import Product
 from ddco_pyro.spec import Kind
 
@@ -29,8 +24,3 @@ CONTROLS: dict[str, Callable[[Part, np.ndarray, np.ndarray, np.ndarray | None], 
     kind: emission.control for kind, emission in KINDS.items()
 }
 """The control of a caller by numpy alone, as :attr:`Emission.control` has it."""
-
-__all__ = [
-    "CONTROLS", "KINDS", "Binary", "Categorical", "Clipped", "Emission", "Gaussian", "Hurdle", "Information",
-    "Product", "Steps",
-]  # fmt: skip

@@ -15,19 +15,6 @@ from ddco_pyro.model.networks.user import UserNetwork
 from ddco_pyro.spec import NetworkSpec
 from ddco_pyro.spec.networks import UserNetworkSpec
 
-__all__ = [
-    "CLASSES",
-    "InputShape",
-    "Inputs",
-    "Network",
-    "ShapeError",
-    "State",
-    "States",
-    "UserNetwork",
-    "build",
-    "named",
-]
-
 CLASSES: dict[str, type[Network]] = {
     "linear": Mlp,
     "constant": Constant,
