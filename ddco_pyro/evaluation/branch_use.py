@@ -64,10 +64,8 @@ def _sums(piece: Inferred, level: int, branch: nn.Module) -> Tensor:
     A weight is the posterior probability that the caller is active.
     """
     hierarchy, inputs, lengths = piece.hierarchy, piece.batch.inputs, piece.batch.lengths
-    if level < hierarchy.depth:
-        weight = piece.posterior.u[level][..., 1:]
-    else:
-        weight = (torch.arange(inputs.batch[1]) < lengths[:, None]).double().unsqueeze(-1)
+    inner = level < hierarchy.depth
+    weight = piece.posterior.u[level][..., 1:] if inner else piece.batch.alive.double().unsqueeze(-1)
     seen: list[Tensor] = []  # [N, T, K, F] for each chunk of time
     with torch.no_grad():
         with branch.register_forward_hook(lambda _, __, output: seen.append(output[0].cpu())):

@@ -47,6 +47,11 @@ class Batch:
         return int(self.lengths.sum())
 
     @property
+    def alive(self) -> Tensor:
+        """Whether a step is within its demonstration, [N, T]."""
+        return self.inputs.time < self.lengths[:, None]
+
+    @property
     def by_length(self) -> Tensor:
         """The demonstrations, the shortest first: pieces of them in this order have little padding, [N]."""
         return self.lengths.argsort(stable=True)

@@ -123,14 +123,9 @@ class Recogniser(nn.Module):
 def observed(inputs: Inputs) -> Tensor:
     """All vectors, and the block means of all pictures, [N, T, F] float64."""
     parts = inputs.chunks(FRAMES_AT_ONCE // inputs.batch[0]) if inputs.images else [inputs]
-    return torch.cat([_observed(part.loaded()) for part in parts], dim=1)
-
-
-def _observed(loaded: Inputs) -> Tensor:
-    means = [torch.stack([_block_means(frames) for frames in image]) for image in loaded.images.values()]
-    return torch.cat([loaded.vector, *means], dim=-1).double()
-
-
-def _block_means(frames: Tensor) -> Tensor:
-    """Pictures uint8 [T, H, W, C] averaged over POOLED × POOLED blocks, in [0, 1], [T, C · POOLED²]."""
-    return adaptive_avg_pool2d(frames.permute(0, 3, 1, 2).float() / 255, POOLED).flatten(1)
+    each = []
+    for part in (part.loaded() for part in parts):
+        frames = (image.flatten(0, 1).permute(0, 3, 1, 2).float() / 255 for image in part.images.values())
+        means = (adaptive_avg_pool2d(image, POOLED).flatten(1).unflatten(0, part.batch) for image in frames)
+        each.append(torch.cat([part.vector, *means], dim=-1).double())
+    return torch.cat(each, dim=1)

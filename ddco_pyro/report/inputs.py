@@ -41,8 +41,7 @@ def deciding(fit: Fit, demos: Demonstrations) -> dict[str, dict[str, dict[int, s
     count = max(1, min(GRADIENT_DEMONSTRATIONS, GRADIENT_STEPS // max(demos.lengths), len(demos)))
     few = demos.select([demos.names[row] for row in np.linspace(0, len(demos) - 1, count).astype(int)])
     for piece in fit.infer(few):
-        seen, time = piece.batch.inputs.vectors, piece.batch.inputs.time
-        alive = time < piece.batch.lengths[:, None].to(time.device)
+        seen, time, alive = piece.batch.inputs.vectors, piece.batch.inputs.time, piece.batch.alive
         spread = {key: array[alive].std(0) for key, array in seen.items()}
         vectors = {key: array.detach().clone().requires_grad_() for key, array in seen.items()}
         with torch.enable_grad():

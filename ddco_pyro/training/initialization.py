@@ -72,7 +72,7 @@ class Clusters:
             here, left = np.split(left, [len(block)])
             found.append(block[here])
         rows = np.concatenate(found)
-        known = None if labels is None else labels[_alive(batch)].numpy()[chosen]
+        known = None if labels is None else labels[batch.alive].numpy()[chosen]
         self._namer: LogisticRegression | KMeans
         if known is not None and options > 1 and len(_labelled(known, options)) == options:
             from sklearn.linear_model import LogisticRegression
@@ -91,7 +91,7 @@ class Clusters:
         """The cluster of each step, [N, T], 1 to k; 0 where there is padding."""
         choices = torch.zeros(batch.inputs.batch, dtype=torch.long)
         clusters = [self._namer.predict(rows) for rows in self._trajectories(batch)]
-        choices[_alive(batch)] = torch.as_tensor(np.concatenate(clusters), dtype=torch.long) + 1
+        choices[batch.alive] = torch.as_tensor(np.concatenate(clusters), dtype=torch.long) + 1
         return choices
 
     def _trajectories(self, batch: Batch) -> Iterator[np.ndarray]:
@@ -122,7 +122,7 @@ def equal_parts(batch: Batch, options: int) -> Tensor:
     Training of left-to-right hidden Markov models starts from this uniform segmentation.
     """
     part = batch.inputs.time * options // batch.lengths[:, None] + 1
-    return torch.where(_alive(batch), part, 0)
+    return torch.where(batch.alive, part, 0)
 
 
 # --- ways to begin ----------------------------------------------------------------------------------------------------
@@ -181,10 +181,6 @@ class _Start:
 def _labelled(labels: np.ndarray, options: int) -> list[int]:
     """The options that have labels, sorted."""
     return [int(option) for option in np.unique(labels) if 0 < option <= options]
-
-
-def _alive(batch: Batch) -> Tensor:
-    return batch.inputs.time < batch.lengths[:, None]
 
 
 def distinct(rows: np.ndarray, most: int) -> int:

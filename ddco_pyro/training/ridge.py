@@ -38,7 +38,7 @@ def cross_validated(model: Hierarchy, batch: Batch, ridge: float, seed: int) -> 
         return ridge
     given = batch.inputs.select(policy.reads).vector.double()
     x = torch.cat([given, given.new_ones(*given.shape[:-1], 1)], dim=-1)
-    alive = batch.inputs.time < batch.lengths[:, None]
+    alive = batch.alive
     clusters = Clusters(batch, count, seed, controls=True, read=policy.reads).choices(batch) if count > 1 else alive
     fold = (torch.arange(len(batch)) % min(FOLDS, len(batch))).unsqueeze(1)
     ridges = ridge * torch.tensor(RAISED, dtype=torch.float64)

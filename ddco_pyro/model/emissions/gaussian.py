@@ -77,12 +77,9 @@ class Gaussian(Emission):
 
     def _errors(self, actions: Tensor) -> Tensor:
         """(a_d - μ_d) / σ_d, [..., K·A]."""
-        return (self._repeated(actions) - self.mean.flatten(-2)) * self._wide(1 / self.std)
-
-    def _repeated(self, actions: Tensor) -> Tensor:
-        """[..., A] for each caller, [..., K·A]."""
         callers, size = self.shape[-2:]
-        return actions.to(self.mean.dtype) @ torch.eye(size, dtype=self.mean.dtype).repeat(1, callers)
+        repeated = actions.to(self.mean.dtype) @ torch.eye(size, dtype=self.mean.dtype).repeat(1, callers)
+        return (repeated - self.mean.flatten(-2)) * self._wide(1 / self.std)
 
     def _wide(self, values: Tensor) -> Tensor:
         """[A], [K, A] or [..., K, A] as [..., K·A]."""
