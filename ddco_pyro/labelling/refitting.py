@@ -19,7 +19,6 @@ from ddco_pyro.model.batch import encode
 from ddco_pyro.spec import Spec, with_overrides
 from ddco_pyro.training.checkpoint import TrainingData, fitted_of
 from ddco_pyro.training.labels import Labels
-from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.optimizers import optimizer_of
 from ddco_pyro.training.processes import one_thread
 from ddco_pyro.training.recognition import EM_STEPS, by_em, recognise
@@ -59,7 +58,7 @@ def refit(
         if before.depth > 1 or not _by_em(trained):
             return fit(spec, _tuned(spec, demos), on_event=on_event)
         on_event(TrainingBegan(trained.name, EM_STEPS + STEPS))
-        names, size = demos.names, replace(Dimensions.of_model(before), steps=max(demos.lengths))
+        names, size = demos.names, replace(before.dimensions, steps=max(demos.lengths))
         batch = encode(demos, before.encoder, before.scaling, fitted=True)
         known = _padded([demo.labels[SAID] for demo in demos])
         known = torch.where(known > 0, known, -1)

@@ -36,6 +36,7 @@ class ControlScaling(nn.Module):
     :param constant: the constant dimensions and their values, in the control's own units.
     :param parts: the kinds of the other dimensions.
     :ivar counts: how many parameters each part has (:class:`ControlStd`).
+    :ivar stds: what the spec says of the σ of each continuous dimension, part after part.
     """
 
     shift: Tensor
@@ -52,6 +53,8 @@ class ControlScaling(nn.Module):
         super().__init__()
         self.parts, self.relative_to = parts, spec.relative_to
         self.counts = [len(part.dims) * part.continuous for part in parts]
+        given = {dimension: part.std for part in spec.parts for dimension in part.dims}
+        self.stds = [given.get(dim) or spec.std for part in parts if part.continuous for dim in part.dims]
         varying = [dimension for dimension in range(size) if dimension not in constant]
         self.groups = [tuple(varying.index(dimension) for dimension in part.dims) for part in parts]
         count = len(varying)
@@ -190,9 +193,9 @@ class ControlStd(nn.Module):
     floor: Tensor
     start: Tensor
 
-    def __init__(self, spec: ControlSpec, scaling: ControlScaling, copies: int) -> None:
+    def __init__(self, scaling: ControlScaling, copies: int) -> None:
         super().__init__()
-        each = [_std_of(spec, dimension) for part in scaling.parts for dimension in part.dims if part.continuous]
+        each = scaling.stds
         stds = {place: std for place, std in enumerate(each) if isinstance(std, LearnedStd)}
         self.own = [place for place, std in stds.items() if std.per_option]
         self.of_state = [place for place, std in stds.items() if std.per_state]
@@ -237,8 +240,3 @@ def _with_columns(table: Tensor, places: Sequence[int], values: Tensor) -> Tenso
     for place, column in zip(places, values.unbind(-1), strict=True):
         columns[place] = column
     return torch.stack(columns, dim=-1)
-
-
-def _std_of(spec: ControlSpec, dimension: int) -> float | LearnedStd:
-    named = next((part for part in spec.parts if dimension in part.dims), None)
-    return spec.std if named is None or named.std is None else named.std

@@ -6,14 +6,25 @@ A flat policy is a hierarchy without option levels, whose meta-policy emits the 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from types import MappingProxyType
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from ddco_pyro.data.controls import ControlPart, all_gaussian
+from ddco_pyro.data.controls import (
+    ControlDimension,
+    ControlPart,
+    all_constant,
+    all_gaussian,
+    control_dimensions,
+    control_parts,
+    same,
+)
+from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
+from ddco_pyro.data.tasks import known_tasks
 from ddco_pyro.model.batch import STEPS_AT_ONCE, Batch
 from ddco_pyro.model.controls import ControlScaling, ControlStd
 from ddco_pyro.model.encoder import ObservationEncoder, Shapes
@@ -24,7 +35,7 @@ from ddco_pyro.model.outputs import CallerOutputs, Outputs
 from ddco_pyro.model.recogniser import Recogniser
 from ddco_pyro.model.seeding import HOST
 from ddco_pyro.model.tables import Tables
-from ddco_pyro.spec import ControlSpec, LevelSpec, PolicySpec, Spec
+from ddco_pyro.spec import LevelSpec, PolicySpec, Spec
 from ddco_pyro.spec.networks import Network as AnyNetworkSpec
 from ddco_pyro.spec.networks import PerTimestepSpec
 
@@ -42,6 +53,58 @@ RawOutputs = Sequence[Tensor]
 meta-policy's."""
 
 
+@dataclass(frozen=True)
+class Dimensions:
+    """Shapes of the observations by name, control dimensions A, and steps of the longest demonstration.
+
+    :param constant: control dimensions that are constant in all demonstrations, with their values; the model leaves
+        them out.
+    :param control: statistics of each control dimension in the demonstrations; empty where they are unknown.
+    :param parts: the parts of the control in a fitted model; None before they are decided.
+    :param tasks: of the numbers of the built-in observation ``task``.
+    """
+
+    shapes: Shapes
+    control_size: int
+    steps: int
+    constant: Mapping[int, float] = field(default_factory=dict)
+    control: tuple[ControlDimension, ...] = field(default=(), compare=False)
+    parts: tuple[ControlPart, ...] | None = None
+    tasks: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, demonstrations: Demonstrations, relative_to: str | None = None) -> Dimensions:
+        """The dimensions of these demonstrations.
+
+        :param relative_to: the spec's ``control.relative_to``.
+        :raises DemonstrationsError: every dimension of the control is constant.
+        """
+        control = control_dimensions({demo.name: demo.controls(relative_to) for demo in demonstrations})
+        constant = {dimension.number: dimension.minimum for dimension in control if dimension.constant}
+        if len(constant) == len(control):
+            raise DemonstrationsError(all_constant(control))
+        shapes, size = demonstrations.observation_shapes, demonstrations.control_size
+        tasks = known_tasks(demonstrations.attributes)
+        return cls(shapes, size, max(demonstrations.lengths), constant, control, tasks=tasks)
+
+    def like(self, model: Hierarchy, name: str) -> Dimensions:
+        """With the kinds of control of a fitted model, which is to be the prior of another one.
+
+        :param name: of the model, for errors.
+        :raises DemonstrationsError: observations or the control have other shapes, or a dimension varies here alone.
+        """
+        there = model.dimensions
+        sizes = {f"obs/{key}": (tuple(self.shapes[key]), shape) for key, shape in there.shapes.items()}
+        for place, (ours, theirs) in (sizes | {"actions": (self.control_size, there.control_size)}).items():
+            if ours != theirs:
+                raise DemonstrationsError(f"{place}: has shape {ours} at each step, and in {name} {theirs}")
+        for dimension, value in there.constant.items():
+            if not same(np.array(self.constant.get(dimension, np.nan)), np.array(value)):
+                text = f"control dimension {dimension} is not always {value:g}, as in {name}"
+                raise DemonstrationsError(f"{text}; the library's tasks have to vary it")
+        return replace(self, steps=there.steps, constant=there.constant, parts=there.parts)
+
+
 class Caller(nn.Module):
     """K policies over the options of the level below, the physical control, or both (§4.2).
 
@@ -50,20 +113,14 @@ class Caller(nn.Module):
     """
 
     def __init__(
-        self,
-        policy: PolicySpec,
-        options: int,
-        shape: InputShape,
-        control: ControlSpec,
-        scaling: ControlScaling,
-        copies: int,
+        self, policy: PolicySpec, options: int, shape: InputShape, scaling: ControlScaling, copies: int
     ) -> None:
         super().__init__()
         self.options, self.copies = options, copies
         self.emits_control = "control" in policy.emits
         self.emits_options = "options" in policy.emits and options > 0
         logits = options + self.emits_control if self.emits_options else 0
-        std = ControlStd(control, scaling, copies) if self.emits_control else None
+        std = ControlStd(scaling, copies) if self.emits_control else None
         of_state = 0 if std is None else len(std.of_state)
         self.sizes = (logits, scaling.numbers + of_state if self.emits_control else 0)
         self.network = build(policy, shape, sum(self.sizes), copies)
@@ -94,18 +151,12 @@ class Level(nn.Module):
     """
 
     def __init__(
-        self,
-        place: str,
-        spec: LevelSpec,
-        options_below: int,
-        shape: InputShape,
-        control: ControlSpec,
-        scaling: ControlScaling,
+        self, place: str, spec: LevelSpec, options_below: int, shape: InputShape, scaling: ControlScaling
     ) -> None:
         super().__init__()
         self.count = spec.count
         with named(f"{place}.policy"):
-            self.policy = Caller(spec.policy, options_below, shape, control, scaling, spec.count)
+            self.policy = Caller(spec.policy, options_below, shape, scaling, spec.count)
         self.termination: Network | None = None
         if isinstance(spec.termination, AnyNetworkSpec):
             with named(f"{place}.termination"):
@@ -115,36 +166,26 @@ class Level(nn.Module):
 class Hierarchy(nn.Module):
     """Levels of options, lowest first, and the meta-policy on top.
 
-    :param shapes: shapes of the observations by name, without time.
-    :param control_size: A, the number of control dimensions.
-    :param steps: the longest demonstration, for per-timestep networks.
-    :param constant: the control dimensions outside the model, and the values that are emitted for them.
-    :param parts: the kinds of the other control dimensions; by default all are Gaussian.
-    :param tasks: of the numbers of the built-in observation ``task``.
+    :ivar dimensions: of what the networks read, with the kinds of control as they are decided.
     :raises ShapeError: a network cannot read these observations.
     """
 
     power: Tensor
     """β of :class:`~ddco_pyro.model.tables.Tables`, a number."""
 
-    def __init__(
-        self,
-        spec: Spec,
-        shapes: Shapes,
-        control_size: int,
-        steps: int,
-        constant: Mapping[int, float] = MappingProxyType({}),
-        parts: tuple[ControlPart, ...] | None = None,
-        tasks: tuple[str, ...] = (),
-    ) -> None:
+    def __init__(self, spec: Spec, dimensions: Dimensions) -> None:
         super().__init__()
+        size, constant, steps = dimensions.control_size, dimensions.constant, dimensions.steps
         self.steps, self.device = steps, HOST
-        self.encoder = ObservationEncoder(spec.observations, shapes, tasks)
+        self.encoder = ObservationEncoder(spec.observations, dimensions.shapes, dimensions.tasks)
         power = spec.control.power if spec.hierarchy is not None else 1.0  # nothing is latent in a flat policy
         self.register_buffer("power", torch.tensor(power, dtype=torch.float64))
-        varying = [dimension for dimension in range(control_size) if dimension not in constant]
-        parts = all_gaussian(varying) if parts is None else parts
-        self.scaling = scaling = ControlScaling(spec.control, control_size, dict(constant), parts)
+        parts = dimensions.parts
+        if parts is None and dimensions.control:
+            parts = control_parts(spec.control, dimensions.control)
+        parts = all_gaussian([d for d in range(size) if d not in constant]) if parts is None else parts
+        self.dimensions = replace(dimensions, shapes=self.encoder.shapes, parts=parts)
+        self.scaling = scaling = ControlScaling(spec.control, size, dict(constant), parts)
         self.input_shape = self.encoder.shape(steps)
         self.trunk: Network | None = None
         if spec.hierarchy is not None and spec.hierarchy.trunk is not None:
@@ -153,11 +194,11 @@ class Hierarchy(nn.Module):
         shape = self.read_shape
         levels, below = [], 0
         for number, level in enumerate(spec.hierarchy.levels if spec.hierarchy else ()):
-            levels.append(Level(f"hierarchy.levels.{number}", level, below, shape, spec.control, scaling))
+            levels.append(Level(f"hierarchy.levels.{number}", level, below, shape, scaling))
             below = level.count
         self.levels = nn.ModuleList(levels)
         with named("hierarchy.meta_policy" if levels else "baseline.policy"):
-            self.meta_policy = Caller(_meta_policy(spec), below, shape, spec.control, scaling, copies=1)
+            self.meta_policy = Caller(_meta_policy(spec), below, shape, scaling, copies=1)
         self.recogniser: Recogniser | None = None
         if spec.hierarchy is not None and (labels := spec.training.labels) is not None and labels.recogniser:
             place = 1 + [each.name for each in spec.hierarchy.levels].index(labels.level)
@@ -223,7 +264,10 @@ class Hierarchy(nn.Module):
     @property
     def steps_in_memory(self) -> int:
         """Most steps of a trajectory in a chunk of time, for training within the memory that is allowed."""
-        return max(1, int(_bytes_at_once(self.device)) // max(1, self.step_bytes))
+        most: float = BYTES_AT_ONCE
+        if self.device.type == "cuda":
+            most = PART_OF_A_GPU * torch.cuda.get_device_properties(self.device).total_memory
+        return max(1, int(most) // max(1, self.step_bytes))
 
     @property
     def steps_at_once(self) -> int:
@@ -313,12 +357,6 @@ class Hierarchy(nn.Module):
         else:
             last = self.meta_policy(raw[-1], self.scaling)
         return Outputs((*callers, last), tuple(endings), self.power)
-
-
-def _bytes_at_once(device: torch.device) -> float:
-    if device.type == "cuda":
-        return PART_OF_A_GPU * torch.cuda.get_device_properties(device).total_memory
-    return BYTES_AT_ONCE
 
 
 def _meta_policy(spec: Spec) -> PolicySpec:

@@ -4,92 +4,20 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from torch import nn
 
-from ddco_pyro.data.controls import (
-    ControlDimension,
-    ControlPart,
-    all_constant,
-    control_dimensions,
-    control_parts,
-    refuse_unknown_dimensions,
-    same,
-)
-from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
-from ddco_pyro.data.tasks import known_tasks
+from ddco_pyro.data.controls import refuse_unknown_dimensions
 from ddco_pyro.model.encoder import Shapes
-from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.hierarchy import Dimensions, Hierarchy
 from ddco_pyro.model.networks import ShapeError
 from ddco_pyro.model.seeding import seeded
 from ddco_pyro.names import HIERARCHY, MIXTURE
 from ddco_pyro.spec import TASK, BaselineSpec, Spec, SpecError, user_code, with_overrides
 from ddco_pyro.training.processes import device_of
-
-
-@dataclass(frozen=True)
-class Dimensions:
-    """Shapes of the observations by name, control dimensions A, and steps of the longest demonstration.
-
-    :param constant: control dimensions that are constant in all demonstrations, with their values; the model leaves
-        them out.
-    :param control: statistics of each control dimension in the demonstrations; empty where they are unknown.
-    :param parts: the parts of the control in a fitted model; None before they are decided.
-    :param tasks: of the numbers of the built-in observation ``task``.
-    """
-
-    shapes: Shapes
-    control_size: int
-    steps: int
-    constant: Mapping[int, float] = field(default_factory=dict)
-    control: tuple[ControlDimension, ...] = field(default=(), compare=False)
-    parts: tuple[ControlPart, ...] | None = None
-    tasks: tuple[str, ...] = ()
-
-    @classmethod
-    def of(cls, demonstrations: Demonstrations, relative_to: str | None = None) -> Dimensions:
-        """The dimensions of these demonstrations.
-
-        :param relative_to: the spec's ``control.relative_to``.
-        :raises DemonstrationsError: every dimension of the control is constant.
-        """
-        control = control_dimensions({demo.name: demo.controls(relative_to) for demo in demonstrations})
-        constant = {dimension.number: dimension.minimum for dimension in control if dimension.constant}
-        if len(constant) == len(control):
-            raise DemonstrationsError(all_constant(control))
-        shapes, size = demonstrations.observation_shapes, demonstrations.control_size
-        tasks = known_tasks(demonstrations.attributes)
-        return cls(shapes, size, max(demonstrations.lengths), constant, control, tasks=tasks)
-
-    @classmethod
-    def of_model(cls, model: Hierarchy) -> Dimensions:
-        """The dimensions that a fitted model is of."""
-        scaling, encoder = model.scaling, model.encoder
-        others = sorted({*range(scaling.size)} - {*scaling.varying.tolist()})
-        constant = dict(zip(others, scaling.constant.tolist(), strict=True))
-        return cls(encoder.shapes, scaling.size, model.steps, constant, parts=scaling.parts, tasks=encoder.tasks)
-
-    def like(self, model: Hierarchy, name: str) -> Dimensions:
-        """With the kinds of control of a fitted model, which is to be the prior of another one.
-
-        :param name: of the model, for errors.
-        :raises DemonstrationsError: observations or the control have other shapes, or a dimension varies here alone.
-        """
-        there = Dimensions.of_model(model)
-        sizes = {f"obs/{key}": (tuple(self.shapes[key]), shape) for key, shape in there.shapes.items()}
-        for place, (ours, theirs) in (sizes | {"actions": (self.control_size, there.control_size)}).items():
-            if ours != theirs:
-                raise DemonstrationsError(f"{place}: has shape {ours} at each step, and in {name} {theirs}")
-        for dimension, value in there.constant.items():
-            if not same(np.array(self.constant.get(dimension, np.nan)), np.array(value)):
-                text = f"control dimension {dimension} is not always {value:g}, as in {name}"
-                raise DemonstrationsError(f"{text}; the library's tasks have to vary it")
-        return replace(self, steps=there.steps, constant=there.constant, parts=there.parts)
 
 
 def build_hierarchy(spec: Spec, dimensions: Dimensions, seed: int | None = None) -> Hierarchy:
@@ -104,15 +32,10 @@ def build_hierarchy(spec: Spec, dimensions: Dimensions, seed: int | None = None)
         known = ", ".join(sorted(dimensions.shapes))
         raise SpecError(f"observations: there is no {', '.join(missing)} (there are: {known})")
     _refuse_undrawable(spec, dimensions.shapes)
-    size = dimensions.control_size
-    refuse_unknown_dimensions(spec.control, size)
-    parts = dimensions.parts
-    if parts is None and dimensions.control:
-        parts = control_parts(spec.control, dimensions.control)
+    refuse_unknown_dimensions(spec.control, dimensions.control_size)
     try:
         with seeded(spec.seed if seed is None else seed):
-            given = (dimensions.steps, dimensions.constant, parts, dimensions.tasks)
-            return Hierarchy(spec, dimensions.shapes, size, *given)
+            return Hierarchy(spec, dimensions)
     except ShapeError as error:
         raise SpecError(str(error)) from error
 

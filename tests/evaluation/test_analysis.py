@@ -1,6 +1,7 @@
 """Use of options and paired differences, against counts made by hand."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -154,8 +155,7 @@ def make(counts: tuple[int, ...], emits: tuple[str, ...]) -> Hierarchy:
     options = {"hierarchy": {"levels": levels, "meta_policy": above}} if counts else {}
     spec = small_spec(counts, observations=["pose"], control={"std": {"learn": True}}, **options)
     torch.manual_seed(1)
-    size = Dimensions.of(DEMOS)
-    hierarchy = Hierarchy(spec, size.shapes, size.control_size, size.steps, size.constant)
+    hierarchy = Hierarchy(spec, replace(Dimensions.of(DEMOS), control=()))
     hierarchy.encoder.fit(DEMOS)
     hierarchy.scaling.fit(DEMOS)
     with torch.no_grad():

@@ -19,7 +19,7 @@ import ddco_pyro.exporting as module
 from ddco_pyro.errors import BadInput, Failed
 from ddco_pyro.exporting import TOLERANCE, export, runner
 from ddco_pyro.fitting.fitted import Fit
-from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.hierarchy import Dimensions, Hierarchy
 from ddco_pyro.model.networks import InputShape, UserNetwork
 
 SHAPES = {"state": (3,), "goal": (2, 2), "camera": (9, 12, 3)}
@@ -65,7 +65,7 @@ def make(
     observations, control = [*seen, *pictures], {"std": dict(std)}
     spec = small_spec(counts, policy, observations=observations, control=control, rollout=rollout, **model)
     torch.manual_seed(1)
-    hierarchy = Hierarchy(spec, SHAPES, 2, steps)
+    hierarchy = Hierarchy(spec, Dimensions(SHAPES, 2, steps))
     hierarchy.encoder.mean.uniform_(-3, 3)
     hierarchy.encoder.std.uniform_(0.5, 2)
     hierarchy.encoder.mean[3:6] = 0  # of the differences: it goes to and fro
@@ -416,7 +416,7 @@ def perceptron(units: int) -> Fit:
     """A policy of one observation, which acts with its mean."""
     spec = small_spec((), {"network": "mlp", "hidden": [units]}, rollout={"control": "mean"})
     torch.manual_seed(2)
-    return Fit(spec, Hierarchy(spec, {"state": (5,)}, 2, 7).eval())
+    return Fit(spec, Hierarchy(spec, Dimensions({"state": (5,)}, 2, 7)).eval())
 
 
 def measured(folder: Path) -> float:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ddco_pyro.inference import log_likelihood
 from ddco_pyro.model.batch import Batch
-from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.hierarchy import Dimensions, Hierarchy
 from ddco_pyro.model.networks import CLASSES, Inputs
 
 SHAPES = {"state": (3,), "camera": (10, 9, 3)}
@@ -46,7 +46,7 @@ def hierarchy(network: str, dtype: torch.dtype = torch.float64) -> Hierarchy:
     model = {"trunk": whole, "levels": [lower, upper], "meta_policy": meta}
     spec = small_spec(observations=list(SHAPES), control={"std": {"learn": True}}, hierarchy=model)
     torch.manual_seed(0)
-    return Hierarchy(spec, SHAPES, 2, STEPS).to(dtype).train()
+    return Hierarchy(spec, Dimensions(SHAPES, 2, STEPS)).to(dtype).train()
 
 
 def batch(dtype: torch.dtype = torch.float64) -> Batch:

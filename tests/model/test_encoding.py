@@ -13,7 +13,7 @@ from ddco_pyro.inference import log_likelihood
 from ddco_pyro.model.batch import encode
 from ddco_pyro.model.controls import ControlScaling
 from ddco_pyro.model.encoder import ObservationEncoder
-from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.hierarchy import Dimensions, Hierarchy
 from ddco_pyro.spec import ControlSpec, ObservationSpec
 
 LENGTHS = (5, 3, 4)
@@ -144,7 +144,7 @@ def test_the_density_is_in_the_controls_own_units():
     """log p(a) of a flat policy against scipy's Gaussian of a with the mean and deviation carried over to a's units."""
     spec = small_spec((), observations=["pose"], control={"std": 0.2})
     torch.manual_seed(0)
-    hierarchy = Hierarchy(spec, SHAPES, 3, steps=5)
+    hierarchy = Hierarchy(spec, Dimensions(SHAPES, 3, 5))
     hierarchy.encoder.fit(DEMOS)
     hierarchy.scaling.fit(DEMOS)
     encoded = encode(DEMOS, hierarchy.encoder, hierarchy.scaling)

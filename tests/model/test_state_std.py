@@ -11,7 +11,7 @@ from scipy import stats
 import ddco_pyro
 from ddco_pyro.inference.engines import compare_engines
 from ddco_pyro.model.controls import INITIAL_STD
-from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.hierarchy import Dimensions, Hierarchy
 
 OF_STATE = {"learn": True, "per_state": True}
 OF_OPTION = {"learn": True, "per_option": True}
@@ -64,7 +64,7 @@ def test_dimensions_with_other_sigmas_stand_beside():
     """One of the state, one of each option, one fixed."""
     parts = [{"name": "a", "dims": [2], "std": OF_STATE}, {"name": "b", "dims": [0], "std": OF_OPTION}]
     spec = small_spec(control={"std": 0.3, "parts": parts})
-    hierarchy, batch = varied(Hierarchy(spec, {"state": (3,)}, 3, 4)), make_batch()
+    hierarchy, batch = varied(Hierarchy(spec, Dimensions({"state": (3,)}, 3, 4))), make_batch()
     with torch.no_grad():
         hierarchy.levels[0].policy.std.raw_own[1] += 1
         std = hierarchy(batch.inputs).callers[0].emission.std

@@ -5,7 +5,7 @@ from hierarchies import SHAPES, make_batch
 from planted import LINEAR, small_spec
 
 from ddco_pyro.inference import log_likelihood
-from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.hierarchy import Dimensions, Hierarchy
 from ddco_pyro.training.stages import plan
 
 SEES = {"network": "mlp", "hidden": [5], "activation": "tanh"}
@@ -20,7 +20,7 @@ def spec_of(network, trunk=None, **training):
 
 def made(spec):
     torch.manual_seed(0)
-    return Hierarchy(spec, SHAPES, 2, steps=4)
+    return Hierarchy(spec, Dimensions(SHAPES, 2, 4))
 
 
 def value_of(hierarchy):

@@ -10,7 +10,7 @@ from planted import small_spec
 
 from ddco_pyro.exporting import write_numpy
 from ddco_pyro.fitting.fitted import Fit
-from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.hierarchy import Dimensions, Hierarchy
 from studies import arena_recording
 from studies.arena_phases import Phases
 from studies.arena_playing import exported, play
@@ -41,7 +41,7 @@ def fitted():
     seen = [{"key": "state", "differences": True}]
     spec = small_spec((3,), {"network": "mlp"}, observations=seen, control={"std": 0.5})
     torch.manual_seed(0)
-    hierarchy = Hierarchy(spec, {"state": (3,)}, 2, 30)
+    hierarchy = Hierarchy(spec, Dimensions({"state": (3,)}, 2, 30))
     hierarchy.scaling.scale.copy_(torch.tensor([2.0, 0.5]))
     return Fit(spec, hierarchy.eval())
 

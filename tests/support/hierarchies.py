@@ -4,7 +4,7 @@ import torch
 from planted import LINEAR, small_spec
 
 from ddco_pyro.model.batch import Batch
-from ddco_pyro.model.hierarchy import Hierarchy
+from ddco_pyro.model.hierarchy import Dimensions, Hierarchy
 from ddco_pyro.model.networks import Inputs
 
 SHAPES = {"state": (3,)}
@@ -42,7 +42,7 @@ def make_hierarchy(
         whole["hierarchy"] = {"levels": levels, "meta_policy": caller}
     spec = small_spec(counts, lowest or reads, **whole)
     torch.manual_seed(seed)
-    return Hierarchy(spec, SHAPES, 2, steps, parts=parts)
+    return Hierarchy(spec, Dimensions(SHAPES, 2, steps, parts=parts))
 
 
 def varied(hierarchy):
