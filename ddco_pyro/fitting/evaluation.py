@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.metadata
+import json
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -12,6 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import one_hot
 
+from ddco_pyro.data.controls import measure
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.errors import Failed
 from ddco_pyro.evaluation.agreement import agreement, confusion, of_equal_lengths
@@ -20,6 +23,7 @@ from ddco_pyro.evaluation.inferred import Inferred, infer
 from ddco_pyro.evaluation.options import divergences, option_use, segments_of
 from ddco_pyro.fitting.draws import matched
 from ddco_pyro.fitting.fitted import Fit
+from ddco_pyro.fitting.names import matched as matched_names
 from ddco_pyro.inference import Posterior
 from ddco_pyro.inference.posteriors import log_predictive
 from ddco_pyro.metrics import (
@@ -27,7 +31,9 @@ from ddco_pyro.metrics import (
     Alike,
     Below,
     Compared,
+    Counts,
     Dimensions,
+    Engines,
     Finite,
     HeldOut,
     Listed,
@@ -45,7 +51,11 @@ from ddco_pyro.statistics import paired, worth
 from ddco_pyro.training.data import tuning_split
 from ddco_pyro.training.labels import choices, used
 from ddco_pyro.training.networks import Dimensions as Sizes
-from ddco_pyro.training.restarts import train_model
+from ddco_pyro.training.networks import parameters
+from ddco_pyro.training.restarts import Trainer, train_model
+
+PACKAGES = ("ddco-pyro", "torch", "pyro-ppl", "numpy", "dm-control", "mujoco", "ompl", "scikit-learn")
+"""Packages whose versions are in ``metrics.json``, where they are installed."""
 
 
 class NotFinite(Failed):
@@ -103,7 +113,7 @@ def decompose(outputs: Outputs, batch: Batch) -> tuple[Tensor, Tensor]:
     actors = torch.autograd.grad(value.sum(), control)
     with torch.no_grad():
         value = value.detach()
-        alive = (batch.inputs.time < batch.lengths[:, None])[..., None, None]
+        alive = batch.alive[..., None, None]
         dimensions = sum(
             torch.where(alive, weight.unsqueeze(-1) * emission.by_dimension(actions), 0.0).sum((1, 2))
             for emission, weight in zip(exact.emissions, actors, strict=True)
@@ -160,14 +170,18 @@ def _finite(fit: Fit, piece: Inferred) -> np.ndarray:
     return piece.log_likelihood
 
 
+def _versions() -> dict[str, str]:
+    installed = {package: next(iter(importlib.metadata.distributions(name=package)), None) for package in PACKAGES}
+    return {package: found.version for package, found in installed.items() if found}
+
+
 def evaluate(
     fitted: Fit,
+    trained: Trainer,
+    size: Sizes,
     parts: dict[str, Demonstrations],
-    demos: Demonstrations,
-    *,
-    training: Mapping[str, Any],
-    contained: Collection[str] = (),
-    **about: Any,
+    contained: Collection[str],
+    whole: bool,
 ) -> Metrics:
     """The evaluation of a model.
 
@@ -175,12 +189,11 @@ def evaluate(
     difference to every baseline. A hierarchy also has the use, divergences and agreement with labels of its options.
 
     :param parts: training (``train``) and held-out (``valid``) demonstrations.
-    :param demos: all demonstrations.
-    :param training: the field of :class:`ddco_pyro.metrics.Metrics`.
     :param contained: names of the mixtures among the baselines that the model contains.
-    :param about: the other fields of :class:`ddco_pyro.metrics.Metrics`: versions, for example.
+    :param whole: whether it is a model with its baselines, which has a marginal and names of options.
     :raises NotFinite: a log-likelihood is NaN or infinite.
     """
+    demos, scaling, training = fitted.demonstrations, fitted.hierarchy.scaling, trained.summary
     ours = {name: _Part.of(fitted, part, name == "valid") for name, part in parts.items()}
     by_method = {fitted.name: {name: part.values for name, part in ours.items()}}
     for method, fit in fitted.baselines.items():
@@ -194,6 +207,15 @@ def evaluate(
     held_out = {} if valid is None else {name: each["valid"] for name, each in by_method.items()}
     lengths = np.array([] if valid is None else valid.lengths, dtype=float)
     options, segments, alike = _options(fitted, demos) if depth else ([], [], [])
+    labels, train = _trained_labels(fitted, parts["train"], ours["train"]), len(trained.data.train)
+    named = matched_names(fitted.spec, parts["train"], ours["train"].segments, labels) if depth and whole else []
+    counts = Counts(
+        train=train,
+        tune=len(parts["train"]) - train,
+        valid=len(valid or ()),
+        left_out=bool(fitted.without),
+        supervisor=json.loads(str(demos.attributes.get("supervisor", "{}"))),  # a collected file has it
+    )
     return Metrics(
         model=fitted.name,
         log_likelihood_per_step=Parts[Finite](train=per_step["train"], valid=per_step.get("valid")),
@@ -219,7 +241,7 @@ def evaluate(
             )
             for name in contained
         },
-        training=training,  # type: ignore[arg-type]  # validated
+        marginal=marginal(fitted.spec, size, parts) if whole else None,
         worth=worth(fitted.name, held_out, partial(paired, lengths=lengths)),
         branches=branch_use(fitted.hierarchy, infer(fitted.hierarchy, valid or demos)),
         options=options,
@@ -227,8 +249,16 @@ def evaluate(
         divergences=alike,
         agreement=_agreement(fitted, ours, parts),
         control_frequency=demos.frequency,
-        trained_labels=_trained_labels(fitted, demos),
-        **about,
+        trained_labels=labels,
+        named_by_labels=named,
+        engine_check=Engines(**trained.check._asdict()),
+        demonstrations=counts,
+        measure=measure(scaling.parts),
+        control_dimensions=list(size.control),
+        parameters=parameters(fitted.hierarchy),
+        training=training,  # type: ignore[arg-type]  # validated
+        seconds={},
+        versions=_versions(),
     )
 
 
@@ -345,19 +375,18 @@ def _agreement(fit: Fit, ours: Mapping[str, _Part], parts: Mapping[str, Demonstr
     return Agreement(**found) if names else None
 
 
-def _trained_labels(fit: Fit, demos: Demonstrations) -> TrainedLabels | None:
+def _trained_labels(fit: Fit, train: Demonstrations, ours: _Part) -> TrainedLabels | None:
     """The labels that a fit used in training (``training.labels``).
 
     ``agreement`` is the fraction of the labelled steps whose most likely option, inferred without labels, is the
     label's.
     """
-    labels, own = used(fit.spec, demos), fit.spec.training.labels
+    labels, own = used(fit.spec, fit.demonstrations), fit.spec.training.labels
     if labels is None or own is None:
         return None
-    labelled = demos.select(labels.demonstrations)
-    found = _Part.of(fit, labelled).segments[labels.level - 1]
-    known = choices(labelled, own.source, labels.values, labelled.names).numpy()
-    agree = [(ours == label[: len(ours)])[label[: len(ours)] >= 0] for ours, label in zip(found, known, strict=True)]
+    known = choices(train, own.source, labels.values, labels.demonstrations).numpy()
+    pairs = zip(ours.segments[labels.level - 1], known, strict=True)
+    agree = [(found == label[: len(found)])[label[: len(found)] >= 0] for found, label in pairs]
     return TrainedLabels(
         level=own.level,
         labels=own.source,

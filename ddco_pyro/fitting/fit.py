@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
-import json
 import math
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
@@ -14,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from ddco_pyro.data.controls import measure
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import only_one
 from ddco_pyro.data.hdf5 import natural
@@ -22,10 +19,10 @@ from ddco_pyro.data.labels import label_names
 from ddco_pyro.errors import BadInput, path_of
 from ddco_pyro.events import OnEvent, SeedFitted, ignore
 from ddco_pyro.fitting.digest import record, recorded
-from ddco_pyro.fitting.evaluation import evaluate, marginal
+from ddco_pyro.fitting.evaluation import evaluate
 from ddco_pyro.fitting.fitted import Fit, left_out, load
 from ddco_pyro.fitting.library import check_library, dimensions_for, prior_of
-from ddco_pyro.fitting.names import accepted, matched, read_names, write_names
+from ddco_pyro.fitting.names import accepted, read_names, write_names
 from ddco_pyro.fitting.run import Clock, claim, claimed, is_finished, write_model
 from ddco_pyro.inference import compile_all
 from ddco_pyro.jobs import BackendError, Workers, run_all
@@ -35,16 +32,13 @@ from ddco_pyro.spec import Spec, load_spec, with_overrides
 from ddco_pyro.training.data import demonstrations as read_demonstrations
 from ddco_pyro.training.data import known_demonstrations, refuse_unfit, seen, train_and_valid
 from ddco_pyro.training.labels import used
-from ddco_pyro.training.networks import check_models, check_networks, model_name, parameters
+from ddco_pyro.training.networks import check_models, check_networks, model_name
 from ddco_pyro.training.optimizers import optimizer_of
 from ddco_pyro.training.processes import Ranks, device_of, repeatable
 from ddco_pyro.training.restarts import train_model, training_began
 
 ALONE = Workers(1)
 """This process."""
-
-PACKAGES = ("ddco-pyro", "torch", "pyro-ppl", "numpy", "dm-control", "mujoco", "ompl", "scikit-learn")
-"""Packages whose versions are in ``metrics.json``, where they are installed."""
 
 
 def fit(
@@ -159,7 +153,8 @@ def _fit_models(
     spec, *_ = next(iter(models.values()))
     specs = {other: its for other, (its, _) in list(models.items())[1:]}
     split, size = train_and_valid(spec, demos), dimensions_for(spec, demos)
-    later = {other for other, its in specs.items() if _shares_recogniser(its)}
+    labels = {other: its.training.labels for other, its in specs.items()}  # the model chooses the recogniser of all
+    later = {other for other, own in labels.items() if own and own.recogniser == "cross_validated"}
 
     def baseline(other: str) -> Callable[..., Fit]:
         place = folder and folder / "baselines" / other
@@ -192,37 +187,17 @@ def _fit_models(
         alone = workers if _worth_a_process(spec, hierarchy, demos) else ALONE
         apart = _without_each(spec, demos, folder, on_event, alone)
     fitted = Fit(spec, hierarchy, folder=folder, given=demos, beside=by_name, apart=apart)
-    train, valid = len(trained.data.train), len(split.get("valid", ()))
-    counts = {"train": train, "tune": len(split["train"]) - train, "valid": valid, "left_out": bool(apart)}
-    known = {"supervisor": json.loads(str(demos.attributes.get("supervisor", "{}")))}  # a collected file has it
     with clock("evaluation"), repeatable(hierarchy.device):
-        metrics = evaluate(
-            fitted,
-            split,
-            demos,
-            engine_check=trained.check._asdict(),
-            demonstrations=counts | known,
-            measure=measure(hierarchy.scaling.parts),
-            control_dimensions=[dimension.as_data() for dimension in size.control],
-            parameters=parameters(hierarchy),
-            training=trained.summary,
-            contained=contained,
-            marginal=marginal(spec, size, split) if name is None else None,
-            seconds={},
-            versions=_versions(),
-        )
+        metrics = evaluate(fitted, trained, size, split, contained, name is None)
         named = read_names(folder, spec) if folder else None
-        if spec.hierarchy and name is None:
-            segments = fitted.segment(split["train"])
-            metrics.named_by_labels = matched(spec, split["train"], segments, metrics.trained_labels)
-            if named is None:
-                named = accepted(spec, metrics.named_by_labels)
-                if folder and named:
-                    write_names(folder, named)
+        if named is None:
+            named = accepted(spec, metrics.named_by_labels)
+            if folder and named:
+                write_names(folder, named)
     metrics.seconds = clock.seconds
     if folder:
         metrics.write(folder)
-    return replace(fitted, metrics=metrics, named=named or {})
+    return replace(fitted, metrics=metrics, named=named)
 
 
 def _contains(spec: Spec, baseline: Spec) -> bool:
@@ -232,12 +207,6 @@ def _contains(spec: Spec, baseline: Spec) -> bool:
     return baseline.training == spec.training and baseline.control == spec.control
 
 
-def _shares_recogniser(baseline: Spec) -> bool:
-    """Whether a baseline takes what cross-validation chooses for the model, rather than doing the same itself."""
-    labels = baseline.training.labels
-    return labels is not None and labels.recogniser == "cross_validated"
-
-
 def _with_recogniser(baseline: Spec, chosen: Mapping[str, Any]) -> Spec:
     """A baseline's spec with the model's recogniser, which leaves the policies and what lasts to differ.
 
@@ -245,11 +214,6 @@ def _with_recogniser(baseline: Spec, chosen: Mapping[str, Any]) -> Spec:
     """
     recogniser = {"weight": chosen["weight"], "ridge": chosen["ridge"]}
     return with_overrides(baseline, {"control.power": chosen["power"], "training.labels.recogniser": recogniser})
-
-
-def _versions() -> dict[str, str]:
-    installed = {package: next(iter(importlib.metadata.distributions(name=package)), None) for package in PACKAGES}
-    return {package: found.version for package, found in installed.items() if found}
 
 
 def _without_each(
