@@ -66,6 +66,12 @@ def picture(pixels: np.ndarray, alt: str, caption: str = "") -> Drawing:
     return Drawing(Markup('<img src="{}" alt="{}">').format(data_uri(jpeg(pixels), "image/jpeg"), alt), caption)
 
 
+def film(content: bytes, caption: str) -> Drawing:
+    """A film in mp4 for a page."""
+    video = Markup('<video controls muted loop playsinline preload="metadata" src="{}"></video>')
+    return Drawing(video.format(data_uri(content, "video/mp4")), caption)
+
+
 def data_uri(content: bytes, kind: str) -> str:
     """Bytes as ``data:<kind>;base64,...``."""
     return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"

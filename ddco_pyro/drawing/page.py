@@ -114,24 +114,8 @@ class Warned:
 
 
 @dataclass(frozen=True)
-class Film:
-    """A film: ``uri`` holds it, or is None where the page only links to ``link``."""
-
-    uri: str | None
-    link: str
-    caption: str
-
-
-@dataclass(frozen=True)
-class Films:
-    """Films side by side."""
-
-    films: Sequence[Film]
-
-
-@dataclass(frozen=True)
 class Drawing:
-    """A drawing in SVG, or a picture, inside the page, and its caption."""
+    """A drawing in SVG, a picture or a film, inside the page, and its caption."""
 
     content: Markup
     caption: str
@@ -145,7 +129,7 @@ class Card:
     blocks: Sequence[Block]
 
 
-Block = Text | Table | Facts | Folded | Columns | Warned | Films | Drawing | Card | Timelines
+Block = Text | Table | Facts | Folded | Columns | Warned | Drawing | Card | Timelines
 
 
 def footnote(text: str) -> Folded:

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from ddco_pyro.drawing.figures import data_uri
-from ddco_pyro.drawing.page import Block, Film, Films, Section, Table, Text, note
+from markupsafe import Markup
+
+from ddco_pyro.drawing.figures import film
+from ddco_pyro.drawing.page import Block, Columns, Drawing, Section, Table, Text, note
 from ddco_pyro.drawing.words import P_VALUE, interval, measure, number, p_value, rate
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Mean, Measure, Method, read_successes
@@ -69,10 +71,10 @@ def films(fit: Fit) -> Section | None:
     if not paths:
         return None
     explained = "The border has the colour of the lowest level’s option; h1 is its number."
-    return Section("films", "Films", [Films(films_of(folder, paths)), note(explained)])
+    return Section("films", "Films", [Columns(films_of(folder, paths)), note(explained)])
 
 
-def films_of(folder: Path, paths: list[Path]) -> list[Film]:
+def films_of(folder: Path, paths: list[Path]) -> list[Drawing]:
     """The films of a run folder with their outcomes, the first ones held in the page."""
     outcomes = {key: ": success" if value == 1 else ": failure" for key, value in read_successes(folder).items()}
     left, films = MOST_BYTES, []
@@ -80,8 +82,9 @@ def films_of(folder: Path, paths: list[Path]) -> list[Film]:
         name, seed = _named(path)
         held = path.stat().st_size <= left
         left -= path.stat().st_size if held else 0
-        uri = data_uri(path.read_bytes(), "video/mp4") if held else None
-        films.append(Film(uri, f"videos/{path.name}", f"{method(name)}, seed {seed}{outcomes.get((name, seed), '')}"))
+        caption = f"{method(name)}, seed {seed}{outcomes.get((name, seed), '')}"
+        link = Markup('{} – <a href="{}">{}</a>').format(caption, *[f"videos/{path.name}"] * 2)
+        films.append(film(path.read_bytes(), caption) if held else Drawing(Markup(), link))
     return films
 
 

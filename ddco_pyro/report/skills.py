@@ -10,7 +10,7 @@ import numpy as np
 
 from ddco_pyro.data.arrays import Observed
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.drawing.figures import curves, data_uri, picture, transition_graph, typical_paths
+from ddco_pyro.drawing.figures import curves, film, picture, transition_graph, typical_paths
 from ddco_pyro.drawing.page import (
     Block,
     Card,
@@ -18,8 +18,6 @@ from ddco_pyro.drawing.page import (
     Columns,
     Drawing,
     Facts,
-    Film,
-    Films,
     Section,
     Text,
     note,
@@ -204,7 +202,10 @@ def section(fit: Fit, every: Sequence[Skill], shown: Shown, segmented: Segmented
                 "Comes before": _frequent(counts[choice], [*names, "end"]),
             }
             if len(tasks) > 1:
-                facts["Tasks"] = _frequent(np.array([_steps_in(one, segmented, task) for task in tasks]), tasks)
+                steps = Counter[str]()
+                for each in one.found:
+                    steps[segmented.segments[each.row].task] += len(each)
+                facts["Tasks"] = _frequent(np.array([steps[task] for task in tasks]), tasks)
             facts |= {f"Label {labels}, agreement": told for labels, told in one.labels.items()}
             if choice and level not in fit.named and (known := proposed.get(level)):
                 facts["Name in the library, a proposal"] = known[choice - 1]
@@ -239,11 +240,6 @@ def _nearest(choice: int, pairs: Sequence[Alike], names: Sequence[str]) -> str:
         return ""
     apart, first, second = min(known)
     return f"{option_name(first if second == choice else second, names)}, {number(apart)} nats per step apart"
-
-
-def _steps_in(skill: Skill, segmented: Segmented, task: str) -> int:
-    """Steps of an option in the demonstrations of a task."""
-    return sum(len(one) for one in skill.found if segmented.segments[one.row].task == task)
 
 
 def _frequent(counts: np.ndarray, names: Sequence[str]) -> str:
@@ -303,8 +299,8 @@ class Shown:
         where = self._places(chosen[:SHOWN])
         if self.pictures:
             self.films += 1
-            film = [Films([film_of(self.pictures, chosen, choice)])] if self.films <= MOST_FILMS else []
-            return [sheet_of(self.pictures, chosen[:SHOWN], where), *film]
+            films = [film_of(self.pictures, chosen, choice)] if self.films <= MOST_FILMS else []
+            return [sheet_of(self.pictures, chosen[:SHOWN], where), *films]
         caption = where if self.drawn else f"{len(chosen)} instances from their onset on"
         return [self._drawing(chosen[:SHOWN] if self.drawn else chosen, choice, caption, MOST_CONTROLS)]
 
@@ -333,7 +329,7 @@ def sheet_of(pictures: Sequence[Observed], chosen: Sequence[Instance], where: st
     return picture(np.vstack(rows), f"First, middle and last pictures of {where}", where)
 
 
-def film_of(pictures: Sequence[Observed], chosen: Sequence[Instance], choice: int) -> Film:
+def film_of(pictures: Sequence[Observed], chosen: Sequence[Instance], choice: int) -> Drawing:
     """A grid of instances aligned at their onset, in H.264; one that has ended rests at its last step, paler."""
     longest = max(map(len, chosen))
     after = np.arange(0, longest, -(-longest // FRAMES))[:, None]
@@ -342,12 +338,11 @@ def film_of(pictures: Sequence[Observed], chosen: Sequence[Instance], choice: in
     cells = [frames(pictures[one.row], steps[:, cell], FILM_HEIGHT) for cell, one in enumerate(chosen)]
     columns = int(np.ceil(np.sqrt(len(cells))))
     height, width = cells[0].shape[1:3]
-    film = np.full((len(steps), -(-len(cells) // columns) * height, columns * width, 3), 255, np.uint8)
+    pixels = np.full((len(steps), -(-len(cells) // columns) * height, columns * width, 3), 255, np.uint8)
     for cell, seen in enumerate(cells):
         ended = np.diff(steps[:, cell], prepend=-1) == 0
         shown = np.where(ended[:, None, None, None], 128 + seen // 2, seen)
         shown[:, :3] = option_rgb(choice)
         top, left = height * (cell // columns), width * (cell % columns)
-        film[:, top : top + height, left : left + width] = shown
-    caption = f"{len(chosen)} instances from their onset on"
-    return Film(data_uri(encoded(film, FRAMES_PER_SECOND), "video/mp4"), "", caption)
+        pixels[:, top : top + height, left : left + width] = shown
+    return film(encoded(pixels, FRAMES_PER_SECOND), f"{len(chosen)} instances from their onset on")

@@ -230,8 +230,8 @@ def test_films_past_the_limit_are_links(deep, monkeypatch):
     monkeypatch.setattr(rolling, "MOST_BYTES", size)
     paths = sorted((deep[0].folder / "videos").glob("*.mp4"))
     found = rolling.films_of(deep[0].folder, paths)
-    assert [one.uri is None for one in found] == [False, True, True]
-    assert found[1].link == "videos/ddco-1001.mp4"
+    assert ["<video" in one.content for one in found] == [True, False, False]
+    assert '<a href="videos/ddco-1001.mp4">' in found[1].caption
 
 
 def test_names_are_escaped(tmp_path):
