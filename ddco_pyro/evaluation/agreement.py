@@ -43,15 +43,8 @@ def agreement(segments: Sequence[np.ndarray], labels: Sequence[np.ndarray], task
 
     Of several tasks, measures are means over tasks: options are matched with the labels of one task at a time.
 
-    - ``nmi``: normalised mutual information, arithmetic mean of the entropies.
-    - ``ari``: adjusted Rand index, 0 by chance.
-    - ``boundary_f1_N``: F1 of the steps at which a segment begins (the first step is none), matched one to one within
-      ±N steps; 1 where neither has any.
-    - ``matched_globally`` and ``matched_per_demonstration``, for either matching: ``accuracy``, the share of steps that
-      agree (mean over frames, MoF); ``iou``, intersection over union of the steps, mean over labels; ``f1_P``,
-      segmental F1: a segment is right where its intersection over union with a segment of its label, not taken before,
-      is P % or more; ``edit``, 1 − Levenshtein distance of the sequences of segments divided by the longer one, mean
-      over demonstrations.
+    :data:`EXPLAINED` says what they measure. Boundaries are matched one to one; where neither side has any, their F1 is
+    1. A segment is compared with the segment of its label with which it overlaps most, and that is taken once.
 
     >>> found = agreement([np.array([7, 7, 3, 3])], [np.array([0, 0, 0, 1])])
     >>> found.matched_globally.accuracy, found.boundary_f1_1

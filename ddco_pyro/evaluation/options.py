@@ -255,16 +255,7 @@ def diagnose(
 ) -> list[Finding]:
     """The signs of a degenerate solution in the ``options`` and ``divergences`` of a run, lowest level first.
 
-    - unused: an option that is active less than 1 % of the time;
-    - dominating: one of several options that is active more than 90 % of the time;
-    - never persisting: an option with an expected duration below 1.5 steps and at least three selections in each
-      demonstration with the option, so that its caller does all the work;
-    - whole: an option that takes at least 90 % of the demonstrations that have it, where others lack it; or at least
-      two thirds of them, where no more than half of all have it;
-    - redundant: two used options with a divergence below 0.1 nats per step;
-    - brief: a level most of whose segments are twitches (:func:`segments_of`), with at least six segments in a
-      demonstration;
-    - high-fitting: a caller that emits the control itself more than half of the time that it acts.
+    :data:`SOUND` says which signs these are.
     """
     found: list[Finding] = []
     for level, use in enumerate(options, start=1):
@@ -292,6 +283,18 @@ def diagnose(
         if itself > HIGH_FITTING_SHARE:
             found.append(Finding("high_fitting", level, 0, itself))
     return found
+
+
+SOUND = (
+    "Training converged, and the model predicts held-out controls better than the mean and the spread of each control "
+    "do. Every option is used (at least 1 % of all steps) and none dominates (more than 90 %). No two options act "
+    "alike (differ by less than 0.1 nats per step). No option ends at once again and again (lasts less than 1.5 steps, "
+    "with three selections or more in a demonstration). No option takes some demonstrations whole (at least 90 % of "
+    "their steps, or two thirds of no more than half of the demonstrations). Options do not switch all the time (six "
+    "segments or more in a demonstration, most of them below 0.5 s, or 5 steps or a fiftieth of their demonstration "
+    "where the rate is unknown). No caller emits the control itself most of the time."
+)
+"""What was looked at where nothing is doubtful. A sign of two options that act alike is of used ones alone."""
 
 
 # --- signs in words ---------------------------------------------------------------------------------------------------

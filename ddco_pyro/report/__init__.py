@@ -14,7 +14,7 @@ from ddco_pyro.data.sources import open_source
 from ddco_pyro.drawing.page import Block, Folded, Page, Section, Text, Warned, note
 from ddco_pyro.drawing.shown import pictures, stored_pictures
 from ddco_pyro.evaluation import verdicts
-from ddco_pyro.evaluation.options import beside_equal_parts
+from ddco_pyro.evaluation.options import SOUND, beside_equal_parts
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.names import method
 from ddco_pyro.report import inputs, likelihood, options, rollouts, skills, training
@@ -108,5 +108,5 @@ def header(fit: Fit) -> list[Block]:
     return [
         *map(Text, texts),
         *(Warned(*sign) for sign in found),
-        *([] if found else [Folded("No sign of a doubtful fit", [note(training.SOUND)])]),
+        *([] if found else [Folded("No sign of a doubtful fit", [note(SOUND)])]),
     ]

@@ -94,18 +94,6 @@ def doubts(fit: Fit) -> list[tuple[str, str]]:
     return [*found, *(degeneracies(metrics, fit.spec, fit.names) if fit.spec.hierarchy else ())]
 
 
-SOUND = (
-    "Training converged, and the model predicts held-out controls better than the mean and the spread of each control "
-    "do. Every option is used (at least 1 % of all steps) and none dominates (more than 90 %). No two options act "
-    "alike (differ by less than 0.1 nats per step). No option ends at once again and again (lasts less than 1.5 steps, "
-    "with three selections or more in a demonstration). No option takes some demonstrations whole (at least 90 % of "
-    "their steps, or two thirds of no more than half of the demonstrations). Options do not switch all the time (six "
-    "segments or more in a demonstration, most of them below 0.5 s, or 5 steps or a fiftieth of their demonstration "
-    "where the rate is unknown). No caller emits the control itself most of the time."
-)
-"""What was looked at where nothing is doubtful."""
-
-
 # --- particulars ------------------------------------------------------------------------------------------------------
 
 
