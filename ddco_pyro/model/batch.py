@@ -13,7 +13,6 @@ from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
 from ddco_pyro.model.controls import ControlScaling
 from ddco_pyro.model.encoder import ObservationEncoder, padded
 from ddco_pyro.model.networks import Inputs
-from ddco_pyro.model.networks.inputs import Frames
 
 STEPS_AT_ONCE = 8192
 """Most steps of a piece of a batch; fewer where a step takes much memory
@@ -76,12 +75,11 @@ class Batch:
 
         :param most: by observation, the most pixels of a shift along either axis.
         """
-        random = np.random.default_rng(seed)
-        shifts = {key: random.integers(-pixels, pixels + 1, (len(self), 2)) for key, pixels in most.items()}
-        images = self.inputs.images
-        if not isinstance(images, Frames):
-            return self
-        return replace(self, inputs=replace(self.inputs, images=replace(images, shifts=shifts)))
+        random, images = np.random.default_rng(seed), dict(self.inputs.images)
+        for key, pixels in most.items():
+            shifts = random.integers(-pixels, pixels + 1, (len(self), 2))
+            images[key] = replace(images[key], shifts=shifts)
+        return replace(self, inputs=replace(self.inputs, images=images)) if most else self
 
 
 def encode(

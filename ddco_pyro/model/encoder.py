@@ -195,8 +195,10 @@ class ObservationEncoder(nn.Module):
         vectors = [self.scaled(self.features(sequence, times)) for sequence in sequences]
         vector = padded(vectors).float()
         by_key, steps = dict(zip(self.keys, vector.split(self.sizes, -1), strict=True)), vector.shape[1]
-        pictures = {key: tuple(sequence[key] for sequence in sequences) for key in self.images}
-        images = Frames(pictures, self.transforms, slice(0, steps)) if pictures else {}
+        images = {
+            key: Frames(tuple(sequence[key] for sequence in sequences), self.transforms[key], slice(0, steps))
+            for key in self.images
+        }
         return Inputs(by_key, images, torch.arange(steps))
 
 

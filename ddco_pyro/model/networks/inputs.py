@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -17,42 +17,42 @@ from ddco_pyro.errors import nearest
 
 
 @dataclass(frozen=True, eq=False)
-class Frames(Mapping[str, Tensor]):
-    """Pictures of N trajectories by observation, each uint8 [N, T, H, W, C], zeros past their ends.
+class Frames:
+    """Pictures of N trajectories that are read when asked for, uint8 [N, T, H, W, C], zeros past their ends.
 
-    :param arrays: of each observation the pictures [T_n, ...] of each trajectory, in memory or in their file.
-    :param transforms: how they are cropped and scaled.
+    :param arrays: the pictures [T_n, ...] of each trajectory, in memory or in their file.
+    :param transform: how they are cropped and scaled.
     :param steps: the T steps of time.
-    :param shifts: rows and columns by which the pictures of each trajectory are shifted, [N, 2]; by default none.
+    :param shifts: rows and columns by which the pictures of each trajectory are shifted, [N, 2]; None for none.
     """
 
-    arrays: Mapping[str, tuple[Observed, ...]]
-    transforms: Mapping[str, Transform]
+    arrays: tuple[Observed, ...]
+    transform: Transform
     steps: slice
-    shifts: Mapping[str, np.ndarray] = field(default_factory=dict)
-
-    def __getitem__(self, key: str) -> Tensor:
-        return torch.from_numpy(padded(self.arrays[key], self.steps, self.transforms[key], self.shifts.get(key)))
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.arrays)
-
-    def __len__(self) -> int:
-        return len(self.arrays)
+    shifts: np.ndarray | None = None
 
     @property
-    def batch(self) -> tuple[int, int]:
+    def shape(self) -> tuple[int, int]:
         """(N, T)."""
-        return len(next(iter(self.arrays.values()))), self.steps.stop - self.steps.start
+        return len(self.arrays), self.steps.stop - self.steps.start
 
-    def part(self, rows: Tensor | slice, steps: slice) -> Frames:
+    def __getitem__(self, part: tuple[Tensor | slice, slice]) -> Frames:
         """The frames of some trajectories and of consecutive steps; nothing is read."""
-        chosen = torch.arange(self.batch[0])[rows].tolist()
-        arrays = {key: tuple(each[row] for row in chosen) for key, each in self.arrays.items()}
-        shifts = {key: each[chosen] for key, each in self.shifts.items()}
-        first, last, _ = steps.indices(self.batch[1])
-        seen = slice(self.steps.start + first, self.steps.start + last)
-        return replace(self, arrays=arrays, shifts=shifts, steps=seen)
+        chosen = torch.arange(len(self.arrays))[part[0]].tolist()
+        first, last, _ = part[1].indices(self.shape[1])
+        return Frames(
+            tuple(self.arrays[row] for row in chosen),
+            self.transform,
+            slice(self.steps.start + first, self.steps.start + last),
+            None if self.shifts is None else self.shifts[chosen],
+        )
+
+    def read(self) -> Tensor:
+        """The pictures.
+
+        :raises DemonstrationsError: a file cannot be read.
+        """
+        return torch.from_numpy(padded(self.arrays, self.steps, self.transform, self.shifts))
 
 
 T = TypeVar("T")
@@ -98,20 +98,18 @@ class Inputs:
     """Observations of N trajectories by name.
 
     :param vectors: float32 [N, T, F_key].
-    :param images: uint8 [N, T, H, W, C]; in a batch perhaps :class:`Frames`, for a network tensors.
+    :param images: uint8 [N, T, H, W, C]; :class:`Frames` in a batch, tensors for a network (:meth:`loaded`).
     :param time: the number of each step, [T].
     """
 
     vectors: Mapping[str, Tensor]
-    images: Mapping[str, Tensor]
+    images: Mapping[str, Any]
     time: Tensor
 
     @property
     def batch(self) -> tuple[int, int]:
         """(N, T)."""
-        if not self.vectors and isinstance(self.images, Frames):
-            return self.images.batch
-        array = next(iter([*self.vectors.values()] or [*self.images.values()]))
+        array = next(iter([*self.vectors.values(), *self.images.values()]))
         return array.shape[0], array.shape[1]
 
     @cached_property
@@ -124,11 +122,7 @@ class Inputs:
 
     def select(self, names: Sequence[str]) -> Inputs:
         """These observations alone, in this order; nothing is read."""
-        if isinstance(self.images, Frames):
-            images: Mapping[str, Tensor] = replace(self.images, arrays=_of(self.images.arrays, names))
-        else:
-            images = _of(self.images, names)
-        return Inputs(_of(self.vectors, names), images, self.time)
+        return Inputs(_of(self.vectors, names), _of(self.images, names), self.time)
 
     def chunks(self, steps: int) -> Iterator[Inputs]:
         """Consecutive parts of at most ``steps`` steps, and of at least one."""
@@ -137,18 +131,19 @@ class Inputs:
             yield self.part(slice(None), slice(first, first + size))
 
     def part(self, rows: Tensor | slice, steps: slice) -> Inputs:
-        """Consecutive steps of some trajectories."""
-        vectors = {key: array[rows, steps] for key, array in self.vectors.items()}
-        if isinstance(self.images, Frames):
-            return Inputs(vectors, self.images.part(rows, steps), self.time[steps])
-        return Inputs(vectors, {key: array[rows, steps] for key, array in self.images.items()}, self.time[steps])
+        """Consecutive steps of some trajectories; nothing is read."""
+        vectors, images = (
+            {key: array[rows, steps] for key, array in arrays.items()} for arrays in (self.vectors, self.images)
+        )
+        return Inputs(vectors, images, self.time[steps])
 
     def loaded(self) -> Inputs:
         """These inputs with all images in memory.
 
         :raises DemonstrationsError: a file cannot be read.
         """
-        return Inputs(self.vectors, dict(self.images), self.time) if isinstance(self.images, Frames) else self
+        unread = {key: image.read() for key, image in self.images.items() if isinstance(image, Frames)}
+        return Inputs(self.vectors, {**self.images, **unread}, self.time) if unread else self
 
     def to(self, device: torch.device) -> Inputs:
         """These inputs on a device; images have to be in memory."""
