@@ -73,15 +73,6 @@ class TrainingEnded(Event):
 
 
 @dataclass(frozen=True)
-class LengthTried(Event):
-    """A power of the control's log-density, and gates that are constant or not, gave this median segment, steps."""
-
-    power: float
-    constant: bool
-    median: float
-
-
-@dataclass(frozen=True)
 class CellsBegan(Event):
     """A ``study`` or a ``cross-validation`` of ``total`` cells begins; ``kept`` of them are done already."""
 
@@ -99,18 +90,12 @@ class CellDone(Event):
 
 
 @dataclass(frozen=True)
-class SeedFitted(Event):
-    """The model and its baselines are fitted with another of ``total`` training seeds."""
+class Counted(Event):
+    """One more of ``total`` pieces of ``work`` is done; None where nobody knows how many there are."""
 
-    total: int
-
-
-@dataclass(frozen=True)
-class EpisodeEnded(Event):
-    """One of ``total`` episodes of a method ended."""
-
-    method: str
-    total: int
+    work: str
+    total: int | None
+    note: str = ""
 
 
 OnEvent = Callable[[Event], None]

@@ -21,14 +21,12 @@ from ddco_pyro.evaluation import verdicts
 from ddco_pyro.events import (
     CellDone,
     CellsBegan,
+    Counted,
     DemonstrationsDone,
-    EpisodeEnded,
     EpochEnded,
     Event,
-    LengthTried,
     RestartDiverged,
     RestartStopped,
-    SeedFitted,
     TrainingBegan,
     TrainingEnded,
 )
@@ -101,19 +99,14 @@ class Progress:
                 self._say(f"restart {restart}: diverged: {why}")
             case TrainingEnded():
                 self.end()
-            case LengthTried(power, constant, median):
-                gates = ", constant gates" if constant else ""
-                self._advance("trying lengths", note=f"power {power:g}{gates}: median segment {median:g} steps")
             case CellsBegan(work, total, kept):
                 self._begin(f"{work}{f' ({kept} of {total} kept)' if kept else ''}", total - kept)
             case CellDone(cell, failed):
                 if failed:
                     self._say(f"{cell} failed: {failed}")
                 self._advance(note=cell)
-            case SeedFitted(total):
-                self._advance("fitting with other training seeds", total)
-            case EpisodeEnded(policy, total):
-                self._advance("rolling out", total, note=method(policy))
+            case Counted(work, total, note):
+                self._advance(work, total, note=note)
 
     def _begin(self, label: str, total: int | None) -> None:
         """Begin to count up to ``total``, or without an end for None."""

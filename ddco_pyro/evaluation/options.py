@@ -138,15 +138,11 @@ def divergences(pieces: Iterable[tuple[Outputs, Posterior]]) -> list[list[Alike]
 
 def _divergence(own: CallerOutputs, i: int, u: Tensor) -> Tensor:
     """Of option i and each option: the weighted sum over the steps, and the sum of the weights, [k, 2]."""
-    options = u[..., 1:]
-    steps = torch.zeros_like(options)
-    control = torch.ones_like(options)  # mean probability of emitting the control
-    if own.selection is not None:
-        q = own.selection
-        p = q[:, :, i : i + 1]
-        both = torch.isfinite(p) & torch.isfinite(q)  # callers of a level emit the same kinds of choices
-        steps = torch.where(both, 0.5 * (p.exp() - q.exp()) * (p - q), 0.0).sum(-1)
-        control = 0.5 * (p[..., 0].exp() + q[..., 0].exp())
+    options, q = u[..., 1:], own.selection
+    p = q[:, :, i : i + 1]
+    both = torch.isfinite(p) & torch.isfinite(q)  # callers of a level emit the same kinds of choices
+    steps = torch.where(both, 0.5 * (p.exp() - q.exp()) * (p - q), 0.0).sum(-1)
+    control = 0.5 * (p[..., 0].exp() + q[..., 0].exp())  # mean probability of emitting the control
     if own.emission is not None:
         steps = steps + control * own.emission.divergence(i)
     weight = options[..., i : i + 1] + options

@@ -17,7 +17,7 @@ from ddco_pyro.data.files import only_one
 from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.labels import label_names
 from ddco_pyro.errors import BadInput, path_of
-from ddco_pyro.events import OnEvent, SeedFitted, ignore
+from ddco_pyro.events import Counted, OnEvent, ignore
 from ddco_pyro.fitting.digest import record, recorded
 from ddco_pyro.fitting.evaluation import evaluate
 from ddco_pyro.fitting.fitted import Fit, left_out, load
@@ -288,7 +288,7 @@ def repeat(first: Fit, seeds: int, on_event: OnEvent = ignore, jobs: int = 1) ->
         with run_all(calls, Workers(jobs), "repeated the fit") as repeated:
             for seed, metrics in repeated:
                 found[seed] = metrics
-                on_event(SeedFitted(len(calls)))
+                on_event(Counted("fitting with other training seeds", len(calls)))
         each = [found[seed] for seed in (own, *others)]
         worth = [metrics.worth.parts if metrics.worth else {} for metrics in each]
         models = {first.metrics.model: each} | {

@@ -6,10 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from ddco_pyro.acting.controller import Controller
-from ddco_pyro.events import EpisodeEnded, OnEvent, ignore
+from ddco_pyro.events import Counted, OnEvent, ignore
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.fitting.run import RunError
 from ddco_pyro.metrics import Method, Rollouts, Seeds, write_table
+from ddco_pyro.names import method
 from ddco_pyro.simulation.episodes import run_episodes, summarize
 from ddco_pyro.simulation.film import write_film
 from ddco_pyro.simulation.task import SUCCESS, Policy, find_task
@@ -75,7 +76,7 @@ def roll_out(
             if episode.frames:
                 names = [*policy.names.values()] if isinstance(policy, Controller) else []  # lowest level first
                 write_film(_film(fit, name, episode.seed), episode, names)
-            on_event(EpisodeEnded(name, len(played) * episodes))
+            on_event(Counted("rolling out", len(played) * episodes, method(name)))
     task = find_task(str(fit.spec.task))
     rows = [
         {"method": name, "seed": seed, **outcome}

@@ -17,7 +17,7 @@ from ddco_pyro.data.starting import Decided
 from ddco_pyro.drawing.words import duration
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.options import segments_of
-from ddco_pyro.events import EpochEnded, Event, LengthTried, OnEvent, ignore
+from ddco_pyro.events import Counted, EpochEnded, Event, OnEvent, ignore
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.metrics import Segments
 from ddco_pyro.spec import Spec, with_overrides
@@ -133,7 +133,9 @@ def lasting(spec: Spec, demos: Demonstrations, steps: float | None, on_event: On
     def tried(power: float, constant: bool) -> Lasting:
         tries = [begun(power, constant, window) for window in (windows if power < USUAL else [0])]
         found = max(tries, key=lambda one: one.value)
-        on_event(LengthTried(power, constant, found.segments.median))
+        gates = ", constant gates" if constant else ""
+        note = f"power {power:g}{gates}: median segment {found.segments.median:g} steps"
+        on_event(Counted("trying lengths", None, note))
         return found
 
     return unasked(tried) if steps is None else asked(tried, steps)

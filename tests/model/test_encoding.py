@@ -131,11 +131,10 @@ def test_batches_are_padded_with_zeros_and_images_stay_bytes():
     found = batch()
     assert (len(found), found.steps, found.lengths.tolist()) == (3, 12, [5, 3, 4])
     assert found.inputs.time.tolist() == [0, 1, 2, 3, 4]
-    assert (found.inputs.vector.shape, found.inputs.loaded().images["camera"].dtype) == ((3, 5, 3), torch.uint8)
+    seen = found.inputs.loaded().images["camera"]
+    assert (found.inputs.vector.shape, seen.dtype) == ((3, 5, 3), torch.uint8)
     for n, demo in enumerate(DEMOS):
-        np.testing.assert_array_equal(
-            found.inputs.loaded().images["camera"][n, : len(demo)], demo.observations["camera"]
-        )
+        np.testing.assert_array_equal(seen[n, : len(demo)], demo.observations["camera"])
         np.testing.assert_allclose(found.actions[n, : len(demo)], demo.actions, rtol=1e-6)
         for padded in (found.inputs.vector, seen, found.actions):
             assert padded.shape[:2] == (3, 5)
