@@ -26,7 +26,7 @@ from ddco_pyro.data.hdf5 import opened
 from ddco_pyro.data.sources import Source, open_source, refuse_foreign
 from ddco_pyro.data.sources.robomimic import robomimic_file, write_demonstration
 from ddco_pyro.errors import BadInput, nearest
-from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
+from ddco_pyro.events import Counted, OnEvent, ignore
 from ddco_pyro.spec.base import Count, Items, Model
 from ddco_pyro.training.processes import one_thread
 
@@ -294,7 +294,7 @@ def encode(
         features = dict[str, np.ndarray]()
         for own, array in pictures.items():
             features[own] = np.concatenate([backbone(batch) for batch in _batches(array)])
-            on_event(DemonstrationsDone(len(features), len(pictures)))
+            on_event(Counted("encoding", len(pictures), done=len(features)))
         projection = None
         if size is not None or number > min(SIZE, steps):
             with one_thread():  # same bits

@@ -23,11 +23,13 @@ class Event:
 
 
 @dataclass(frozen=True)
-class DemonstrationsDone(Event):
-    """``done`` of ``total`` demonstrations are collected, imported, segmented or encoded."""
+class Counted(Event):
+    """One more of ``total`` pieces of ``work`` is done, or ``done`` in all; ``total`` is None where nobody knows it."""
 
-    done: int
-    total: int
+    work: str
+    total: int | None
+    note: str = ""
+    done: int | None = None
 
 
 @dataclass(frozen=True)
@@ -87,15 +89,6 @@ class CellDone(Event):
 
     cell: str
     failed: str
-
-
-@dataclass(frozen=True)
-class Counted(Event):
-    """One more of ``total`` pieces of ``work`` is done; None where nobody knows how many there are."""
-
-    work: str
-    total: int | None
-    note: str = ""
 
 
 OnEvent = Callable[[Event], None]

@@ -22,7 +22,6 @@ from ddco_pyro.events import (
     CellDone,
     CellsBegan,
     Counted,
-    DemonstrationsDone,
     EpochEnded,
     Event,
     RestartDiverged,
@@ -54,12 +53,9 @@ class Progress:
 
     >>> with ddco_pyro.Progress() as progress:
     ...     fit = ddco_pyro.fit("mine.yaml", demos, on_event=progress)
-
-    :param label: the work on demonstrations, such as ``importing``.
     """
 
-    def __init__(self, label: str = "collecting demonstrations") -> None:
-        self._what = label
+    def __init__(self) -> None:
         self._console = Console(stderr=True)
         self._terminal = self._console.is_terminal
         self._rich = rich_progress.Progress(
@@ -86,8 +82,6 @@ class Progress:
     def __call__(self, event: Event) -> None:
         """Show an event."""
         match event:
-            case DemonstrationsDone(done, total):
-                self._advance(f"{self._what}", total, done)
             case TrainingBegan(model, epochs):
                 name, _, further = model.partition(" ")
                 self._begin(f"training {method(name)} {further}".rstrip(), epochs)
@@ -105,8 +99,8 @@ class Progress:
                 if failed:
                     self._say(f"{cell} failed: {failed}")
                 self._advance(note=cell)
-            case Counted(work, total, note):
-                self._advance(work, total, note=note)
+            case Counted(work, total, note, done):
+                self._advance(work, total, done, note)
 
     def _begin(self, label: str, total: int | None) -> None:
         """Begin to count up to ``total``, or without an end for None."""
@@ -165,7 +159,9 @@ def model(spec: Spec, size: Dimensions, hierarchy: Hierarchy, baselines: Sequenc
 
     rows = [[f"observation {key}", str(list(size.shapes[key]))] for key in spec.observed]
     rows += [["features", str(len(hierarchy.encoder.mean))], ["control", str([size.control_size])]]
-    rows += [[name, str(parameters(network))] for name, network in hierarchy.named_networks()]
+    for place in hierarchy.networks():  # each with the σ of its control
+        name = f"hierarchy.{place}" if hierarchy.depth else "baseline.policy"
+        rows.append([name, str(parameters(hierarchy.get_submodule(place)))])
     rows += [["all networks", str(parameters(hierarchy))]]
     for number, (other, policy) in enumerate(baselines):
         rows.append([f"compare_with.{number}: {_baseline(other)}", str(parameters(policy))])

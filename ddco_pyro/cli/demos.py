@@ -235,7 +235,7 @@ def import_(
     table = LabelTable(labels, _columns(columns), unit, fps) if labels else None
     where = where_of(wheres)
     choice = Choice(tuple(observations), mask, videos, size, hz, skip_broken, tuple(actions), table, where)
-    with console.Progress("importing") as progress:
+    with console.Progress() as progress:
         imported = import_demonstrations(sources, out, form, choice, progress)
     for name, reason in imported.left_out.items():
         print(f"left out {name}: {reason}", file=sys.stderr)
@@ -279,7 +279,7 @@ def encode(
     from ddco_pyro.cli import console
     from ddco_pyro.encoding import encode as write
 
-    with console.Progress("encoding") as progress:
+    with console.Progress() as progress:
         about = write(file, out, observation, encoder, size, name, progress, allow_code).about
     of = f"{about.size} of {about.features} features, {about.explained:.1%} of their variance"
     print(f"{out}: obs/{name or f'{observation}_features'}: {of}")

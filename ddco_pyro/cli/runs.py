@@ -170,7 +170,7 @@ def segment(
     fit = load(run, allow_code)
     if level is not None and fit.names:
         refuse_unknown("level", level, fit.names, place="--level: ")
-    with open_source(demos, where=where_of(wheres)) as source, console.Progress("segmenting") as progress:
+    with open_source(demos, where=where_of(wheres)) as source, console.Progress() as progress:
         subtasks = level or next(iter(fit.names), "")
         asked = [Asked(option, path, fit, source, subtasks, same_order) for option, path in places.items()]
         if fit.names:  # without options, segments() refuses the run

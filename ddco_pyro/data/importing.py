@@ -24,7 +24,7 @@ from ddco_pyro.data.sources.metadata import FREQUENCY
 from ddco_pyro.data.sources.robomimic import robomimic_file, write_demonstration
 from ddco_pyro.data.tasks import Where, task_of
 from ddco_pyro.errors import BadInput, refuse_unknown
-from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
+from ddco_pyro.events import Counted, OnEvent, ignore
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ def import_demonstrations(
                     except DemonstrationsError as error:
                         left_out[name] = error
                         _refuse(left_out, names, choice)
-                on_event(DemonstrationsDone(number + 1, len(names)))
+                on_event(Counted("importing", len(names), done=number + 1))
             written = tuple(name for name in whole.names if name in data)
             if not written:
                 why = next(iter(left_out.values()), "there is none")

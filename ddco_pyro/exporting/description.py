@@ -97,7 +97,7 @@ def describe(hierarchy: Hierarchy, control: RolloutSpec, program: StepProgram) -
                 "choices": caller.options,
                 "hybrid": caller.emits_control and caller.emits_options,
             }
-            for caller in hierarchy.callers()
+            for caller in hierarchy.named_callers().values()
         ],
         "outputs": program.names,
         "state": [
@@ -141,7 +141,7 @@ def _part(hierarchy: Hierarchy, number: int) -> dict[str, Any]:
     """
     scaling = hierarchy.scaling
     part, places = scaling.parts[number], list(scaling.groups[number])
-    before, callers = scaling.parts[:number], hierarchy.callers()
+    before, callers = scaling.parts[:number], [*hierarchy.named_callers().values()]
     kind, first = KINDS[part.kind], sum(scaling.counts[:number])
     own = slice(first, first + scaling.counts[number])
     each = zip(callers, (*(level.count for level in hierarchy.option_levels()), 1), strict=True)
@@ -173,7 +173,7 @@ def _part(hierarchy: Hierarchy, number: int) -> dict[str, Any]:
 def _networks(hierarchy: Hierarchy) -> dict[str, Any] | None:
     """The scaling of features, and the form of each network; None where one has none."""
     levels = hierarchy.option_levels()
-    networks = {f"caller_{number}": caller.network for number, caller in enumerate(hierarchy.callers())}
+    networks = {f"caller_{number}": caller.network for number, caller in enumerate(hierarchy.named_callers().values())}
     networks |= {f"end_{n}": level.termination for n, level in enumerate(levels) if level.termination is not None}
     networks |= {} if hierarchy.trunk is None else {"trunk": hierarchy.trunk}
     forms = {name: network.numpy_form() for name, network in networks.items()}

@@ -5,7 +5,7 @@ A flat policy is a hierarchy without option levels, whose meta-policy emits the 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -218,12 +218,8 @@ class Hierarchy(nn.Module):
         """The number D of option levels."""
         return len(self.levels)
 
-    def callers(self) -> list[Caller]:
-        """The policies of each level, lowest first, and the meta-policy."""
-        return [*(level.policy for level in self.option_levels()), self.meta_policy]
-
     def named_callers(self) -> dict[str, Caller]:
-        """The callers by the place of their network in :meth:`networks`."""
+        """The policies of each level, lowest first, and the meta-policy, by place as in :meth:`networks`."""
         levels = {f"levels.{number}.policy": level.policy for number, level in enumerate(self.option_levels())}
         return levels | {"meta_policy": self.meta_policy}
 
@@ -244,11 +240,6 @@ class Hierarchy(nn.Module):
         for level in self.option_levels():
             if level.termination is not None:
                 level.termination.begin_at(1, logit)
-
-    def named_networks(self) -> Iterator[tuple[str, nn.Module]]:
-        """Every network, with the σ of its control, by its place in the spec."""
-        for place in self.networks():
-            yield f"hierarchy.{place}" if self.depth else "baseline.policy", self.get_submodule(place)
 
     @property
     def read_shape(self) -> InputShape:
@@ -274,12 +265,9 @@ class Hierarchy(nn.Module):
         """Most steps of several trajectories that go through the networks together."""
         return min(STEPS_AT_ONCE, self.steps_in_memory)
 
-    def tabulate(self, batch: Batch, discovering: int | None = None) -> Tables:
-        """The tables of a batch: every network once, over all options, steps and trajectories.
-
-        :param discovering: d gives levels 1 to d alone under a uniform meta-policy (layer-wise training, SM 2.3).
-        """
-        outputs: Outputs = self(batch.inputs, discovering)
+    def tabulate(self, batch: Batch) -> Tables:
+        """The tables of a batch: every network once, over all options, steps and trajectories."""
+        outputs: Outputs = self(batch.inputs)
         return outputs.tables(batch.actions)
 
     def recognised(self, tables: Tables, batch: Batch) -> Tables:
@@ -294,7 +282,7 @@ class Hierarchy(nn.Module):
         Trajectories longer than :attr:`steps_in_memory` go through the networks in chunks of time. Only the raw outputs
         and the states between chunks are kept; for the gradient each chunk is computed again, the last first.
 
-        :param discovering: as in :meth:`tabulate`.
+        :param discovering: d gives levels 1 to d alone under a uniform meta-policy (layer-wise training, SM 2.3).
         """
         chunks = list(inputs.chunks(self.steps_in_memory // inputs.batch[0]))
         if len(chunks) == 1:

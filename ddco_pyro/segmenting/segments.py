@@ -22,7 +22,7 @@ from ddco_pyro.data.tasks import of_tasks, with_task
 from ddco_pyro.evaluation.agreement import EQUAL, of_equal_lengths
 from ddco_pyro.evaluation.agreement import agreement as scores_of
 from ddco_pyro.evaluation.inferred import Inferred, runs
-from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
+from ddco_pyro.events import Counted, OnEvent, ignore
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.metrics import Scores
 
@@ -177,7 +177,7 @@ def segments(fit: Fit, source: Source, on_event: OnEvent = ignore, intervals: bo
 
     for piece in fit.infer(read()):
         segmented += (replace(one, task=compared[one.name].task) for one in of_piece(fit, piece, labels, intervals))
-        on_event(DemonstrationsDone(len(segmented), len(chosen)))
+        on_event(Counted("segmenting", len(chosen), done=len(segmented)))
     each, known = of_tasks([demo.task for demo in segmented], [demo.labels for demo in segmented], known)
     segmented = [replace(demo, labels=own) for demo, own in zip(segmented, each, strict=True)]
     nats = {demo.name: demo.log_likelihood for demo in segmented}

@@ -16,7 +16,7 @@ from ddco_pyro.data.files import only_one
 from ddco_pyro.data.hdf5 import opened
 from ddco_pyro.data.sources.robomimic import robomimic_file, write_demonstration
 from ddco_pyro.errors import BadInput
-from ddco_pyro.events import DemonstrationsDone, OnEvent, ignore
+from ddco_pyro.events import Counted, OnEvent, ignore
 from ddco_pyro.simulation.episodes import run_episodes, summarize
 from ddco_pyro.simulation.task import Task, find_task
 from ddco_pyro.spec import DemonstrationsSpec
@@ -94,7 +94,7 @@ def _record(
             for episode in run_episodes(task_name, spec.supervisor, seeds[first : first + at_once], observed=observed):
                 write_demonstration(data, episode.record)
                 outcomes.append(episode.outcome)
-                on_event(DemonstrationsDone(len(data), spec.count))
+                on_event(Counted("collecting demonstrations", spec.count, done=len(data)))
         attributes["supervisor"] = json.dumps(
             {name: one.model_dump() for name, one in summarize(task, outcomes).items()}
         )

@@ -22,7 +22,7 @@ import ddco_pyro
 from ddco_pyro.cli import console
 from ddco_pyro.cli.app import app
 from ddco_pyro.drawing import words
-from ddco_pyro.events import DemonstrationsDone, EpochEnded, TrainingBegan, TrainingEnded
+from ddco_pyro.events import Counted, EpochEnded, TrainingBegan, TrainingEnded
 from ddco_pyro.names import method
 from ddco_pyro.spec import dump_spec, load_spec, spec_schema
 
@@ -300,7 +300,7 @@ def clock(monkeypatch):
 def test_plain_lines_come_now_and_then_and_at_the_end(clock, capsys):
     with console.Progress() as progress:
         for done in range(1, 8):
-            progress(DemonstrationsDone(done, 7))
+            progress(Counted("collecting demonstrations", 7, done=done))
             clock[0] += 4
     assert capsys.readouterr().err.splitlines() == [
         "collecting demonstrations: 4/7, 12 s left",

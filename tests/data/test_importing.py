@@ -25,7 +25,7 @@ from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
 from ddco_pyro.data.importing import Choice, import_demonstrations
 from ddco_pyro.data.inspection import inspect
 from ddco_pyro.errors import BadInput
-from ddco_pyro.events import DemonstrationsDone
+from ddco_pyro.events import Counted
 
 ROBOMIMIC, LEROBOT = Path(__file__).parents[1] / "fixtures" / "robomimic.hdf5", odd.FIXTURE
 
@@ -417,7 +417,7 @@ class Stopped(Exception):
 
 
 def test_an_interrupted_import_leaves_nothing_and_one_that_is_there_is_not_replaced(out: Path, tmp_path: Path) -> None:
-    def stop(event: DemonstrationsDone) -> None:
+    def stop(event: Counted) -> None:
         if event.done == 3:
             raise Stopped
 

@@ -14,7 +14,7 @@ from sklearn.linear_model import LinearRegression
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.encoding import Backbone, encode, load, principal_components
 from ddco_pyro.errors import BadInput
-from ddco_pyro.events import DemonstrationsDone
+from ddco_pyro.events import Counted
 
 MEANS, PLACES = "user_encoders:means", "user_encoders:places"
 
@@ -43,7 +43,7 @@ def test_components_say_where_the_dot_is(tmp_path, out):
 def test_all_but_the_pictures_stays(few_dots, out):
     before, seen = Demonstrations.read(few_dots), []
     encoded(few_dots, out, size=4, on_event=seen.append)
-    assert seen == [DemonstrationsDone(done, 6) for done in range(1, 7)]
+    assert seen == [Counted("encoding", 6, done=done) for done in range(1, 7)]
     after = Demonstrations.read(out)
     assert (after.masks, after.names, after.attributes) == (before.masks, before.names, before.attributes)
     assert after.observation_shapes == {"other": (4, 4, 2), "place": (2,), "camera_features": (4,)}

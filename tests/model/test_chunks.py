@@ -61,7 +61,7 @@ def batch(dtype: torch.dtype = torch.float64) -> Batch:
 def value_and_gradient(model: Hierarchy, seen: Batch, discovering: int | None) -> tuple[Tensor, Tensor]:
     """The log-likelihood, and its gradient in all parameters that it depends on."""
     torch.manual_seed(3)
-    value = log_likelihood(model.tabulate(seen, discovering), seen.lengths).sum()
+    value = log_likelihood(model(seen.inputs, discovering).tables(seen.actions), seen.lengths).sum()
     used = list(model.parameters())
     gradients = torch.autograd.grad(value, used, allow_unused=True, materialize_grads=True)
     return value.detach(), torch.cat([gradient.flatten() for gradient in gradients])

@@ -53,7 +53,7 @@ def test_tables_are_normalised(counts, emits):
 
 def test_discovery_sees_a_uniform_meta_policy():
     hierarchy, batch = make_hierarchy((3, 2)), make_batch()
-    tables = hierarchy.tabulate(batch, discovering=1)
+    tables = hierarchy(batch.inputs, discovering=1).tables(batch.actions)
     assert tables.depth == 1
     np.testing.assert_allclose(tables.selection[0][..., 1:].exp(), 1 / 3, rtol=1e-6)
     assert (tables.selection[0][..., 0] == -torch.inf).all()

@@ -12,7 +12,7 @@ import toy_task
 from scipy import stats
 
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
-from ddco_pyro.events import DemonstrationsDone
+from ddco_pyro.events import Counted
 from ddco_pyro.simulation.collect import cache_path, collect
 from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.spec import DemonstrationsSpec, SpecError, parse_spec, with_overrides
@@ -33,7 +33,7 @@ def test_the_same_demonstrations_are_collected_once(own_cache):
     told = []
     path = collect(TASK, SPEC, on_event=told.append)
     assert own_cache in path.parents
-    assert told == [DemonstrationsDone(done, 5) for done in range(1, 6)]
+    assert told == [Counted("collecting demonstrations", 5, done=done) for done in range(1, 6)]
     before = path.stat()
     assert collect(TASK, SPEC, on_event=told.append) == path
     assert (path.stat().st_mtime_ns, path.stat().st_ino, len(told)) == (before.st_mtime_ns, before.st_ino, 5)
@@ -173,7 +173,7 @@ def test_demonstrations_are_collected_where_there_is_no_file_yet(tmp_path):
     path, told = tmp_path / "later.hdf5", []
     given = spec(demonstrations={"path": str(path), "count": 3, "labels": "phase"})
     found = demonstrations(given, told.append)
-    assert (found.names, told[-1]) == (("demo_0", "demo_1", "demo_2"), DemonstrationsDone(3, 3))
+    assert (found.names, told[-1]) == (("demo_0", "demo_1", "demo_2"), Counted("collecting demonstrations", 3, done=3))
     assert (set(found[0].observations), set(found[0].labels)) == ({"offsets"}, {"phase"})
     assert path.exists()
 

@@ -56,7 +56,7 @@ def expectation(model, ridge, batch, trained=EVERYTHING, discovering=None):
 
 def penalised(model, batch, ridge, discovering=None):
     """log p(ξ) and the log-prior of the ridges, by the formulas, differentiable in the model's parameters."""
-    value = log_likelihood(model.tabulate(batch, discovering), batch.lengths).sum()
+    value = log_likelihood(model(batch.inputs, discovering).tables(batch.actions), batch.lengths).sum()
     for name, parameter in model.named_parameters():
         if not name.endswith("weight") or (discovering and name.startswith("meta_policy")):
             continue

@@ -11,7 +11,7 @@ from planted import LINEAR, small_spec
 from random_demonstrations import demonstrations
 
 import ddco_pyro
-from ddco_pyro.events import LOGS, DemonstrationsDone, EpochEnded, Log, TrainingBegan
+from ddco_pyro.events import LOGS, Counted, EpochEnded, Log, TrainingBegan
 from ddco_pyro.spec import dump_spec
 
 
@@ -71,7 +71,7 @@ def test_restarts_have_names_of_their_own_and_numbers_are_finite(tmp_path, monke
     said, kept = [], Kept()
     monkeypatch.setitem(LOGS, "tensorboard", (kept, "ddco_pyro"))
     with Log("tensorboard", tmp_path / "run", {"seed": 3}, said.append) as log:
-        log(DemonstrationsDone(1, 2))
+        log(Counted("seeds", 2))
         log(TrainingBegan("DDCO", 5))
         assert kept.got == []  # the run folder may not be there yet
         log(EpochEnded(0, "joint", 2, -1.0, float("nan")))

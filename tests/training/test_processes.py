@@ -21,7 +21,7 @@ from planted import small_spec
 from random_demonstrations import of_states
 
 from ddco_pyro.errors import Failed
-from ddco_pyro.events import Counted, DemonstrationsDone
+from ddco_pyro.events import Counted
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.jobs import Workers, run_all
 from ddco_pyro.spec import dump_spec
@@ -225,14 +225,14 @@ def test_more_processes_than_shards_are_refused(whole, tmp_path):
 def test_events_come_call_after_call_and_the_wait_is_announced_once(jobs) -> None:
     def tell(number, on_event):  # pickled by value, as it is in no module
         on_event(Counted("seeds", number))
-        on_event(DemonstrationsDone(number, 3))
+        on_event(Counted("calls", 3, done=number))
 
     told, calls = [], {n: partial(tell, n) for n in range(3)}
     how = {"ordered": True, "beside": True, "waiting": {n: Counted("seeds", n) for n in calls}}
     with run_all(calls, Workers(jobs), "worked", told.append, **how) as results:
         order = [number for number, _ in results]
     assert order == [0, 1, 2]
-    assert told == [event for n in order for event in (Counted("seeds", n), DemonstrationsDone(n, 3))]
+    assert told == [event for n in order for event in (Counted("seeds", n), Counted("calls", 3, done=n))]
 
 
 def test_a_process_that_is_killed_is_one_line(capfd) -> None:
