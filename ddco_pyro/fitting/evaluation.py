@@ -254,7 +254,7 @@ def evaluate(
         engine_check=Engines(**trained.check._asdict()),
         demonstrations=counts,
         measure=measure(scaling.parts),
-        control_dimensions=list(size.control),
+        control_dimensions=[dimension.as_data() for dimension in size.control],  # type: ignore[misc]  # validated
         parameters=parameters(fitted.hierarchy),
         training=training,  # type: ignore[arg-type]  # validated
         seconds={},
