@@ -327,15 +327,14 @@ def degeneracies(metrics: Metrics, spec: Spec, names: Mapping[str, Sequence[str]
 
     :param names: of the choices of each level, such as ``fit.names``.
     """
-    levels = spec.hierarchy.levels if spec.hierarchy else ()
     groups: dict[tuple[int, Kind], list[Finding]] = {}
     rate = metrics.control_frequency
     for finding in diagnose(metrics.options, metrics.divergences, metrics.segments):
-        if finding.kind not in ("never_persisting", "brief") or levels[finding.level - 1].lasts:
+        if finding.kind not in ("never_persisting", "brief") or spec.levels[finding.level - 1].lasts:
             groups.setdefault((finding.level, finding.kind), []).append(finding)
     signs = []
     for (number_of_level, _), findings in groups.items():
-        level = levels[number_of_level - 1].name
+        level = spec.levels[number_of_level - 1].name
         text = _sign(findings, level, names[level], rate)
         signs.append((text, findings[0].advice(spec.training)))
     less = [(text, LABELS) for text, worse in beside_equal_parts(metrics) if worse]

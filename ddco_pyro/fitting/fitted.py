@@ -94,8 +94,7 @@ class Fit:
     @property
     def names(self) -> dict[str, tuple[str, ...]]:
         """The name of each choice of each level, lowest first: ``control``, then the options 1 to k."""
-        levels = self.spec.hierarchy.levels if self.spec.hierarchy else ()
-        return {level.name: choice_names(level.count, self.named.get(level.name, ())) for level in levels}
+        return {one.name: choice_names(one.count, self.named.get(one.name, ())) for one in self.spec.levels}
 
     def name_options(self, level: str, names: Sequence[str]) -> None:
         """Name the options 1 to k of a level, in ``names.yaml`` of the run folder too.
@@ -335,5 +334,5 @@ def load(folder: str | Path, allow_code: bool = False, overrides: Iterable[str] 
     if spec.model_copy(update={"report": fitted.report}) != fitted:
         raise SpecError(f"{folder}: is fitted; only settings of the report can change, such as report.trajectory=KEY")
     hierarchy = read_model(folder, spec)
-    counts = [level.count for level in spec.hierarchy.levels] if spec.hierarchy else []
-    return Fit(spec, hierarchy, Metrics.read(folder, counts), folder, named=read_names(folder, spec) or {})
+    metrics = Metrics.read(folder, [level.count for level in spec.levels])
+    return Fit(spec, hierarchy, metrics, folder, named=read_names(folder, spec) or {})

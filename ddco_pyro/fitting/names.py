@@ -33,7 +33,7 @@ def checked(spec: Spec, given: Any) -> Named:
     :param given: for each level to name, a list of the names of options 1 to k.
     :raises BadInput: there is no such level, or the names are not k different texts.
     """
-    counts = {level.name: level.count for level in spec.hierarchy.levels} if spec.hierarchy else {}
+    counts = {level.name: level.count for level in spec.levels}
     if not counts:
         raise BadInput("there are no options to name; name a run that has options")
     if not isinstance(given, Mapping):
@@ -97,8 +97,7 @@ def matched(
 
     :param segments: the most likely choices of each level, of each demonstration [T].
     """
-    assert spec.hierarchy is not None  # or there are no segments
-    levels, known = spec.hierarchy.levels, label_names(train.attributes)
+    levels, known = spec.levels, label_names(train.attributes)
     labels = dict(zip((level.name for level in levels), spec.demonstrations.labels_by_level(len(levels)), strict=False))
     found: list[NamedByLabel] = []
     for level, choices in zip(levels, segments, strict=True):
@@ -130,7 +129,7 @@ def accepted(spec: Spec, found: Sequence[NamedByLabel]) -> Named:
     Levels without any are left out.
     """
     named: Named = {}
-    for level in spec.hierarchy.levels if spec.hierarchy else ():
+    for level in spec.levels:
         given = spec.training.labels is not None and spec.training.labels.level == level.name
         own = {one.option: one.name for one in found if one.level == level.name and (given or one.agreement >= AGREED)}
         if own:

@@ -193,7 +193,7 @@ class Hierarchy(nn.Module):
                 self.trunk = build(spec.hierarchy.trunk, self.input_shape, None, 1)
         shape = self.read_shape
         levels, below = [], 0
-        for number, level in enumerate(spec.hierarchy.levels if spec.hierarchy else ()):
+        for number, level in enumerate(spec.levels):
             levels.append(Level(f"hierarchy.levels.{number}", level, below, shape, scaling))
             below = level.count
         self.levels = nn.ModuleList(levels)

@@ -192,7 +192,7 @@ def of_run(
 
     :param known: for labels in the file, the names of labels 0, 1, ...
     """
-    counts = {level.name: level.count for level in fit.spec.hierarchy.levels} if fit.spec.hierarchy else {}
+    counts = {level.name: level.count for level in fit.spec.levels}
     names = fit.spec.demonstrations.labels_by_level(len(counts))
     truth = dict(zip(counts, names, strict=bool(names)))
     record, matched = fit.metrics.agreement, dict[str, dict[int, int]]()
@@ -235,11 +235,10 @@ def of_piece(
     :param labels: ground-truth labels of each demonstration, by its name.
     :raises DemonstrationsError: no options explain a demonstration.
     """
-    levels = fit.spec.hierarchy.levels if fit.spec.hierarchy else ()
     for row, (name, steps) in enumerate(zip(piece.names, piece.lengths, strict=True)):
         steps_of = np.arange(steps)
-        known = piece.intervals(row) if intervals else [None] * len(levels)
-        every = zip(levels, piece.segmented(row), piece.posterior.u, known, strict=True)
+        known = piece.intervals(row) if intervals else [None] * len(fit.names)
+        every = zip(fit.spec.levels, piece.segmented(row), piece.posterior.u, known, strict=True)
         each = {  # rounding can exceed 1
             level.name: LevelLabels(options, starts, np.minimum(u[row].numpy()[steps_of, options], 1.0), within)
             for level, (options, starts), u, within in every

@@ -66,6 +66,11 @@ class Spec(Model):
     """Seed of everything random that has no seed of its own."""
 
     @property
+    def levels(self) -> tuple[LevelSpec, ...]:
+        """The levels of options, lowest first; none of a policy without options."""
+        return self.hierarchy.levels if self.hierarchy else ()
+
+    @property
     def demonstrated_task(self) -> str | None:
         """Name of the task in which demonstrations are collected; None where a file is all there is."""
         return self.demonstrations.task or self.task
@@ -123,7 +128,7 @@ class Spec(Model):
             yield "baseline.std", "is for baselines in compare_with; give it in control.std"
 
     def _baselines(self) -> Problems:
-        known = [level.name for level in self._levels]
+        known = [level.name for level in self.levels]
         for number, baseline in enumerate(self.compare_with):
             place, optimizer = f"compare_with.{number}", baseline.optimizer
             if optimizer and optimizer.schedule == "cosine" and self.training.epochs is None:
@@ -134,7 +139,7 @@ class Spec(Model):
                 continue
             if not known:
                 yield place, "mixture takes its experts from a hierarchy; declare one, or leave it out"
-            elif not any(level.lasts for level in self._levels):
+            elif not any(level.lasts for level in self.levels):
                 yield place, "the hierarchy is a mixture already: none of its options lasts; leave it out"
         if self.compare_with and not self.demonstrations.validates:
             yield "compare_with", "needs held-out demonstrations to compare on; raise demonstrations.valid_fraction"
@@ -157,7 +162,7 @@ class Spec(Model):
                 yield place, f"there is no observation {key!r}{nearest(key, self.observed)}; there is: {there}"
 
     def _labelled(self) -> Problems:
-        names, known = self.demonstrations.labels, [level.name for level in self._levels]
+        names, known = self.demonstrations.labels, [level.name for level in self.levels]
         if known and isinstance(names, tuple) and len(names) != len(known):
             text = f"must have a name for each of {len(known)} levels, or be one name for all, got {show([*names])}"
             yield "demonstrations.labels", text
@@ -179,18 +184,14 @@ class Spec(Model):
             return
         for number, emits in enumerate(self._emitted[1:], start=1):
             if "options" not in emits:
-                place = f"levels.{number}.policy" if number < len(self._levels) else "meta_policy"
+                place = f"levels.{number}.policy" if number < len(self.levels) else "meta_policy"
                 yield f"hierarchy.{place}.emits", "training.layerwise: segments needs options here"
-
-    @property
-    def _levels(self) -> tuple[LevelSpec, ...]:
-        return self.hierarchy.levels if self.hierarchy else ()
 
     @property
     def _emitted(self) -> list[tuple[Emission, ...]]:
         """The choices that the policies of each level, and last the meta-policy, emit."""
         meta_policy = [self.hierarchy.meta_policy.emits] if self.hierarchy else []
-        return [*(level.policy.emits for level in self._levels), *meta_policy]
+        return [*(level.policy.emits for level in self.levels), *meta_policy]
 
 
 def _grid_problems(spec: Spec) -> Problems:

@@ -73,7 +73,7 @@ def check_networks(spec: Spec, dimensions: Dimensions) -> Hierarchy:
     :raises SpecError: something in the spec does not fit the observations, the control or this machine, or the model is
         larger than any that can be trained.
     """
-    choices = math.prod(1 + level.count for level in spec.hierarchy.levels) if spec.hierarchy else 1
+    choices = math.prod(1 + level.count for level in spec.levels)
     if choices > MOST_CHOICES:
         raise SpecError(
             f"hierarchy.levels: the levels have {choices} joint choices, at most {MOST_CHOICES} can be summed over; "
@@ -104,10 +104,10 @@ def model_name(spec: Spec) -> str:
     if spec.hierarchy is None:
         assert spec.baseline is not None  # a spec has one or the other
         return spec.baseline.kind
-    memoryless = [level.name for level in spec.hierarchy.levels if not level.lasts]
+    memoryless = [level.name for level in spec.levels if not level.lasts]
     if not memoryless:
         return HIERARCHY
-    return "_".join((MIXTURE, *(memoryless if len(memoryless) < len(spec.hierarchy.levels) else ())))
+    return "_".join((MIXTURE, *(memoryless if len(memoryless) < len(spec.levels) else ())))
 
 
 def check_models(spec: Spec, dimensions: Dimensions) -> dict[str, tuple[Spec, Hierarchy]]:
