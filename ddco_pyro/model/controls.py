@@ -13,7 +13,7 @@ from torch.nn.functional import softplus
 from ddco_pyro.data.controls import ControlPart, same
 from ddco_pyro.data.demonstration import number
 from ddco_pyro.data.demonstrations import Demonstrations
-from ddco_pyro.model.emissions import KINDS, Emission, Product
+from ddco_pyro.model.emissions import KINDS, Emission, Given, Product
 from ddco_pyro.spec import ControlSpec, LearnedStd
 
 ABOVE_FLOOR = 1e-4
@@ -163,11 +163,11 @@ class ControlScaling(nn.Module):
         groups: list[tuple[tuple[int, ...], Emission]] = []
         sizes, at, ends = [KINDS[part.kind].size(part) for part in self.parts], 0, self.ends()
         each = numbers.split(sizes, dim=-1) if len(sizes) > 1 else (numbers,)  # a split's gradient is a copy
-        for dims, part, own in zip(self.groups, self.parts, each, strict=True):
-            low, high, units = (of[list(dims)] for of in (*ends, self.scale.log()))
-            emission = KINDS[part.kind].of(part, own, std[..., at:], units, (low, high))
-            groups.append((dims, emission))
-            at += emission.parameters
+        for dims, part, own, count in zip(self.groups, self.parts, each, self.counts, strict=True):
+            units, low, high = (of[list(dims)] for of in (self.scale.log(), *ends))
+            given = Given(part, own, std[..., at : at + count], units, low, high)
+            groups.append((dims, KINDS[part.kind].of(given)))
+            at += count
         in_order = [dimension for dims, _ in groups for dimension in dims] == list(range(len(self.varying)))
         return groups[0][1] if len(groups) == 1 and in_order else Product(tuple(groups))
 

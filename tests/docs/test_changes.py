@@ -23,10 +23,6 @@ from ddco_pyro.model.emissions.gaussian import Gaussian, continuous_control
 class Laplace(Gaussian):
     helpers: ClassVar = (continuous_control,)
 
-    @classmethod
-    def of(cls, part, numbers, parameters, log_scale, ends):
-        return cls(numbers, parameters[..., : len(part.dims)], log_scale)
-
     def by_dimension(self, actions):
         errors = (actions.unsqueeze(-2) - self.mean).abs() / self.std
         return -errors - self.std.log() - self.log_scale - math.log(2)

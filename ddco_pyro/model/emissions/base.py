@@ -10,7 +10,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, ClassVar, Protocol, Self
+from typing import Any, ClassVar, NamedTuple, Protocol, Self
 
 import numpy as np
 import torch
@@ -75,6 +75,23 @@ class Information:
         return cls(columns, 2 * weight.unsqueeze(-1) * p * (1 - p))
 
 
+class Given(NamedTuple):
+    """What the distribution of a part of the control is made of.
+
+    :param numbers: of the callers' network, [..., K, size].
+    :param std: σ, [n], [K, n] or [..., K, n]; n is 0 where the part is not continuous.
+    :param log_scale: logarithms of the units, [A].
+    :param low: the lower bounds in scaled units, [A]; ``high`` are the upper ones.
+    """
+
+    part: ControlPart
+    numbers: Tensor
+    std: Tensor
+    log_scale: Tensor
+    low: Tensor
+    high: Tensor
+
+
 class Emission(ABC):
     """The distributions of the controls of K callers, [..., K, A].
 
@@ -92,17 +109,9 @@ class Emission(ABC):
     control: ClassVar[Any]
 
     @classmethod
-    def of(
-        cls, part: ControlPart, numbers: Tensor, parameters: Tensor, log_scale: Tensor, ends: tuple[Tensor, Tensor]
-    ) -> Emission:
-        """The distribution of a part of the control; a product joins those of parts, and is of none.
-
-        :param numbers: of the callers' network, [..., K, size].
-        :param parameters: σ of a continuous part, then those of other parts; [n], [K, n] or [..., K, n].
-        :param log_scale: logarithms of the units, [A].
-        :param ends: the lower and the upper bounds in scaled units, [A].
-        """
-        raise NotImplementedError
+    def of(cls, given: Given) -> Self:
+        """The distribution of a part of the control: by default of the network's numbers alone."""
+        return cls(given.numbers)  # type: ignore[call-arg]
 
     @classmethod
     def size(cls, part: ControlPart) -> int:

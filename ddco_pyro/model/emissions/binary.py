@@ -41,13 +41,6 @@ class Binary(Emission):
     control: ClassVar = staticmethod(binary_control)
 
     @classmethod
-    def of(
-        cls, part: ControlPart, numbers: Tensor, parameters: Tensor, log_scale: Tensor, ends: tuple[Tensor, Tensor]
-    ) -> Emission:
-        """The numbers are the logits."""
-        return Binary(numbers)
-
-    @classmethod
     def possible(cls, part: ControlPart, scaled: np.ndarray) -> np.ndarray:
         """Both positions."""
         positions: np.ndarray = (scaled == 0) | (scaled == 1)

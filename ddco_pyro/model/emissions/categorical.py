@@ -37,12 +37,6 @@ class Categorical(Emission):
     control: ClassVar = staticmethod(categorical_control)
 
     @classmethod
-    def of(
-        cls, part: ControlPart, numbers: Tensor, parameters: Tensor, log_scale: Tensor, ends: tuple[Tensor, Tensor]
-    ) -> Emission:
-        return Categorical(numbers)
-
-    @classmethod
     def size(cls, part: ControlPart) -> int:
         return len(part.values)
 

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ddco_pyro.data.controls import ControlPart
-from ddco_pyro.model.emissions.base import LOG_2PI, Emission
+from ddco_pyro.model.emissions.base import LOG_2PI, Given
 from ddco_pyro.model.emissions.gaussian import Gaussian
 
 
@@ -30,12 +29,11 @@ class Clipped(Gaussian):
     high: Tensor
 
     @classmethod
-    def of(
-        cls, part: ControlPart, numbers: Tensor, parameters: Tensor, log_scale: Tensor, ends: tuple[Tensor, Tensor]
-    ) -> Emission:
+    def of(cls, given: Given) -> Gaussian:  # type: ignore[override]
         """The clipped normal distribution; a normal one where no bound is finite."""
-        normal = Gaussian(numbers, parameters[..., : len(part.dims)], log_scale)
-        return Clipped(normal.mean, normal.std, log_scale, *ends) if part.bounded else normal
+        if not given.part.bounded:
+            return Gaussian.of(given)
+        return cls(given.numbers, given.std, given.log_scale, given.low, given.high)
 
     def log_density(self, actions: Tensor) -> Tensor:
         """log π(a | s), [..., K]."""

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ddco_pyro.data.controls import ControlPart
-from ddco_pyro.model.emissions.base import LOG_2PI, Emission, Information, Part
+from ddco_pyro.model.emissions.base import LOG_2PI, Emission, Given, Information, Part
 
 
 def continuous_control(part: Part, mean: np.ndarray, std: np.ndarray, z: np.ndarray | None) -> np.ndarray:
@@ -42,10 +41,8 @@ class Gaussian(Emission):
     control: ClassVar = staticmethod(continuous_control)
 
     @classmethod
-    def of(
-        cls, part: ControlPart, numbers: Tensor, parameters: Tensor, log_scale: Tensor, ends: tuple[Tensor, Tensor]
-    ) -> Emission:
-        return Gaussian(numbers, parameters[..., : len(part.dims)], log_scale)
+    def of(cls, given: Given) -> Self:
+        return cls(given.numbers, given.std, given.log_scale)
 
     @property
     def parameters(self) -> int:

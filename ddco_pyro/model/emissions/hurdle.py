@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from torch.nn.functional import logsigmoid
 from torch.special import ndtr
 
 from ddco_pyro.data.controls import ControlPart
-from ddco_pyro.model.emissions.base import Emission, Information, Part, phi
+from ddco_pyro.model.emissions.base import Emission, Given, Information, Part, phi
 from ddco_pyro.model.emissions.binary import of_switch
 from ddco_pyro.model.emissions.clipped import Clipped
 from ddco_pyro.model.emissions.gaussian import Gaussian, continuous_control
@@ -47,12 +47,8 @@ class Hurdle(Emission):
     control: ClassVar = staticmethod(hurdle_control)
 
     @classmethod
-    def of(
-        cls, part: ControlPart, numbers: Tensor, parameters: Tensor, log_scale: Tensor, ends: tuple[Tensor, Tensor]
-    ) -> Emission:
-        slab = Clipped.of(part, numbers[..., 1:], parameters, log_scale, ends)
-        assert isinstance(slab, Gaussian)
-        return Hurdle(numbers[..., :1], slab)
+    def of(cls, given: Given) -> Self:
+        return cls(given.numbers[..., :1], Clipped.of(given._replace(numbers=given.numbers[..., 1:])))
 
     @classmethod
     def size(cls, part: ControlPart) -> int:

@@ -17,8 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ddco_pyro.data.controls import ControlPart
-from ddco_pyro.model.emissions.base import Emission, Information, Part
+from ddco_pyro.model.emissions.base import Information, Part
 from ddco_pyro.model.emissions.gaussian import Gaussian, continuous_control
 
 NU = 4
@@ -43,12 +42,6 @@ class Student(Gaussian):
     further_noise: ClassVar[int] = NU
     helpers: ClassVar = (continuous_control,)
     control: ClassVar = staticmethod(student_control)
-
-    @classmethod
-    def of(
-        cls, part: ControlPart, numbers: Tensor, parameters: Tensor, log_scale: Tensor, ends: tuple[Tensor, Tensor]
-    ) -> Emission:
-        return Student(numbers, parameters[..., : len(part.dims)], log_scale)
 
     def log_density(self, actions: Tensor) -> Tensor:
         """log t_ν(a; μ, σ²), float64 [..., K]."""
