@@ -21,7 +21,7 @@ from ddco_pyro.model.batch import LARGEST_SCALED
 from ddco_pyro.model.encoder import ObservationEncoder
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs, States
-from ddco_pyro.model.tables import Step, complete
+from ddco_pyro.model.tables import Chain, complete
 from ddco_pyro.names import option_name
 from ddco_pyro.spec import TASK, OptionExecution
 
@@ -118,7 +118,7 @@ class Controller:
         key = self.hierarchy.scaling.relative_to
         return emitted if key is None else emitted + self._window.last[key]
 
-    def _chosen(self, now: Step, generator: np.random.Generator) -> tuple[Tensor, ...]:
+    def _chosen(self, now: Chain, generator: np.random.Generator) -> tuple[Tensor, ...]:
         """The choice of each level, [1], lowest first."""
         if self.options == "marginal":
             self._log_marginal = arrive(self._log_marginal, now)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ddco_pyro.model.tables import NEVER, Chain, Step
+from ddco_pyro.model.tables import NEVER, Chain
 
 
 def log_sum(values: Tensor) -> Tensor:
@@ -32,7 +32,7 @@ def log_likelihood(chain: Chain) -> Tensor:
     return log_sum(message.flatten(1))
 
 
-def arrive(message: Tensor | None, now: Step) -> Tensor:
+def arrive(message: Tensor | None, now: Chain) -> Tensor:
     """The predicted log-mass of the joint choices at step t, before its control, [N, C_D, ..., C_1].
 
     :param message: that at t - 1, with its control; None for t = 0.
@@ -83,7 +83,7 @@ class Filter:
         self.log_likelihood = torch.zeros(1, dtype=torch.float64)
         self._message: Tensor | None = None
 
-    def predict(self, now: Step) -> tuple[Tensor, ...]:
+    def predict(self, now: Chain) -> tuple[Tensor, ...]:
         """p(h^d_t | s_0..t, a_0..t-1) of every level, lowest first, each float64 [N, C_d]."""
         message = arrive(self._message, now)
         self._message = message if now.evidence is None else _normalised(message + now.evidence)

@@ -20,7 +20,7 @@ from torch.distributions import constraints
 from torch.nn.functional import one_hot
 
 from ddco_pyro.model.emissions import Steps
-from ddco_pyro.model.tables import NEVER, Chain, Step
+from ddco_pyro.model.tables import NEVER, Chain
 
 
 class Tabulated(TorchDistribution):
@@ -149,7 +149,7 @@ def _of_caller(values: Tensor, caller: Tensor) -> Tensor:
     return values.expand(*shape, *values.shape[-2:]).gather(-2, index).squeeze(-2)
 
 
-def choose(t: int, now: Step, previous: tuple[Tensor, ...] | None) -> tuple[Tensor, ...]:
+def choose(t: int, now: Chain, previous: tuple[Tensor, ...] | None) -> tuple[Tensor, ...]:
     """Sample sites ``b_{d}_{t}`` and ``h_{d}_{t}``: the choices (h^1, ..., h^D) at t, given those at t - 1.
 
     Terminations go bottom-up and selections top-down; without ``previous`` (t = 0) everything is selected.
@@ -169,7 +169,7 @@ def choose(t: int, now: Step, previous: tuple[Tensor, ...] | None) -> tuple[Tens
     return tuple(reversed(choices))
 
 
-def _terminate(t: int, now: Step, previous: tuple[Tensor, ...], rows: Tensor) -> list[Tensor]:
+def _terminate(t: int, now: Chain, previous: tuple[Tensor, ...], rows: Tensor) -> list[Tensor]:
     """(b^1_t, ..., b^D_t): b^d can be 1 only where b^{d-1} is."""
     keep = torch.tensor([0.0, NEVER], dtype=torch.float64)
     below = torch.ones_like(rows)

@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -185,27 +184,20 @@ class Chain:
         """The number D of option levels."""
         return len(self.selection)
 
-    def steps(self) -> list[Step]:
-        """The chain's T steps, unbound once: slicing inside a loop over time would make its gradient O(T²)."""
+    def steps(self) -> list[Chain]:
+        """The chain's T steps, whose tables have no time dimension.
+
+        They are unbound once: slicing inside a loop over time would make its gradient O(T²).
+        """
         selection = [table.unbind(1) for table in self.selection]
         termination = [table.unbind(1) for table in self.termination]
         nothing = (None,) * self.alive.shape[1]
         evidence = nothing if self.evidence is None else self.evidence.unbind(1)
         emission = nothing if self.emission is None else self.emission.unbind(1)
         return [
-            Step(tuple(s[t] for s in selection), tuple(b[t] for b in termination), evidence[t], emission[t], alive)
+            Chain(tuple(s[t] for s in selection), tuple(b[t] for b in termination), evidence[t], emission[t], alive)
             for t, alive in enumerate(self.alive.unbind(1))
         ]
-
-
-class Step(NamedTuple):
-    """One step of a :class:`Chain`: its tables without the time dimension."""
-
-    selection: tuple[Tensor, ...]
-    termination: tuple[Tensor, ...]
-    evidence: Tensor | None
-    emission: Tensor | None
-    alive: Tensor
 
 
 def complete(tables: Tables, lengths: Tensor) -> Chain:
