@@ -13,8 +13,7 @@ from pyro.ops.contract import contract_tensor_tree
 from torch import Tensor
 
 from ddco_pyro.inference import fused, logspace
-from ddco_pyro.model.ahmm import Scored, ahmm
-from ddco_pyro.model.emissions import Steps
+from ddco_pyro.model.ahmm import Scored, Steps, ahmm
 from ddco_pyro.model.outputs import Outputs
 from ddco_pyro.model.tables import Tables, complete
 

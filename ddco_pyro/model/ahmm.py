@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.distributions import constraints
 from torch.nn.functional import one_hot
 
-from ddco_pyro.model.emissions import Steps
+from ddco_pyro.model.emissions import Emission
 from ddco_pyro.model.tables import NEVER, Chain
 
 
@@ -74,6 +74,10 @@ class Scored:
 
     def steps(self) -> list[Scored]:
         return [Scored(table) for table in self.table.unbind(1)]
+
+
+Steps = Emission | Scored
+"""What the program scores or draws a control with at each step."""
 
 
 class Acting(TorchDistribution):

@@ -11,7 +11,7 @@ from typing import get_args
 
 import numpy as np
 
-from ddco_pyro.model.emissions.base import Emission, Given, Information, Part, Steps
+from ddco_pyro.model.emissions.base import Emission, Given, Information, Part
 from ddco_pyro.model.emissions.product import Product
 from ddco_pyro.spec import Kind
 

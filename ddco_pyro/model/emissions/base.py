@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any, ClassVar, NamedTuple, Protocol, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -27,23 +27,6 @@ Part = Mapping[str, Any]
 def phi(z: float) -> float:
     """The standard normal distribution function."""
     return 0.5 * math.erfc(-z / math.sqrt(2))
-
-
-class Steps(Protocol):
-    """What the Pyro program scores or draws a control with at each step."""
-
-    @property
-    def shape(self) -> torch.Size:
-        """[..., K, A]."""
-        ...
-
-    def log_density(self, actions: Tensor) -> Tensor:
-        """log π(a | s) of each caller for controls [..., A], [..., K]."""
-        ...
-
-    def steps(self) -> Sequence[Any]:
-        """One emission [N, K, A] for each of T steps, from [N, T, K, A]; unbound once."""
-        ...
 
 
 @dataclass(frozen=True)
