@@ -35,10 +35,6 @@ from ddco_pyro.statistics import paired, paired_difference, rate, worth
 from ddco_pyro.training.data import train_and_valid
 
 
-class CompareError(BadInput):
-    """Runs that cannot be compared; one line with the runs and the reason."""
-
-
 @dataclass(frozen=True)
 class Row:
     """One run, in nats over all held-out trajectories.
@@ -120,14 +116,13 @@ def compare(runs: Sequence[str | Path], allow_code: bool = False) -> Comparison:
     (2, 0.0)
 
     :param allow_code: import the user code that the specs name.
-    :raises CompareError: there are fewer than two runs, one is named twice, or they held out different data.
-    :raises RunError: a folder is not a finished run.
+    :raises BadInput: there are fewer than two runs, one is named twice or unfinished, or they held out different data.
     """
     folders = [path_of(run, "runs") for run in runs]
     if len({folder.resolve() for folder in folders}) < len(folders):
-        raise CompareError("the same run is given twice; name each once")
+        raise BadInput("the same run is given twice; name each once")
     if len(folders) < 2:
-        raise CompareError("one run alone cannot be compared; name at least two, such as RUN and RUN/baselines/flat")
+        raise BadInput("one run alone cannot be compared; name at least two, such as RUN and RUN/baselines/flat")
     fits = [load(folder, allow_code) for folder in folders]
     demos = _shared(fits)
     values = [_log_likelihoods(fit, own) for fit, own in zip(fits, demos, strict=True)]
@@ -167,13 +162,13 @@ def _row(rank: int, fit: Fit, values: np.ndarray, best: np.ndarray, lengths: Seq
 def _shared(fits: Sequence[Fit]) -> list[Demonstrations]:
     """The held-out demonstrations of each run, which are the same ones in the same order.
 
-    :raises CompareError: they differ, or the runs score other dimensions of the control.
+    :raises BadInput: they differ, or the runs score other dimensions of the control.
     """
     own = [train_and_valid(fit.spec, fit.demonstrations).get("valid") for fit in fits]
     shared: list[Demonstrations] = []
     for fit, demos in zip(fits, own, strict=True):
         if demos is None:
-            raise CompareError(
+            raise BadInput(
                 f"{fit.place}: held nothing out (demonstrations.valid_fraction: 0); there is nothing to compare"
             )
         if shared:
@@ -190,13 +185,13 @@ def _check_same(first: Fit, ours: Demonstrations, second: Fit, theirs: Demonstra
     if only:
         where = (first if only[0] in ours.names else second).place
         remedy = "fit both with the same demonstrations, valid_fraction and seed"
-        raise CompareError(f"{lead}: {only[0]} was held out by {where} alone; {remedy}")
+        raise BadInput(f"{lead}: {only[0]} was held out by {where} alone; {remedy}")
     for mine, yours in zip(ours, theirs.select(ours.names), strict=True):
         both = [key for key in mine.observations if key in yours.observations]
         arrays = {f"obs/{key}": (mine.observations[key], yours.observations[key]) for key in both}
         arrays["actions"] = (mine.actions, yours.actions)
         if different := ", ".join(key for key, (left, right) in arrays.items() if not same(left, right)):
-            raise CompareError(f"{lead}: {mine.name} has other {different}; fit both to the same demonstrations")
+            raise BadInput(f"{lead}: {mine.name} has other {different}; fit both to the same demonstrations")
 
 
 def _check_measure(first: Fit, second: Fit) -> None:
@@ -205,13 +200,13 @@ def _check_measure(first: Fit, second: Fit) -> None:
     if ours != theirs:
         dimension = min(ours ^ theirs)
         scored, left = (first, second) if dimension in ours else (second, first)
-        raise CompareError(
+        raise BadInput(
             f"{first.place} and {second.place} score different things: control dimension {dimension} is in the "
             f"likelihood of {scored.place} and not in that of {left.place}; fit both to the same demonstrations, "
             "with the same version"
         )
     if different := difference(first.hierarchy.scaling.parts, second.hierarchy.scaling.parts):
-        raise CompareError(
+        raise BadInput(
             f"{first.folder} and {second.folder} measure different things: {different}; densities and probabilities "
             "cannot be ranked, so fit both with the same control.kind"
         )
@@ -220,12 +215,12 @@ def _check_measure(first: Fit, second: Fit) -> None:
 def _log_likelihoods(fit: Fit, demos: Demonstrations) -> np.ndarray:
     """log p(ξ) of each demonstration.
 
-    :raises CompareError: a value is not the one in ``metrics.json``.
+    :raises BadInput: a value is not the one in ``metrics.json``.
     """
     values = np.concatenate([piece.log_likelihood for piece in fit.infer(demos, held_out=True)])
     for name, value in zip(demos.names, values, strict=True):
         if not fit.was_held_out(name, float(value)):
-            raise CompareError(f"{fit.place}: {name} has changed since this run was fitted to it; fit it again")
+            raise BadInput(f"{fit.place}: {name} has changed since this run was fitted to it; fit it again")
     return values
 
 

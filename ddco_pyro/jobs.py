@@ -35,22 +35,18 @@ def from_outside(doing: str, fewer: str = "--jobs") -> str:
     )
 
 
-class BackendError(BadInput):
-    """Work cannot be done by these processes."""
-
-
 @dataclass(frozen=True)
 class Workers:
     """Processes that do calls: ``jobs`` of them, -1: one for each core of this machine or of joblib's backend.
 
-    :raises BackendError: ``jobs`` is not a number of processes.
+    :raises BadInput: ``jobs`` is not a number of processes.
     """
 
     jobs: int = ALL_CORES
 
     def __post_init__(self) -> None:
         if self.jobs != ALL_CORES and self.jobs < 1:
-            raise BackendError(f"--jobs {self.jobs}: give a number of processes, or -1 for one on each core")
+            raise BadInput(f"--jobs {self.jobs}: give a number of processes, or -1 for one on each core")
 
     def number(self, calls: int = sys.maxsize) -> int:
         """The number of processes for so many calls, at most one for each call."""

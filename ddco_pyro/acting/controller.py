@@ -96,7 +96,7 @@ class Controller:
     def act(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
         """The control [A], in the control's own units.
 
-        :raises ObservationError: an observation is missing, not finite, or of another shape than in training.
+        :raises BadInput: an observation is missing, not finite, or of another shape than in training.
         """
         generator = np.random.default_rng([self.seed, self.time])
         with torch.no_grad():
@@ -154,10 +154,6 @@ class Chosen(Messenger):
 # --- observations that arrive one at a time ---------------------------------------------------------------------------
 
 
-class ObservationError(BadInput):
-    """An observation that is missing, or of another shape than in the demonstrations."""
-
-
 class Window:
     """The last two observations, for what the encoder makes of both.
 
@@ -171,7 +167,7 @@ class Window:
     def inputs(self, observation: Mapping[str, np.ndarray]) -> Inputs:
         """The networks' inputs for an observation, N = T = 1.
 
-        :raises ObservationError: an observation is missing, has another shape than in training, is not finite, or too
+        :raises BadInput: an observation is missing, has another shape than in training, is not finite, or too
             large for networks.
         """
         now = {key: self._checked(observation, key, shape) for key, shape in self.encoder.shapes.items()}
@@ -188,16 +184,16 @@ class Window:
     def _checked(self, observation: Mapping[str, np.ndarray], key: str, shape: tuple[int, ...]) -> np.ndarray:
         if not isinstance(observation, Mapping):
             given = type(observation).__name__
-            raise ObservationError(f"an observation has to be a mapping, such as {{{key!r}: array}}; got {given}")
+            raise BadInput(f"an observation has to be a mapping, such as {{{key!r}: array}}; got {given}")
         if key not in observation:
             known = ", ".join(sorted(map(str, observation)))
-            raise ObservationError(f"the observation has no {key!r} (it has: {known})")
+            raise BadInput(f"the observation has no {key!r} (it has: {known})")
         given = observation[key]
         if key == TASK and isinstance(given, str):
             given = one_hot(given, self.encoder.tasks)
         value = numbers(f"observation {key!r}", given, tuple(shape))
         if key in self.encoder.images and value.dtype != np.uint8:
-            raise ObservationError(f"observation {key!r} is {value.dtype}, it has to be uint8")
+            raise BadInput(f"observation {key!r} is {value.dtype}, it has to be uint8")
         return value
 
 
@@ -205,29 +201,29 @@ def numbers(what: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
     """An array of finite real numbers.
 
     :param what: the name of the value in errors.
-    :raises ObservationError: the value is something else, or has another shape.
+    :raises BadInput: the value is something else, or has another shape.
     """
     try:
         array = np.asarray(value)
     except (ValueError, TypeError, RuntimeError) as error:
-        raise ObservationError(f"{what} is no array: {' '.join(str(error).split())}") from None
+        raise BadInput(f"{what} is no array: {' '.join(str(error).split())}") from None
     if array.shape != shape:
-        raise ObservationError(f"{what} has shape {array.shape}, the demonstrations had {shape}")
+        raise BadInput(f"{what} has shape {array.shape}, the demonstrations had {shape}")
     if array.dtype.kind not in NUMBERS:
-        raise ObservationError(f"{what} is {array.dtype}, it has to be numbers")
+        raise BadInput(f"{what} is {array.dtype}, it has to be numbers")
     if not usable(array).all():
-        raise ObservationError(f"{what} is {'too large' if np.isfinite(array).all() else 'not finite'}")
+        raise BadInput(f"{what} is {'too large' if np.isfinite(array).all() else 'not finite'}")
     return array
 
 
 def refuse_large(what: str, scaled: np.ndarray) -> None:
     """Refuse numbers in scaled units that are too large for networks.
 
-    :raises ObservationError: one of them is.
+    :raises BadInput: one of them is.
     """
     largest = np.abs(scaled).max(initial=0.0)
     if largest > LARGEST_SCALED:
-        raise ObservationError(
+        raise BadInput(
             f"{what} is {number(float(f'{largest:.2g}'))} once it is scaled, and networks take at most "
             f"{LARGEST_SCALED:g}; is it in the demonstrations' units?"
         )

@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ddco_pyro.acting.controller import ObservationError, Window, fitted, numbers, refuse_large
+from ddco_pyro.acting.controller import Window, fitted, numbers, refuse_large
+from ddco_pyro.errors import BadInput
 from ddco_pyro.inference.logspace import Filter
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks import Inputs, States
@@ -62,11 +63,11 @@ class Monitor:
         """The probability of each choice of each level by name, p(h_t | s_0..t, a_0..t-1).
 
         :param control: a_{t-1} [A], in the control's own units; None at the first step, and only there.
-        :raises ObservationError: an observation or the control is missing, not finite, or of another shape than in
+        :raises BadInput: an observation or the control is missing, not finite, or of another shape than in
             training. A refused step changes nothing.
         """
         if self._outputs is None and control is not None:
-            raise ObservationError("no control comes before the first observation: leave it out")
+            raise BadInput("no control comes before the first observation: leave it out")
         scaled = None if self._outputs is None else self._scaled(control)
         with torch.no_grad():
             inputs = self._window.inputs(observation)
@@ -96,14 +97,14 @@ class Monitor:
     def _scaled(self, control: np.ndarray | None) -> Tensor:
         scaling = self.hierarchy.scaling
         if control is None:
-            raise ObservationError(
+            raise BadInput(
                 f"the control applied since the last observation is needed, shape ({scaling.size},); got none"
             )
         row = numbers("the control", control, (scaling.size,))[None]
         if scaling.relative_to is not None:
             row = row - self._window.last[scaling.relative_to]
         if problem := scaling.impossible("the control", row):
-            raise ObservationError(f"{problem}; is it in the demonstrations' units?")
+            raise BadInput(f"{problem}; is it in the demonstrations' units?")
         scaled = scaling.scaled(row)
         refuse_large("the control", scaled)
         return torch.as_tensor(scaled).float().reshape(1, 1, -1)

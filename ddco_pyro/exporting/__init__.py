@@ -32,10 +32,6 @@ FILES = {"controller.json", "weights.npz", "controller.onnx", "runner.py", "chec
 DEFECT = "with networks of this library that is a defect: report it"
 
 
-class ExportError(Failed):
-    """An exported form acts differently from the original, or cannot be made."""
-
-
 Exported = dict[str, tuple[float, float]]
 """Form to (largest difference of a control, median seconds of a step)."""
 
@@ -51,7 +47,7 @@ def export(fit: Fit, folder: str | Path, onnx: bool = False) -> Exported:
     :func:`~ddco_pyro.exporting.recording.tolerance`. If all forms agree, the folder replaces an earlier export;
     otherwise nothing changes.
 
-    :raises ExportError: a form acts differently, or cannot be made.
+    :raises Failed: a form acts differently, or cannot be made.
     :raises BadInput: ``folder`` holds other files, or numpy cannot evaluate the networks and no ONNX is asked for.
 
     >>> [*ddco_pyro.export(fit, "controller")]  # it acts like the original
@@ -119,7 +115,7 @@ def _write_verified(fit: Fit, folder: Path, onnx: bool = False) -> Exported:
         if not difference < allowed:
             cause = "the weights are so large that float32 is too coarse for them" if allowed == MOST else DEFECT
             what = f"as {form} it differs from the run by {difference:.1e}, of {allowed:.1e} that are allowed"
-            raise ExportError(f"nothing was written: {what}; {cause}")
+            raise Failed(f"nothing was written: {what}; {cause}")
     return replayed
 
 
@@ -129,10 +125,10 @@ def _one_line_errors(what: str) -> Iterator[None]:
     try:
         yield
     except ImportError as error:
-        raise ExportError(f"--onnx needs {error.name}; install it with: pip install 'ddco-pyro[export]'") from error
+        raise Failed(f"--onnx needs {error.name}; install it with: pip install 'ddco-pyro[export]'") from error
     except Exception as error:
         text = " ".join(str(error).split())[:300]
-        raise ExportError(f"nothing was written: {what}: {type(error).__name__}: {text}") from error
+        raise Failed(f"nothing was written: {what}: {type(error).__name__}: {text}") from error
 
 
 def _onnx(program: StepProgram) -> bytes:
@@ -160,7 +156,7 @@ def export_policy(fit: Fit, folder: Path) -> Exported:
     installed, which imports the folder's ``runner.py``: ``lerobot-eval --policy.path=FOLDER``.
 
     :raises BadInput: numpy cannot evaluate the networks, or the folder holds other files.
-    :raises ExportError: the controller acts differently.
+    :raises Failed: the controller acts differently.
     """
     _refuse_others(folder, FILES | OWN, "--lerobot")
     with whole_folder(folder) as temporary:

@@ -24,14 +24,6 @@ FORMAT = 5
 """The version of the run folder's format."""
 
 
-class OtherDemonstrations(BadInput):
-    """Demonstrations are not those of a run."""
-
-
-class OtherVersion(BadInput):
-    """A run folder has another format."""
-
-
 class Digest(Record):
     """The digest of demonstrations: ``names`` in order, SHA-256 of controls, observations and labels, and ``masks``.
 
@@ -109,13 +101,13 @@ def recorded(folder: Path) -> Digest | None:
     """The digest of the demonstrations of a run or a selection; None where nothing is kept yet.
 
     :raises Damaged: ``demonstrations.json`` is damaged.
-    :raises OtherVersion: the folder was written in another format.
+    :raises BadInput: the folder was written in another format.
     """
     if not (path := folder / NAME).exists():
         return None
     kept = read_record(path, Digest, "fit again into another --out")
     if kept.format != FORMAT:
-        raise OtherVersion(
+        raise BadInput(
             f"{folder}: this run was written by version {kept.format} of the run folder's format, and version {FORMAT} "
             "is read here: fit again"
         )
@@ -126,14 +118,14 @@ def record(folder: Path, demos: Demonstrations, known: Digest | None = None) -> 
     """Write the digest of demonstrations into a new run folder, or compare it with the folder's.
 
     :param known: an earlier digest, as in :func:`digest`.
-    :raises OtherDemonstrations: the folder is a run of other demonstrations.
+    :raises BadInput: the folder is a run of other demonstrations.
     :raises Damaged: ``demonstrations.json`` is damaged.
     """
     kept = recorded(folder)
     if kept is None:
         write_text(folder / NAME, digest(demos, known).model_dump_json(indent=1) + "\n")
     elif different := difference(kept, digest(demos, kept)):
-        raise OtherDemonstrations(
+        raise BadInput(
             f"{folder}: is a run of other demonstrations ({different}); bring back those that it was fitted to, or "
             "choose another --out for these"
         )

@@ -58,10 +58,6 @@ PACKAGES = ("ddco-pyro", "torch", "pyro-ppl", "numpy", "dm-control", "mujoco", "
 """Packages whose versions are in ``metrics.json``, where they are installed."""
 
 
-class NotFinite(Failed):
-    """A log-likelihood is NaN or infinite."""
-
-
 @dataclass(frozen=True)
 class _Part:
     """A model on a part of the demonstrations.
@@ -159,11 +155,11 @@ def _active(pieces: Iterable[Inferred], sizes: Sequence[int]) -> dict[str, Tenso
 def _finite(fit: Fit, piece: Inferred) -> np.ndarray:
     """log p(ξ) of each demonstration, nats, [N].
 
-    :raises NotFinite: one is NaN or infinite.
+    :raises Failed: one is NaN or infinite.
     """
     for name, value in zip(piece.names, piece.log_likelihood, strict=True):
         if not np.isfinite(value):
-            raise NotFinite(
+            raise Failed(
                 f"{fit.place}: the log-likelihood of {name} under the fitted model is {value}; look at its values "
                 "(ddco-pyro inspect), lower training.optimizer.lr, or leave it out (demonstrations.exclude)"
             )
@@ -191,7 +187,7 @@ def evaluate(
     :param parts: training (``train``) and held-out (``valid``) demonstrations.
     :param contained: names of the mixtures among the baselines that the model contains.
     :param whole: whether it is a model with its baselines, which has a marginal and names of options.
-    :raises NotFinite: a log-likelihood is NaN or infinite.
+    :raises Failed: a log-likelihood is NaN or infinite.
     """
     demos, scaling, training = fitted.demonstrations, fitted.hierarchy.scaling, trained.summary
     ours = {name: _Part.of(fitted, part, name == "valid") for name, part in parts.items()}

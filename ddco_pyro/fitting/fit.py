@@ -25,7 +25,7 @@ from ddco_pyro.fitting.library import check_library, dimensions_for, prior_of
 from ddco_pyro.fitting.names import accepted, read_names, write_names
 from ddco_pyro.fitting.run import Clock, claim, claimed, is_finished, write_model
 from ddco_pyro.inference import compile_all
-from ddco_pyro.jobs import BackendError, Workers, run_all
+from ddco_pyro.jobs import Workers, run_all
 from ddco_pyro.metrics import Metrics, Seeds, write_table
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.spec import Spec, load_spec, with_overrides
@@ -75,17 +75,16 @@ def fit(
         more than one needs the usual ``if __name__ == "__main__":``.
     :param resume: whether ``out`` may hold the finished run.
     :param keep: whether ``out`` has a copy of demonstrations from memory; False where the spec's file has them.
-    :raises BackendError: there is no such number of jobs, or ``torchrun`` started too many processes.
+    :raises BadInput: there is no such number of jobs, ``torchrun`` started too many processes, or the folder holds
+        something else, such as a run of other demonstrations.
     :raises SpecError: something in the spec does not fit the demonstrations.
     :raises DemonstrationsError: the demonstrations cannot be used.
-    :raises RunError: the folder holds something else.
-    :raises OtherDemonstrations: the folder is a run of other demonstrations.
     :raises TrainingError: training stopped; the checkpoints stay.
     """
     spec, folder = spec if isinstance(spec, Spec) else load_spec(spec), None if out is None else path_of(out, "out")
     processes, shards = Ranks.here().size, spec.training.shards
     if processes > shards:
-        raise BackendError(
+        raise BadInput(
             f"torchrun started {processes} processes, but a minibatch is cut into training.shards={shards}; add "
             f"--set training.shards={processes} (results depend on the shards, not on the processes)"
         )

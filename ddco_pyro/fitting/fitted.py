@@ -21,7 +21,7 @@ from ddco_pyro.evaluation.inferred import Inferred, Segmentation, infer
 from ddco_pyro.fitting.digest import record, recorded, usual_of
 from ddco_pyro.fitting.draws import Draws, draw
 from ddco_pyro.fitting.names import Named, checked, read_names, write_names
-from ddco_pyro.fitting.run import RunError, is_finished, read_model
+from ddco_pyro.fitting.run import is_finished, read_model
 from ddco_pyro.inference import Posterior
 from ddco_pyro.metrics import Metrics
 from ddco_pyro.model.hierarchy import Hierarchy
@@ -80,10 +80,10 @@ class Fit:
     def run_folder(self) -> Path:
         """The run folder.
 
-        :raises RunError: the fit has none.
+        :raises BadInput: the fit has none.
         """
         if self.folder is None:
-            raise RunError("this fit has no run folder; fit with out=FOLDER, which this needs")
+            raise BadInput("this fit has no run folder; fit with out=FOLDER, which this needs")
         return self.folder
 
     @property
@@ -113,7 +113,7 @@ class Fit:
     def demonstrations(self) -> Demonstrations:
         """The demonstrations of the fit, training and held out; those of a run are read when asked for.
 
-        :raises OtherDemonstrations: their file holds other demonstrations.
+        :raises BadInput: their file holds other demonstrations.
         """
         if self.given is not None:
             return self.given
@@ -316,10 +316,9 @@ def load(folder: str | Path, allow_code: bool = False, overrides: Iterable[str] 
     :param allow_code: import the user code (``module:name``) that its spec names; nothing else in a run is ever
         executed.
     :param overrides: other settings of the report, such as ``"report.trajectory=pose"``.
-    :raises RunError: the folder has no finished fit, or its model is of another spec.
-    :raises OtherVersion: the folder was written in another format.
+    :raises BadInput: the folder has no finished fit, or one of another format; or the model, or ``names.yaml``, is of
+        another spec.
     :raises Damaged: the model or ``metrics.json`` is damaged.
-    :raises BadInput: ``names.yaml`` does not fit the spec.
     :raises SpecError: its spec names user code, and that is not allowed; or an override is no setting of the report.
     """
     folder = path_of(folder, "folder")
@@ -328,7 +327,7 @@ def load(folder: str | Path, allow_code: bool = False, overrides: Iterable[str] 
         what = "not a run folder" if "spec.yaml" in missing else "an unfinished run: fit it again to continue it"
         if (folder / "folds.json").exists():
             what = f"a selection; the fit of what it chose is in {folder / 'fit'} once it is done"
-        raise RunError(f"{folder}: {what} (it has no {missing[0]})")
+        raise BadInput(f"{folder}: {what} (it has no {missing[0]})")
     recorded(folder)  # or the format is another, and so are the keys of the spec
     fitted, spec = (load_spec(folder / "spec.yaml", those, allow_code) for those in ((), overrides))
     if spec.model_copy(update={"report": fitted.report}) != fitted:

@@ -42,7 +42,7 @@ STORED = "library.json"
 def library_of(spec: Spec) -> Fit | None:
     """The model of a spec's library that has the same networks: of the run, or of one of its baselines.
 
-    :raises RunError: there is no such run.
+    :raises BadInput: there is no such run.
     :raises SpecError: no model of the run has the same observations, control and networks.
     """
     if (given := spec.training.library) is None:

@@ -6,9 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from ddco_pyro.acting.controller import Controller
+from ddco_pyro.errors import BadInput
 from ddco_pyro.events import Counted, OnEvent, ignore
 from ddco_pyro.fitting.fitted import Fit
-from ddco_pyro.fitting.run import RunError
 from ddco_pyro.metrics import Method, Rollouts, Seeds, write_table
 from ddco_pyro.names import method
 from ddco_pyro.simulation.episodes import run_episodes, summarize
@@ -25,14 +25,14 @@ def policies(fit: Fit, best: bool = False) -> dict[str, Policy | str]:
     """The policies to roll out, by name: scripted ones, baselines, and the model itself last.
 
     :param best: of the fitted ones, :attr:`Fit.best` alone.
-    :raises RunError: the spec has no task, or names a scripted policy that the task lacks.
+    :raises BadInput: the spec has no task, or names a scripted policy that the task lacks.
     """
     if fit.spec.task is None:
-        raise RunError(f"{fit.place}: its spec has no task, so there is nothing to roll out in")
+        raise BadInput(f"{fit.place}: its spec has no task, so there is nothing to roll out in")
     known = find_task(fit.spec.task).policies
     unknown = [name for name in fit.spec.rollout.policies if name not in known]
     if unknown:
-        raise RunError(
+        raise BadInput(
             f"rollout.policies: task {fit.spec.task!r} has no {', '.join(unknown)} (it has: {', '.join(known)})"
         )
     scripted: dict[str, Policy | str] = {name: name for name in fit.spec.rollout.policies}
@@ -59,7 +59,7 @@ def roll_out(
     :param resume: return the finished rollouts of the run where seeds and methods are the same.
     :param best: of the fitted models, roll out :attr:`Fit.best` alone.
     :returns: ``rollouts`` of the fit's metrics.
-    :raises RunError: there is no task, or the fit has no folder.
+    :raises BadInput: there is no task, or the fit has no folder.
     """
     folder = fit.run_folder
     seeds = range(FIRST_SEED, FIRST_SEED + episodes)

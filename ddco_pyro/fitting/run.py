@@ -21,21 +21,17 @@ from ddco_pyro.training.checkpoint import copy_of
 from ddco_pyro.training.networks import Dimensions, build_hierarchy
 
 
-class RunError(BadInput):
-    """A folder is not the run that it is taken for."""
-
-
 @contextmanager
 def claimed(folder: Path, spec: Spec, resume: bool = True) -> Iterator[None]:
     """Inside, the folder is the run of this spec (:func:`claim`), and no other process works on it.
 
     What a killed process has left half written is removed.
 
-    :raises RunError: the folder is a file, or as :func:`claim`.
+    :raises BadInput: the folder is a file, or as :func:`claim`.
     :raises Busy: another process works on the folder.
     """
     if folder.exists() and not folder.is_dir():
-        raise RunError(f"{folder}: is a file; choose another --out")
+        raise BadInput(f"{folder}: is a file; choose another --out")
     with only_one(folder):
         claim(folder, spec, resume)
         for part in (folder, *(path for path in folder.rglob("*") if path.is_dir())):
@@ -50,7 +46,7 @@ def claim(folder: Path, spec: Spec, resume: bool = True) -> None:
     A spec that differs in its ``report`` alone is the same, and replaces the one in the folder.
 
     :param resume: whether the folder may hold the finished run.
-    :raises RunError: the folder holds something else, or the finished run although it may not.
+    :raises BadInput: the folder holds something else, or the finished run although it may not.
     """
     text, path = dump_spec(spec), folder / "spec.yaml"
     if path.exists():
@@ -58,15 +54,15 @@ def claim(folder: Path, spec: Spec, resume: bool = True) -> None:
         with suppress(SpecError):  # user code is not imported by reading its name
             same_model = same or load_spec(path, allow_code=True).model_copy(update={"report": spec.report}) == spec
         if not same_model:
-            raise RunError(f"{folder}: holds a run of another spec; choose another --out or remove it")
+            raise BadInput(f"{folder}: holds a run of another spec; choose another --out or remove it")
         if not resume and is_finished(folder) and (folder / "report.html").exists():  # what `fit` writes last
-            raise RunError(
+            raise BadInput(
                 f"{folder}: holds a run of this spec already; show it with --resume, or choose another --out"
             )
         if same:
             return
     elif folder.exists() and set(folder.iterdir()) - set(leftovers(folder)):
-        raise RunError(f"{folder}: is not empty and not a run; choose another --out")
+        raise BadInput(f"{folder}: is not empty and not a run; choose another --out")
     write_text(path, text)
 
 
@@ -91,7 +87,7 @@ def read_model(folder: Path, spec: Spec) -> Hierarchy:
     """Read ``model.safetensors``, in evaluation mode.
 
     :raises Damaged: the file is damaged.
-    :raises RunError: the model is of another spec.
+    :raises BadInput: the model is of another spec.
     """
     path, remedy = folder / "model.safetensors", refit(folder)
     tensors, metadata = read_tensors(path, remedy)
@@ -110,7 +106,7 @@ def read_model(folder: Path, spec: Spec) -> Hierarchy:
     except BadInput:
         raise
     except (KeyError, ValueError, RuntimeError) as error:
-        raise RunError(f"{path}: is of another spec than spec.yaml; {remedy}") from error
+        raise BadInput(f"{path}: is of another spec than spec.yaml; {remedy}") from error
     return hierarchy.eval()
 
 

@@ -27,7 +27,7 @@ def write_report(fit: Fit, demos: Demonstrations) -> Path:
 
     :param demos: the demonstrations of the fit.
     :returns: the path of the page.
-    :raises RunError: the fit has no folder.
+    :raises BadInput: the fit has no folder.
     """
     path, metrics = fit.run_folder / "report.html", fit.metrics
     tiles: list[Block] = []

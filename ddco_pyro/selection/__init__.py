@@ -31,14 +31,10 @@ from ddco_pyro.training import data
 from ddco_pyro.training.networks import Dimensions, model_name
 from ddco_pyro.training.processes import one_thread
 
-__all__ = ["Choice", "Selection", "SelectionFailed", "Workers", "check", "final_spec", "known_demonstrations", "select"]
+__all__ = ["Choice", "Failed", "Selection", "Workers", "check", "final_spec", "known_demonstrations", "select"]
 
 ALL_CORES = Workers()
 """One process for each core."""
-
-
-class SelectionFailed(Failed):
-    """Every candidate has failed in some fold."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +61,7 @@ def check(spec: Spec, demos: Demonstrations | None = None) -> list[Candidate]:
     :param demos: :func:`known_demonstrations`, where they have been read.
     :returns: the candidates.
     :raises SpecError: a candidate is not valid, or the grid is empty.
-    :raises FoldError: there are fewer demonstrations than folds.
+    :raises BadInput: there are fewer demonstrations than folds.
     """
     wide, own = grid.wide(spec), spec.demonstrations
     demos = data.outline(wide) if demos is None and data.in_file(wide) else demos
@@ -98,9 +94,8 @@ def select(
 
     :param demos: :func:`known_demonstrations`, where they have been read.
     :param resume: whether a finished selection in the folder may be read again.
-    :raises SelectionFailed: every candidate has failed in some fold.
-    :raises RunError: the folder holds something else.
-    :raises OtherDemonstrations: the folder holds a selection by other demonstrations.
+    :raises Failed: every candidate has failed in some fold.
+    :raises BadInput: the folder holds something else, such as a selection by other demonstrations.
     :raises Busy: another process works on the folder.
     """
     folder = Path(folder)
@@ -119,7 +114,7 @@ def select(
         write_text(folder / "selection.json", json_text(found))
     if choice.chosen is None:
         reasons = [reason for row in choice.rows for reason in row.failed.values()]
-        raise SelectionFailed(f"every candidate has failed in some fold; the first reason: {reasons[0]}")
+        raise Failed(f"every candidate has failed in some fold; the first reason: {reasons[0]}")
     return Selection(folder, demos, choice, held_out)
 
 

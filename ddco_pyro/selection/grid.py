@@ -118,10 +118,6 @@ def candidates(spec: Spec, dimensions: Dimensions) -> list[Candidate]:
 # --- folds ------------------------------------------------------------------------------------------------------------
 
 
-class FoldError(BadInput):
-    """Demonstrations that cannot be divided into so many folds."""
-
-
 def divide(demos: Demonstrations, folds: int, seed: int) -> tuple[Demonstrations, ...]:
     """The demonstrations for each fold, with the masks ``train`` and ``valid``, which is held out.
 
@@ -129,7 +125,7 @@ def divide(demos: Demonstrations, folds: int, seed: int) -> tuple[Demonstrations
     demonstrations: their dimensions decide the networks, which are the same in every fold. Of several tasks each is
     spread over the folds.
 
-    :raises FoldError: there are fewer demonstrations than folds, or too few to train and tune with.
+    :raises BadInput: there are fewer demonstrations than folds, or too few to train and tune with.
     """
     used = demos.split(0.5, seed)[0].names if demos.masks.keys() & {"train", "valid"} else demos.names
     held_out = [[used[row] for row in rows] for rows in assign(demos.select(used).tasks, folds, seed)]
@@ -143,15 +139,15 @@ def assign(tasks: Sequence[str], folds: int, seed: int) -> list[list[int]]:
     """The numbers of the demonstrations held out in each fold: a partition, as even as possible, also of each task.
 
     :param tasks: of each demonstration.
-    :raises FoldError: there are fewer demonstrations than folds, or too few to train and tune with.
+    :raises BadInput: there are fewer demonstrations than folds, or too few to train and tune with.
     """
     from sklearn.model_selection import KFold
 
     count = len(tasks)
     if folds > count:
-        raise FoldError(f"selection.folds: {folds} folds of {count} demonstrations; use at most {count}")
+        raise BadInput(f"selection.folds: {folds} folds of {count} demonstrations; use at most {count}")
     if count - -(-count // folds) < 2:
-        raise FoldError(f"selection.folds: {folds} folds of {count} demonstrations leave less than 2 to train with")
+        raise BadInput(f"selection.folds: {folds} folds of {count} demonstrations leave less than 2 to train with")
     if are_several(tasks):  # dealt to the folds in turn, task by task
         dealt = sorted(np.random.default_rng(seed).permutation(count).tolist(), key=lambda row: tasks[row])
         return [sorted(dealt[fold::folds]) for fold in range(folds)]

@@ -16,8 +16,9 @@ from scipy import stats
 from sklearn.metrics import normalized_mutual_info_score
 
 from ddco_pyro import comparison, load
-from ddco_pyro.comparison import CompareError, Comparison, Row, compare, write
+from ddco_pyro.comparison import Comparison, Row, compare, write
 from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.agreement import UNMATCHED
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.rollouts import roll_out
@@ -171,7 +172,7 @@ def test_demonstrations_may_be_held_out_in_another_order(folders, toy_spec, othe
     ids=["another split", "nothing held out"],
 )
 def test_runs_that_share_no_held_out_data_are_refused(folders, other, changes, reason):
-    with pytest.raises(CompareError, match=reason) as refused:
+    with pytest.raises(BadInput, match=reason) as refused:
         compare([folders[0], other(**changes).folder])
     assert "\n" not in str(refused.value)
 
@@ -182,7 +183,7 @@ def test_demonstrations_of_the_same_names_are_looked_at(folders, toy_spec, other
         demo.observations["visited"][:] = 1 - demo.observations["visited"]
     demos.write(tmp_path / "own.hdf5")
     changed = other("changed", demonstrations__path=str(tmp_path / "own.hdf5"))
-    with pytest.raises(CompareError, match=r"same data: demo_\d+ has other obs/visited; fit both to the same"):
+    with pytest.raises(BadInput, match=r"same data: demo_\d+ has other obs/visited; fit both to the same"):
         compare([folders[0], changed.folder])
 
 
@@ -196,12 +197,12 @@ def test_demonstrations_that_have_changed_since_are_refused(toy_spec, other, tmp
     metrics = json.loads((first.folder / "metrics.json").read_text())
     metrics["valid"][0]["log_likelihood"] += 1  # as where the code of a user's network says another one by now
     (first.folder / "metrics.json").write_text(json.dumps(metrics))
-    with pytest.raises(CompareError, match=r"first: demo_\d+ has changed since this run was fitted to it; fit it"):
+    with pytest.raises(BadInput, match=r"first: demo_\d+ has changed since this run was fitted to it; fit it"):
         compare([first.folder, second.folder])
 
 
 def test_a_run_is_not_compared_with_itself(folders):
-    with pytest.raises(CompareError, match="the same run is given twice"):
+    with pytest.raises(BadInput, match="the same run is given twice"):
         compare([folders[0], folders[0] / "baselines" / ".."])
 
 

@@ -16,10 +16,11 @@ from odd_files.hdf5 import spoil
 from planted import small_spec
 
 import ddco_pyro
-from ddco_pyro.acting.controller import ObservationError, Window
+from ddco_pyro.acting.controller import Window
 from ddco_pyro.data.arrays import LazyArray
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
 from ddco_pyro.data.pictures import Transform, shift_into
+from ddco_pyro.errors import BadInput
 from ddco_pyro.fitting.digest import digest
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.encoder import ObservationEncoder
@@ -206,7 +207,7 @@ def test_a_controller_sees_what_networks_were_trained_on(kept: Path) -> None:
             now, states = fit.hierarchy.advance(window.inputs([observation]), states)
             for one, whole in zip(now.tensors(), said.tensors(), strict=True):
                 torch.testing.assert_close(one[0, 0], whole[0, step])
-    with pytest.raises(ObservationError, match=r"shape \(5, 4, 1\), the demonstrations had \(12, 10, 3\)"):
+    with pytest.raises(BadInput, match=r"shape \(5, 4, 1\), the demonstrations had \(12, 10, 3\)"):
         fit.controller().act(seen[0] | {"camera": np.zeros((5, 4, 1), np.uint8)})
 
 

@@ -11,8 +11,8 @@ import pytest
 import toy_task
 
 import ddco_pyro
+from ddco_pyro.errors import BadInput
 from ddco_pyro.fitting.rollouts import policies, roll_out
-from ddco_pyro.fitting.run import RunError
 from ddco_pyro.simulation.episodes import run_episode
 from ddco_pyro.spec import with_overrides
 
@@ -89,12 +89,12 @@ def changed(run, **changes):
 
 def test_an_unknown_scripted_policy_is_refused(toy_run):
     message = r"^rollout\.policies: task 'toy' has no expert \(it has: supervisor, open_loop\)$"
-    with pytest.raises(RunError, match=message):
+    with pytest.raises(BadInput, match=message):
         policies(changed(toy_run, **{"rollout.policies": ["open_loop", "expert"]}))
 
 
 def test_a_run_without_a_task_cannot_be_rolled_out(toy_run):
-    with pytest.raises(RunError, match=r"toy: its spec has no task, so there is nothing to roll out in$"):
+    with pytest.raises(BadInput, match=r"toy: its spec has no task, so there is nothing to roll out in$"):
         policies(changed(toy_run, task=None, **{"demonstrations.path": "demos.hdf5"}))
 
 

@@ -18,7 +18,6 @@ import ddco_pyro
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations, DemonstrationsError
 from ddco_pyro.errors import BadInput
 from ddco_pyro.fitting.rollouts import roll_out
-from ddco_pyro.fitting.run import RunError
 from ddco_pyro.metrics import Compared
 from ddco_pyro.report import write_report
 from ddco_pyro.spec import load_spec, with_overrides
@@ -195,7 +194,7 @@ def test_nothing_is_written_unless_it_is_asked_for(commanded: Path, tmp_path: Pa
 def test_what_needs_a_folder_says_so(in_memory: ddco_pyro.Fit) -> None:
     line = r"^this fit has no run folder; fit with out=FOLDER, which this needs$"
     for ask in (lambda: write_report(in_memory, two_skills()), lambda: roll_out(in_memory, 1)):
-        with pytest.raises(RunError, match=line):
+        with pytest.raises(BadInput, match=line):
             ask()
 
 

@@ -10,9 +10,10 @@ import pytest
 from killing import Interrupting
 
 import ddco_pyro
+from ddco_pyro.errors import BadInput
 from ddco_pyro.events import EpochEnded
 from ddco_pyro.fitting.fit import fit
-from ddco_pyro.fitting.run import RunError, claim, claimed
+from ddco_pyro.fitting.run import claim, claimed
 from ddco_pyro.metrics import Counts
 from ddco_pyro.spec import dump_spec, with_overrides
 from ddco_pyro.training.data import demonstrations
@@ -131,12 +132,12 @@ def test_claiming_a_folder(tmp_path, toy_spec):
     claim(folder, toy_spec, resume=False)  # killed before its report
     (folder / "report.html").touch()
     claim(folder, toy_spec, resume=True)
-    with pytest.raises(RunError, match=r"run: holds a run of this spec already; show it with --resume, or choose"):
+    with pytest.raises(BadInput, match=r"run: holds a run of this spec already; show it with --resume, or choose"):
         claim(folder, toy_spec, resume=False)
     (tmp_path / "file").write_text("")
-    with pytest.raises(RunError, match=r": is not empty and not a run; choose another --out$"):
+    with pytest.raises(BadInput, match=r": is not empty and not a run; choose another --out$"):
         claim(tmp_path, toy_spec)
-    with pytest.raises(RunError, match=r"file: is a file; choose another --out$"), claimed(tmp_path / "file", toy_spec):
+    with pytest.raises(BadInput, match=r"file: is a file; choose another --out$"), claimed(tmp_path / "file", toy_spec):
         pass
 
 
@@ -150,11 +151,11 @@ def test_claiming_a_folder(tmp_path, toy_spec):
 )
 def test_what_is_not_a_finished_run_is_not_loaded(copied, removed, message):
     (copied / removed).unlink()
-    with pytest.raises(RunError, match=message):
+    with pytest.raises(BadInput, match=message):
         ddco_pyro.load(copied)
 
 
 def test_a_model_of_another_spec_is_not_loaded(copied, toy_spec):
     (copied / "spec.yaml").write_text(dump_spec(with_overrides(toy_spec, {"hierarchy.levels.0.count": 3})))
-    with pytest.raises(RunError, match=r"run/model\.safetensors: is of another spec than spec\.yaml; remove it and"):
+    with pytest.raises(BadInput, match=r"run/model\.safetensors: is of another spec than spec\.yaml; remove it and"):
         ddco_pyro.load(copied)

@@ -11,7 +11,8 @@ from command_line import call, done
 from planted import LINEAR, small_spec
 from random_demonstrations import of_states
 
-from ddco_pyro.fitting.evaluation import NotFinite, evaluate
+from ddco_pyro.errors import Failed
+from ddco_pyro.fitting.evaluation import evaluate
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.model.networks import Inputs, InputShape
 from ddco_pyro.spec import dump_spec
@@ -100,5 +101,5 @@ def test_a_likelihood_that_is_none_is_not_reported(tmp_path: Path) -> None:
     found = fit(small_spec(training={"epochs": 1}), demos, out=tmp_path / "run")
     with torch.no_grad():
         next(found.hierarchy.levels[0].policy.parameters())[:] = torch.inf
-    with pytest.raises(NotFinite, match=r"run: the log-likelihood of demo_0 under the fitted model is (nan|-inf); "):
+    with pytest.raises(Failed, match=r"run: the log-likelihood of demo_0 under the fitted model is (nan|-inf); "):
         evaluate(found, {"train": demos}, demos, training={})

@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from selecting import DATA, candidate, scored, spec_at, two_skills
 
 from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.errors import BadInput
 from ddco_pyro.selection.choice import as_data, choose, markdown, table
-from ddco_pyro.selection.grid import FoldError, assign, candidates, divide, wide
+from ddco_pyro.selection.grid import assign, candidates, divide, wide
 from ddco_pyro.spec import SpecError, parse_spec, with_overrides
 from ddco_pyro.training.networks import Dimensions
 
@@ -202,7 +203,7 @@ def test_folds_are_an_even_partition(data):
     ],
 )
 def test_too_few_demonstrations_are_refused(count, folds, message):
-    with pytest.raises(FoldError, match=f"^{message}$"):
+    with pytest.raises(BadInput, match=f"^{message}$"):
         assign([""] * count, folds, 0)
 
 

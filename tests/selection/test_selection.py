@@ -9,8 +9,9 @@ import pytest
 from selecting import Told, kept, spec_at, two_skills
 
 from ddco_pyro import selection
+from ddco_pyro.errors import Failed
 from ddco_pyro.fitting.fitted import Fit
-from ddco_pyro.selection import SelectionFailed, Workers, final_spec, select
+from ddco_pyro.selection import Workers, final_spec, select
 from ddco_pyro.spec import with_overrides
 from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.restarts import train_model
@@ -105,7 +106,7 @@ def test_where_nothing_is_left_an_unexpected_error_is_told_and_tried_again_next_
     spec = spec_at(tmp_path, grid={"hierarchy.levels.0.count": [2]}, folds=2)
     monkeypatch.setattr(selection, "fit_beside", lambda *_, **__: 1 / 0)
     said = "every candidate has failed in some fold; the first reason: unexpected ZeroDivisionError: division by zero"
-    with pytest.raises(SelectionFailed, match=said):
+    with pytest.raises(Failed, match=said):
         select(spec, tmp_path / "run", Told(), ONE)
     assert json.loads((tmp_path / "run" / "selection.json").read_text())["chosen"] is None
     monkeypatch.undo()
