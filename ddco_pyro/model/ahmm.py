@@ -205,8 +205,9 @@ def ahmm(chain: Chain, emissions: Sequence[Steps | None], actions: Tensor | None
 def run(chain: Chain, emissions: Sequence[Steps | None], actions: Tensor | None = None) -> None:
     """The program of :func:`ahmm` outside its plate over demonstrations."""
     steps = chain.steps()
-    emitting = list(zip(*(_steps(emission, len(steps)) for emission in emissions), strict=True))
-    applied = [None] * len(steps) if actions is None else actions.unbind(1)
+    nothing: list[None] = [None] * len(steps)
+    emitting = list(zip(*(nothing if emission is None else emission.steps() for emission in emissions), strict=True))
+    applied = nothing if actions is None else actions.unbind(1)
     choices: tuple[Tensor, ...] | None = None
     for t in pyro.markov(range(len(steps))):
         choices = choose(t, steps[t], choices)
@@ -215,7 +216,3 @@ def run(chain: Chain, emissions: Sequence[Steps | None], actions: Tensor | None 
         if (evidence := steps[t].evidence) is not None:
             rows = torch.arange(len(evidence))
             pyro.factor(f"evidence_{t}", Vindex(evidence)[(rows, *reversed(choices))])
-
-
-def _steps(emission: Steps | None, number: int) -> Sequence[Any]:
-    return [None] * number if emission is None else emission.steps()

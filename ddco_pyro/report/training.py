@@ -13,7 +13,7 @@ from ddco_pyro.drawing.words import number, rate
 from ddco_pyro.evaluation import verdicts
 from ddco_pyro.evaluation.options import degeneracies
 from ddco_pyro.fitting.fitted import Fit
-from ddco_pyro.metrics import Counts, Rate, read_table, refit
+from ddco_pyro.metrics import Rate, read_table, refit
 from ddco_pyro.names import method
 from ddco_pyro.spec import dump_spec
 
@@ -97,11 +97,6 @@ def doubts(fit: Fit) -> list[tuple[str, str]]:
 # --- particulars ------------------------------------------------------------------------------------------------------
 
 
-def held_out(counts: Counts) -> str:
-    """``10 held out``: the demonstrations that no model of the run was trained on."""
-    return "each held out from a fit without it" if counts.left_out else f"{counts.valid} held out"
-
-
 def particulars(fit: Fit) -> Section:
     """Demonstrations, parameters, effort, seconds, engine check, versions and the spec."""
     seconds = {name: number(value, 1) for name, value in fit.metrics.seconds.items()}
@@ -109,7 +104,8 @@ def particulars(fit: Fit) -> Section:
     differences = "Largest relative difference of the two inference engines."
     counts, supervisor = fit.metrics.demonstrations, fit.metrics.demonstrations.supervisor.get("success")
     model = {"Parameters": str(fit.metrics.parameters), "Training": verdicts.spent(fit.metrics.training)}
-    model["Demonstrations"] = f"{counts.train} for training, {counts.tune} for tuning, {held_out(counts)}"
+    held_out = "each held out from a fit without it" if counts.left_out else f"{counts.valid} held out"
+    model["Demonstrations"] = f"{counts.train} for training, {counts.tune} for tuning, {held_out}"
     if isinstance(supervisor, Rate):
         model["Supervisor’s own success"] = f"{rate(supervisor, 'demonstrations')}, 95 % interval"
     facts = [

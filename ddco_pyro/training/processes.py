@@ -26,11 +26,8 @@ from ddco_pyro.spec import SpecError, TrainingSpec
 Result = TypeVar("Result")
 
 
-class LostProcess(Failed):
-    """A process that trained together with this one has ended."""
-
-    def __init__(self) -> None:
-        super().__init__(from_outside("trained together with this one", "processes"))
+LOST = from_outside("trained together with this one", "processes")
+"""The message for another process that has ended."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +49,7 @@ class Ranks:
     def share(self, value: Any = None) -> Any:
         """The value that the first process gives, in each process.
 
-        :raises LostProcess: another process has ended.
+        :raises Failed: another process has ended.
         """
         if self.size == 1:
             return value
@@ -66,7 +63,7 @@ class Ranks:
 
         An error of a call is raised in each process.
 
-        :raises LostProcess: another process has ended.
+        :raises Failed: another process has ended.
         """
         if self.size == 1:
             yield from (call() for call in calls)
@@ -105,7 +102,7 @@ def together() -> Iterator[Ranks]:
 
     The end of this block in the first process tells the others that there is no further model.
 
-    :raises LostProcess: another process has ended.
+    :raises Failed: another process has ended.
     """
     if not os.environ.keys() >= LAUNCHED or os.environ["WORLD_SIZE"] == "1":
         yield Ranks()
@@ -123,18 +120,18 @@ def together() -> Iterator[Ranks]:
 
 @contextmanager
 def connected() -> Iterator[None]:
-    """Inside, a closed connection raises :class:`LostProcess`; other errors are this process's own.
+    """Inside, a closed connection is a failure; other errors are this process's own.
 
-    :raises LostProcess: a connection is closed.
+    :raises Failed: a connection is closed.
     """
     try:
         yield
     except distributed.DistError as error:  # of a store
-        raise LostProcess from error
+        raise Failed(LOST) from error
     except RuntimeError as error:
         if "/gloo/" not in str(error):  # gloo's errors begin with the place in its sources
             raise
-        raise LostProcess from error
+        raise Failed(LOST) from error
 
 
 # --- devices ----------------------------------------------------------------------------------------------------------

@@ -186,4 +186,4 @@ def test_runs_are_compared_by_what_the_fits_without_one_say(run):
     each = {row.name: row.each for row in compared.rows}
     assert each[str(run.folder)] == pytest.approx([row.log_likelihood for row in run.metrics.valid])
     assert "each is held out from a fit without it" in verdicts.verdict(run.metrics)
-    assert training.held_out(run.metrics.demonstrations) == "each held out from a fit without it"
+    assert "each held out from a fit without it" in str(training.particulars(run).blocks)
