@@ -124,7 +124,9 @@ class ObservationEncoder(nn.Module):
         at = 0
         for spec, count, size in zip(self.specs, self.given, self.sizes, strict=True):
             own = rows[:, self.places[at : at + count].numpy()]
-            ends = torch.as_tensor(np.column_stack([_ends(values, spec.bins) for values in own.T]))
+            parts = np.linspace(0, 1, spec.bins + 1)
+            each = [np.quantile(np.unique(values), parts, method="nearest") for values in own.T]
+            ends = torch.as_tensor(np.column_stack(each))
             self.low[at + count : at + size] = ends[:-1].flatten()
             self.high[at + count : at + size] = ends[1:].flatten()
             at += size
@@ -212,11 +214,6 @@ def _turned(values: np.ndarray, spec: ObservationSpec) -> np.ndarray:
     products = (quaternions[..., one] * quaternions[..., other]).reshape(len(values), -1)
     rest = np.delete(values, [*angles, *(first[:, None] + np.arange(4)).ravel()], axis=1)
     return np.concatenate([rest, np.sin(values[:, angles]), np.cos(values[:, angles]), products], axis=1)
-
-
-def _ends(values: np.ndarray, bins: int) -> np.ndarray:
-    """The ends [bins + 1] of bins of ``values`` [T] that hold equally many distinct values."""
-    return np.asarray(np.quantile(np.unique(values), np.linspace(0, 1, bins + 1), method="nearest"))
 
 
 def _seen_shape(spec: ObservationSpec, shapes: Shapes) -> tuple[int, ...]:

@@ -63,8 +63,10 @@ def _output(name: str, network: Network, inputs: Inputs, state: State | None = N
         raise ShapeError(
             f"network {name!r} fails for random observations, N = {trajectories}, T = {steps}: {what}"
         ) from error
+    after: Any
     output, after = given if isinstance(given, tuple) and len(given) == 2 else (given, None)
-    if not _is_state(before, trajectories) or not _is_state(after, trajectories) or _shapes(before) != _shapes(after):
+    states = _is_state(before, trajectories) and _is_state(after, trajectories)
+    if not states or [tensor.shape for tensor in before] != [tensor.shape for tensor in after]:
         raise ShapeError(
             f"network {name!r} has initial_state(N), which has to give a tuple of tensors [N, ...]; each call then "
             f"has to give outputs and such a tuple of the same shapes, here N = {trajectories}"
@@ -82,10 +84,6 @@ def _is_state(state: Any, trajectories: int) -> bool:
     return isinstance(state, tuple) and all(
         isinstance(tensor, Tensor) and tensor.shape[:1] == (trajectories,) for tensor in state
     )
-
-
-def _shapes(state: Any) -> list[torch.Size]:
-    return [tensor.shape for tensor in state]
 
 
 def _random_inputs(shape: InputShape, trajectories: int, steps: int, dtype: torch.dtype = torch.float32) -> Inputs:
