@@ -61,7 +61,7 @@ class Table:
     def folded(self, shown: int, what: str) -> list[Block]:
         """The first rows; the others are folded, and ``what`` names them, such as ``demonstrations``."""
         first, rest = (Table(self.head, rows, self.left) for rows in (self.rows[:shown], self.rows[shown:]))
-        return [first, Folded(f"The other {len(rest.rows)} {what}", [rest])] if rest.rows else [first]
+        return [first, Card(f"The other {len(rest.rows)} {what}", [rest], folded=True)] if rest.rows else [first]
 
 
 def _line(cells: Sequence[str]) -> str:
@@ -91,14 +91,6 @@ class Facts:
 
 
 @dataclass(frozen=True)
-class Folded:
-    """Blocks that are shown after a click on ``summary``."""
-
-    summary: str
-    blocks: Sequence[Block]
-
-
-@dataclass(frozen=True)
 class Columns:
     """Blocks side by side."""
 
@@ -123,18 +115,19 @@ class Drawing:
 
 @dataclass(frozen=True)
 class Card:
-    """Blocks side by side under a title, such as all about one option."""
+    """Blocks side by side under a title, such as all about one option; or ``folded``, shown after a click on it."""
 
     title: str
     blocks: Sequence[Block]
+    folded: bool = False
 
 
-Block = Text | Table | Facts | Folded | Columns | Warned | Drawing | Card | Timelines
+Block = Text | Table | Facts | Columns | Warned | Drawing | Card | Timelines
 
 
-def footnote(text: str) -> Folded:
+def footnote(text: str) -> Card:
     """The meaning of what stands above, which a click shows."""
-    return Folded("What this means", [note(text)])
+    return Card("What this means", [note(text)], folded=True)
 
 
 @dataclass(frozen=True)
@@ -184,7 +177,7 @@ def _kind(block: Any) -> str:
 
 
 def _markdown(blocks: Sequence[Block]) -> str:
-    flat = chain.from_iterable(block.blocks if isinstance(block, Folded) else [block] for block in blocks)
+    flat = chain.from_iterable(block.blocks if isinstance(block, Card) else [block] for block in blocks)
     shown = (
         block.text if isinstance(block, Text) else block.markdown() for block in flat if isinstance(block, Table | Text)
     )

@@ -11,7 +11,7 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
 from ddco_pyro.data.labels import label_names
 from ddco_pyro.data.sources import open_source
-from ddco_pyro.drawing.page import Block, Folded, Page, Section, Text, Warned, note
+from ddco_pyro.drawing.page import Block, Card, Page, Section, Text, Warned, note
 from ddco_pyro.drawing.shown import pictures, stored_pictures
 from ddco_pyro.evaluation import verdicts
 from ddco_pyro.evaluation.options import SOUND, beside_equal_parts
@@ -108,5 +108,5 @@ def header(fit: Fit) -> list[Block]:
     return [
         *map(Text, texts),
         *(Warned(*sign) for sign in found),
-        *([] if found else [Folded("No sign of a doubtful fit", [note(SOUND)])]),
+        *([] if found else [Card("No sign of a doubtful fit", [note(SOUND)], folded=True)]),
     ]

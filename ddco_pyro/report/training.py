@@ -8,7 +8,7 @@ import numpy as np
 
 from ddco_pyro.data.likeness import reasons_told
 from ddco_pyro.drawing.figures import WIDTH, curves
-from ddco_pyro.drawing.page import Columns, Drawing, Facts, Folded, Section, Text, note
+from ddco_pyro.drawing.page import Card, Columns, Drawing, Facts, Section, Text, note
 from ddco_pyro.drawing.words import number, rate
 from ddco_pyro.evaluation import verdicts
 from ddco_pyro.evaluation.options import degeneracies
@@ -113,5 +113,5 @@ def particulars(fit: Fit) -> Section:
         Facts(check, "Engine check", differences),
         Facts(fit.metrics.versions, "Versions"),
     ]
-    spec = Folded("The whole spec, with its defaults", [Text(dump_spec(fit.spec), "code")])
+    spec = Card("The whole spec, with its defaults", [Text(dump_spec(fit.spec), "code")], folded=True)
     return Section("particulars", "How this run was made", [Facts(model), Columns(facts), spec], folded=True)
