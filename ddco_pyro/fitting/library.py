@@ -193,6 +193,6 @@ def imitation_error(model: Hierarchy, demos: Demonstrations) -> float:
             modes = [torch.zeros_like(own) if each is None else each.mode[..., dim] for each, own in pairs]
             joint = torch.where(belief > 0, belief * joint_density(modes), 0.0)
             error = (joint.flatten(2).sum(-1) if tables.depth else joint) - actions[..., dim]
-            total += float(error[piece.batch.inputs.time < lengths[:, None]].abs().sum())
+            total += float(error[piece.batch.alive].abs().sum())
         number += int(lengths.sum()) * actions.shape[-1]
     return total / number
