@@ -131,12 +131,8 @@ def fit(
         return _fit_models(models, demos, folder, on_event, workers, clock)
 
 
-Models = Mapping[str, tuple[Spec, Hierarchy]]
-"""Specs and networks by name: of a model, then of its baselines."""
-
-
 def _fit_models(
-    models: Models,
+    models: Mapping[str, tuple[Spec, Hierarchy]],
     demos: Demonstrations,
     folder: Path | None,
     on_event: OnEvent = ignore,
@@ -146,6 +142,7 @@ def _fit_models(
 ) -> Fit:
     """Train a model and its baselines, evaluate it, and write its folder.
 
+    :param models: specs and networks by name: of the model, then of its baselines.
     :param name: of a baseline, in events.
     """
     clock = clock or Clock()
