@@ -144,14 +144,14 @@ def test_a_trajectory_is_shifted_as_one_and_anew_in_each_epoch() -> None:
     )
     for seed in (1, 2):
         seen = whole.varied(encoder.shifts, seed)
-        shifts = seen.inputs.images.shifts["camera"]
+        shifts = seen.inputs.images["camera"].shifts
         assert np.abs(shifts).max() <= 3
         assert len(np.unique(shifts, axis=0)) > 3
         pictures = seen.select(torch.tensor([5, 2])).inputs.loaded().images["camera"]
         for row, n in enumerate((5, 2)):
             expected = shifted(demos[n].observations["camera"], *shifts[n])
             np.testing.assert_array_equal(pictures[row, : len(expected)], expected)
-    again, other = (whole.varied(encoder.shifts, seed).inputs.images.shifts["camera"] for seed in (2, 1))
+    again, other = (whole.varied(encoder.shifts, seed).inputs.images["camera"].shifts for seed in (2, 1))
     assert (again == shifts).all()
     assert (other != shifts).any()
 
@@ -204,7 +204,7 @@ def test_a_controller_sees_what_networks_were_trained_on(kept: Path) -> None:
         said = fit.hierarchy(fit.hierarchy.encoder.inputs([demo.observations]))
         window, states = Window(fit.hierarchy.encoder), None
         for step, observation in enumerate(seen):
-            now, states = fit.hierarchy.advance(window.inputs([observation]), states)
+            now, states = fit.hierarchy.advance(window.inputs(observation), states)
             for one, whole in zip(now.tensors(), said.tensors(), strict=True):
                 torch.testing.assert_close(one[0, 0], whole[0, step])
     with pytest.raises(BadInput, match=r"shape \(5, 4, 1\), the demonstrations had \(12, 10, 3\)"):
