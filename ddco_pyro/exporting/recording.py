@@ -121,7 +121,7 @@ def _episode(encoder: ObservationEncoder, steps: int, random: np.random.Generato
         if spec.differences and len(rest) == values.shape[1]:
             behind = slice(len(rest), 2 * len(rest))
             differences = mean[behind] + std[behind] * random.normal(size=values.shape)
-            values = np.cumsum([values[0], *differences[1:]], axis=0)
+            values = _walk(values[0], differences, mean[: len(rest)], std[: len(rest)])
         if spec.minus:
             other = observations.setdefault(spec.minus, random.normal(size=(steps, *shape)))
             values = values + other.reshape(steps, -1)
@@ -135,3 +135,12 @@ def _pictures(steps: int, shape: tuple[int, ...], random: np.random.Generator) -
     fewer = tuple(-(-size // side) for size in shape[:2])
     noise = random.integers(0, 256, (steps, *fewer, *shape[2:]), dtype=np.uint8)
     return noise.repeat(side, 1).repeat(side, 2)[:, : shape[0], : shape[1]]
+
+
+def _walk(start: np.ndarray, differences: np.ndarray, mean: np.ndarray, std: np.ndarray) -> np.ndarray:
+    """Values [T, F] that change by these differences [T, F], reflected at two standard deviations from the mean."""
+    values = [start]
+    for difference in differences[1:]:
+        ahead, back = values[-1] + difference, values[-1] - np.copysign(difference, values[-1] - mean)
+        values.append(np.where(np.abs(ahead - mean) > 2 * std, back, ahead))
+    return np.stack(values)
