@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from unittest.mock import Mock
 
 import h5py
 import numpy as np
@@ -102,4 +103,4 @@ def test_a_likelihood_that_is_none_is_not_reported(tmp_path: Path) -> None:
     with torch.no_grad():
         next(found.hierarchy.levels[0].policy.parameters())[:] = torch.inf
     with pytest.raises(Failed, match=r"run: the log-likelihood of demo_0 under the fitted model is (nan|-inf); "):
-        evaluate(found, {"train": demos}, demos, training={})
+        evaluate(found, Mock(), Mock(), {"train": demos}, contained=(), whole=False)
