@@ -24,7 +24,7 @@ class Event:
 
 @dataclass(frozen=True)
 class Counted(Event):
-    """One more of ``total`` pieces of ``work`` is done, or ``done`` in all; ``total`` is None where nobody knows it."""
+    """One more of ``total`` pieces of ``work`` is done, or ``done`` in all; ``total`` is None if unknown."""
 
     work: str
     total: int | None

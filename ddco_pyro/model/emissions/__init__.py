@@ -12,6 +12,11 @@ from typing import get_args
 import numpy as np
 
 from ddco_pyro.model.emissions.base import Emission, Given, Information, Part
+from ddco_pyro.model.emissions.binary import Binary
+from ddco_pyro.model.emissions.categorical import Categorical
+from ddco_pyro.model.emissions.clipped import Clipped
+from ddco_pyro.model.emissions.gaussian import Gaussian
+from ddco_pyro.model.emissions.hurdle import Hurdle
 from ddco_pyro.model.emissions.product import Product
 from ddco_pyro.spec import Kind
 
