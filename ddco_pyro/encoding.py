@@ -103,6 +103,10 @@ class Backbone:
             raise BadInput(f"encoder {self.name!r} gives features that are NaN or infinite in float32")
         return values
 
+    def features(self, pictures: Observed) -> np.ndarray:
+        """Features [T, F] of pictures [T, H, W, C], of which few are in memory at a time."""
+        return np.concatenate([self(batch) for batch in _batches(pictures)])
+
     def try_out(self, pictures: np.ndarray) -> int:
         """The number of features, after comparing those of a second call, and of a picture alone.
 
@@ -165,7 +169,8 @@ def principal_components(blocks: Sequence[np.ndarray], size: int, least: float =
 
     :param least: components with a smaller share of the first one's variance are left out.
     """
-    fitted = PCA(svd_solver="covariance_eigh").fit(np.concatenate(blocks).astype(np.float64))
+    with one_thread():  # same bits
+        fitted = PCA(svd_solver="covariance_eigh").fit(np.concatenate(blocks).astype(np.float64))
     variance = fitted.explained_variance_
     size = min(size, max(1, int((variance >= least * variance[0]).sum())))
     explained = float(variance[:size].sum() / variance.sum()) if variance.any() else 1.0
@@ -293,13 +298,12 @@ def encode(
             raise BadInput(f"--size {size}: {there}; take at most {min(number, steps)}")
         features = dict[str, np.ndarray]()
         for own, array in pictures.items():
-            features[own] = np.concatenate([backbone(batch) for batch in _batches(array)])
+            features[own] = backbone.features(array)
             on_event(Counted("encoding", len(pictures), done=len(features)))
         projection = None
         if size is not None or number > min(SIZE, steps):
-            with one_thread():  # same bits
-                rows = [features[own] for own in training]
-                projection = principal_components(rows, size or min(SIZE, steps), NOISE if size is None else 0.0)
+            rows = [features[own] for own in training]
+            projection = principal_components(rows, size or min(SIZE, steps), NOISE if size is None else 0.0)
         about = About(
             encoder=encoder,
             observation=observation,

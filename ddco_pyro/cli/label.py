@@ -43,6 +43,10 @@ def label(
     twice: Annotated[
         float, typer.Option(min=0, max=1, help="The share of demonstrations that two annotators label.")
     ] = 0.0,
+    features: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Proposals also read pictures, by a network of encode: timm:NAME."),
+    ] = None,
     level: Level = None,
     wheres: Wheres = [],  # noqa: B006
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page; 0 is any that is free.")] = 0,
@@ -69,6 +73,7 @@ def label(
     except ModuleNotFoundError as error:
         raise BadInput(f"label needs {error.name}; install it with: pip install 'ddco-pyro[label]'") from None
     from ddco_pyro.fitting.fitted import load
+    from ddco_pyro.labelling.features import Features
     from ddco_pyro.labelling.session import Session
     from ddco_pyro.labelling.team import Team
     from ddco_pyro.training.processes import one_thread
@@ -76,6 +81,7 @@ def label(
     people = Team(annotator, tuple(filter(None, team.split(","))), twice)
     names = _names(skills)
     where = where_of(wheres)
+    seen = Features.of(file, place, features, allow_code, where) if features else None
     run = paths[0] if len(paths) == 2 else _fitted(file, len(names), where)
     listening = Listening.at(port)
 
@@ -86,7 +92,7 @@ def label(
 
     with one_thread():  # a demonstration is inferred sooner so, and a refit has a core of its own
         fit = load(run, allow_code)
-        first = Session(fit, file, place, level, names, people, where=where)
+        first = Session(fit, file, place, level, names, people, where=where, features=seen)
         others = [own for own in fit.names if own != first.level]
         sessions = [first, *(Session(fit, file, place, own, (), people, first, where) for own in others)]
         for session in sessions:

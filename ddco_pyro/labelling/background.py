@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ddco_pyro.errors import Failed, reason
-from ddco_pyro.events import EpochEnded, Event, TrainingBegan
+from ddco_pyro.events import Counted, EpochEnded, Event, TrainingBegan
 from ddco_pyro.jobs import end_with, without_lost_calls
 
 if TYPE_CHECKING:
@@ -118,14 +118,17 @@ class Background:
 
 
 def _telling(call: Call, file: Path) -> Any:
-    """The result of a call, which writes the share of its epochs that are done into a file."""
-    epochs, done = 0, 0
+    """The result of a call, which writes the share of its epochs or demonstrations that are done into a file."""
+    epochs, done, part = 0, 0, file.with_suffix(".part")
 
     def tell(event: Event) -> None:
         nonlocal epochs, done
+        if isinstance(event, Counted):
+            epochs, done = event.total or 0, event.done or 0
         epochs += (event.epochs or 0) if isinstance(event, TrainingBegan) else 0
         done += isinstance(event, EpochEnded)
         if epochs:
-            file.write_text(f"{min(done / epochs, 1.0):.4f}")
+            part.write_text(f"{min(done / epochs, 1.0):.4f}")
+            part.replace(file)
 
     return call(on_event=tell)

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.demonstration import Demonstration
 from ddco_pyro.data.files import Damaged
 from ddco_pyro.errors import BadInput
 
@@ -146,7 +146,7 @@ def version(files: Iterable[Path]) -> list[tuple[int, int]]:
     return [(stat.st_size, stat.st_mtime_ns) for stat in stats]
 
 
-def digest(demos: Demonstrations, level: str) -> str:
+def digest(demos: Sequence[Demonstration], level: str) -> str:
     """What labels are for: the demonstrations by name, with their controls, and the level."""
     found = hashlib.sha256(json.dumps([level, [(demo.name, demo.actions.shape) for demo in demos]]).encode())
     for demo in demos:

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from scipy.spatial.distance import cdist
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.labels import BOUNDARY, EXCLUDE, SOURCE, SOURCES, UNKNOWN, label_names
@@ -21,12 +22,13 @@ from ddco_pyro.evaluation.agreement import agreement
 from ddco_pyro.evaluation.inferred import Inferred, runs
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.labelling.document import CONFIRM, FREE, OPEN, PAINT, Change, Document
+from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.recogniser import Windows
 from ddco_pyro.model.tables import NEVER, Tables
 from ddco_pyro.names import choice_names, label_name, option_name
 from ddco_pyro.segmenting.segments import LevelLabels, Segmented, Segments, segments
 from ddco_pyro.statistics import matching
-from ddco_pyro.training.recognition import SHARES, learn
+from ddco_pyro.training.recognition import half_widths, learn, typical_length
 
 RIDGE = 50.0
 """Of the recogniser of the steps that a person has named."""
@@ -58,6 +60,18 @@ class Shown:
     probability: np.ndarray
 
 
+def read_beside(batch: Batch, names: Sequence[str], seen: Mapping[str, np.ndarray]) -> Tensor:
+    """What a recogniser reads beside observations: scaled controls, and features of pictures, [N, T, A' + F].
+
+    :param names: of the demonstrations of the batch.
+    :param seen: the features of each, [T, F]; empty for none.
+    """
+    if not seen:
+        return batch.actions
+    pictures = [torch.from_numpy(seen[name]) for name in names]
+    return torch.cat([batch.actions, pad_sequence(pictures, batch_first=True)], dim=-1)
+
+
 @dataclass(frozen=True)
 class Learned:
     """What is learned of the named steps.
@@ -82,6 +96,7 @@ class Proposals:
         An option that the model does not have yet clamps nothing.
     :param count: the options that a person can name.
     :param before: the person's option of each step [T] shown before; empty for the model's own numbers.
+    :param seen: features of the pictures of each step, [T, F]; empty for none.
     :ivar options: of the person, for each option 0 to k of the model.
     """
 
@@ -93,6 +108,7 @@ class Proposals:
         labels: Mapping[str, np.ndarray],
         count: int,
         before: Mapping[str, np.ndarray] = MappingProxyType({}),
+        seen: Mapping[str, np.ndarray] = MappingProxyType({}),
     ) -> None:
         self.fit, self.level = fit, level
         levels = fit.spec.hierarchy.levels if fit.spec.hierarchy else ()
@@ -112,10 +128,15 @@ class Proposals:
         self.occurring = {option for option, _, _ in every_run} - {0}
         typical = float(np.median([stop - start for _, start, stop in every_run]))
         self.half = typical / 2
-        self.windows = Windows(self.size, model.input_shape, len(model.scaling.varying), past=False)
-        self.windows.widths.copy_(torch.tensor([max(1, round(share * typical)) for share in SHARES]))
+        read, controls = [read_beside(own.batch, own.names, seen) for own in self.pieces], len(model.scaling.varying)
+        pictures = read[0].shape[-1] - controls
+        self.windows = Windows(self.size, model.input_shape, controls, past=False, pictures=pictures)
+        if seen and any((own > 0).any() for own in labels.values()):
+            typical = typical_length(labels.values())  # the model knows none where pictures alone show skills
+        self.windows.widths.copy_(half_widths(typical))
         self.features = [
-            self.windows.features(piece.batch.inputs, piece.batch.actions, piece.batch.lengths) for piece in self.pieces
+            self.windows.features(piece.batch.inputs, beside, piece.batch.lengths)
+            for piece, beside in zip(self.pieces, read, strict=True)
         ]
         every = torch.cat([self._rows(name) for name in demos.names])
         self.middle, self.spread = every.mean(0).numpy(), every.std(0).clamp(min=1e-9).numpy()

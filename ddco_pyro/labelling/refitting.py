@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -14,14 +15,15 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.events import OnEvent, TrainingBegan, ignore
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.fitted import Fit
-from ddco_pyro.labelling.proposals import RIDGE, weight
+from ddco_pyro.labelling.proposals import RIDGE, read_beside, weight
 from ddco_pyro.model.batch import encode
+from ddco_pyro.model.recogniser import Windows
 from ddco_pyro.spec import Spec, with_overrides
 from ddco_pyro.training.checkpoint import TrainingData, fitted_of
 from ddco_pyro.training.labels import Labels
 from ddco_pyro.training.optimizers import optimizer_of
 from ddco_pyro.training.processes import one_thread
-from ddco_pyro.training.recognition import EM_STEPS, by_em, recognise
+from ddco_pyro.training.recognition import EM_STEPS, by_em, half_widths, learn, typical_length
 
 SAID = "said"
 """The labels of the demonstrations of a refit."""
@@ -40,6 +42,7 @@ def refit(
     demos: Demonstrations,
     labels: Mapping[str, np.ndarray],
     kept: Mapping[str, np.ndarray],
+    seen: Mapping[str, np.ndarray] = MappingProxyType({}),
     on_event: OnEvent = ignore,
 ) -> Fit:
     """The model with so many options at a level, fitted to all demonstrations and to a person's labels.
@@ -50,6 +53,8 @@ def refit(
     :param labels: an option of each step, [T], by demonstration; below 1 for none.
     :param kept: the option that each step begins with whatever the recogniser finds, [T], by demonstration; below 1 for
         none.
+    :param seen: features of pictures, [T, F], by demonstration, which the recogniser of a single level reads that EM
+        trains; empty for none.
     """
     spec, before = refit_spec(trained, level, count), trained.hierarchy
     said = tuple(replace(demo, labels={SAID: labels[demo.name]}) for demo in demos)
@@ -65,15 +70,17 @@ def refit(
         named = Labels(1, tuple(range(1, count + 1)), names, known, known)
         data = TrainingData(spec, size, batch, batch, names, fitted_of(before), named)
         model = data.hierarchy(0)
-        data, _ = recognise(model, data, demos)
-        taught = data.labels
-        assert taught is not None
-        assert taught.starts is not None
-        assert taught.evidence is not None
+        beside = read_beside(batch, names, seen)
+        controls = batch.actions.shape[-1]
+        windows = Windows(count, before.input_shape, controls, past=False, pictures=beside.shape[-1] - controls)
+        windows.widths.copy_(half_widths(typical_length(known.numpy())))
+        features = windows.features(batch.inputs, beside, batch.lengths)
+        learn(windows, features[known > 0], known[known > 0], RIDGE)
         own = _padded([kept[name] for name in names])
         silent, alive = own > 0, torch.arange(known.shape[1]) < batch.lengths[:, None]
-        evidence = torch.where(silent.unsqueeze(-1), 0.0, taught.evidence[0])
-        starts = torch.where(silent, own, taught.starts[0])
+        ratio = weight(float(before.power)) * windows.log_ratio(features)
+        evidence = torch.where((silent | (known > 0)).unsqueeze(-1), 0.0, ratio)
+        starts = torch.where(silent, own, windows.log_probability(features).argmax(-1) + 1)
         starts = torch.where(alive, torch.where(known > 0, known, starts), -1)
         by_em(data, model, batch, replace(named, train=starts, tune=starts), EM_STEPS, on_event)
         by_em(data, model, batch, replace(named, evidence=(evidence, evidence)), STEPS, on_event)

@@ -31,6 +31,7 @@ from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.labelling.background import Background
 from ddco_pyro.labelling.commands import Segment, View, whole
 from ddco_pyro.labelling.document import FREE, SAVED, SUFFIX, Change, Document, Journal, digest, version
+from ddco_pyro.labelling.features import Features
 from ddco_pyro.labelling.following import Following
 from ddco_pyro.labelling.proposals import (
     Proposals,
@@ -90,6 +91,7 @@ class Session:
     :param team: who labels, and who labels what.
     :param first: the session of another level, whose demonstrations and marks are those of this one.
     :param where: attributes and values of the demonstrations to label; all if empty.
+    :param features: of pictures, which the recognisers of all levels read once they are computed; of the first session.
     :ivar beside: the sessions of the other levels.
     :raises BadInput: the run has no options or no such level, ``out`` is something else, or another process labels it.
     """
@@ -106,6 +108,7 @@ class Session:
         team: Team | None = None,
         first: Session | None = None,
         where: Where = NOTHING,
+        features: Features | None = None,
     ) -> None:
         fit.refuse_flat()
         self.where = where
@@ -134,6 +137,8 @@ class Session:
         self.revision, self.edits, self.changed = 0, 0, set[int]()
         self.behind, self.inferring, self.inferred = False, False, dict.fromkeys(self.demos.names, 0)
         self.refits, self.again = 0, False
+        self.features, self.seen = features, dict[str, np.ndarray]()
+        self.encoding: Background = first.encoding if first else Background(self.lock, lambda: None)
         self.background = Background(self.lock, self._ended, "ddco_pyro.labelling.refitting", "sklearn.linear_model")
         self.shown, self.untouched, self.sure = dict[str, Shown](), dict[str, Shown](), 0.0
         self.view = View(self.document, self.shown, self.untouched)
@@ -154,7 +159,9 @@ class Session:
             check_labels(self.path, [self.level, self.level + SOURCE], self.demos.names)
 
     def begin(self) -> None:
-        """Refit where something is labelled already; else have the process ready for it."""
+        """Compute features of pictures, and refit where something is labelled; else have the process ready for it."""
+        if self.features:
+            self.encoding.begin(self.features.computed, self._look)
         if self._is_labelled():
             self.refit()
         elif self.first is self:
@@ -182,7 +189,8 @@ class Session:
         with self.lock:
             before, count, edits = self._shown_now(), len(self.document.names), self.edits
             labels, accepted = dict(self.document.labels), [*self.document.accepted]
-        proposals = Proposals(fit, self.demos, [*fit.names].index(self.level) + 1, labels, count, before)
+        number = [*fit.names].index(self.level) + 1
+        proposals = Proposals(fit, self.demos, number, labels, count, before, self.first.seen)
         held_out = proposals.held_out(labels, accepted if len(accepted) > 1 else ())
 
         def take() -> None:
@@ -389,6 +397,7 @@ class Session:
                     "done": self.refits,
                     "error": self.background.error and f"fitting the labels failed: {self.background.error}",
                 },
+                "features": self._features_said(),
                 "warnings": self.warnings(),
                 "dirty": self.dirty,
             }
@@ -410,7 +419,14 @@ class Session:
     def warnings(self) -> list[str]:
         """What a person should know: a changed file, a failure, demonstrations unlike those of the fit."""
         changed = f"{self.path} changed while it was labelled; start again to go on with it"
-        return [*([] if self._unchanged() else [changed]), *filter(None, [self.error]), *self.unlike]
+        features = self.encoding.error and f"features of pictures: {self.encoding.error}; proposals go on without them"
+        return [*([] if self._unchanged() else [changed]), *filter(None, [self.error, features]), *self.unlike]
+
+    def _features_said(self) -> str:
+        """How far features of pictures are, in words."""
+        if self.encoding.running:
+            return f"features of pictures: {self.encoding.progress or 0:.0%}"
+        return "proposals read the pictures" if self.first.seen else ""
 
     def _unlike(self) -> list[str]:
         known = [traits(demo, self.fit.hierarchy.encoder.shapes) for demo in self.demos]
@@ -615,7 +631,8 @@ class Session:
             shown, waiting = self._shown_now(), self.proposals.waiting(labels)
             kept = {name: np.where(np.isin(shown[name], waiting), shown[name], FREE) for name in names}
             trained, count = replace(self.fit, given=None), len(self.document.names)
-            call = partial(refit, trained, self.level, count, self._observed.select(names), labels, kept)
+            demos, seen = self._observed.select(names), self.first.seen
+            call = partial(refit, trained, self.level, count, demos, labels, kept, seen)
             self.background.begin(call, self._refitted)
 
     def _refitted(self, fit: Fit) -> Callable[[], None]:
@@ -626,6 +643,20 @@ class Session:
             take()
 
         return counted
+
+    def _look(self, seen: dict[str, np.ndarray]) -> Callable[[], None]:
+        """Have the recognisers of all levels read features of pictures."""
+        self.seen = seen
+        prepared = [(own, own.fit, own._prepare(own.fit)) for own in (self, *self.beside)]
+
+        def take() -> None:
+            for own, fit, show in prepared:
+                if own.fit is fit:
+                    show()
+                if own._is_labelled():
+                    own.refit()
+
+        return take
 
     def _ended(self) -> None:
         self.revision += 1
@@ -715,6 +746,7 @@ class Session:
             self.thread.join()
         with self.lock:
             self.background.close()
+            self.encoding.close()
             if not self.journal.saved and self._unchanged():
                 self.save()
             self.following.close()

@@ -33,6 +33,8 @@ class Windows(nn.Module):
     :param shape: of the observations.
     :param controls: A', the control dimensions in the model.
     :param past: whether the features are of the past alone.
+    :param pictures: further inputs behind the controls, which have one unit.
+    :ivar alike: the features that have one unit, and are not standardised one by one, bool [3 F].
     :ivar share: the share of labelled steps of each option, [k]; 0 for an option without any.
     """
 
@@ -41,10 +43,11 @@ class Windows(nn.Module):
     share: Tensor
     widths: Tensor
 
-    def __init__(self, options: int, shape: InputShape, controls: int, past: bool) -> None:
+    def __init__(self, options: int, shape: InputShape, controls: int, past: bool, pictures: int = 0) -> None:
         super().__init__()
         self.past = past
-        size = shape.vector + sum(image[-1] * POOLED**2 for image in shape.images.values()) + controls
+        size = shape.vector + sum(image[-1] * POOLED**2 for image in shape.images.values()) + controls + pictures
+        self.alike = torch.arange(size).ge(size - pictures).repeat(1 + SCALES)
         for name, shaped in (("weight", ((1 + SCALES) * size, options)), ("bias", (options,)), ("share", (options,))):
             self.register_buffer(name, torch.zeros(shaped, dtype=torch.float64))
         self.register_buffer("widths", torch.ones(SCALES, dtype=torch.int64))

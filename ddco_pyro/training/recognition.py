@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -64,10 +64,10 @@ def recognise(model: Hierarchy, data: TrainingData, demos: Demonstrations) -> tu
     asked = RecogniserSpec() if own.recogniser == "cross_validated" else own.recogniser
     batch = encode(demos, model.encoder, model.scaling)
     options = choices(demos, own.source, labels.values, labels.demonstrations)
-    widths = _widths(options)
+    widths = half_widths(typical_length(options.numpy()))
     features = {}
     for windows in (recogniser.around, recogniser.past):
-        windows.widths.copy_(torch.tensor(widths))
+        windows.widths.copy_(widths)
         features[windows] = windows.features(batch.inputs, batch.actions, batch.lengths)
     power, weight, ridge, tried = data.spec.control.power, asked.weight, asked.ridge, list[Candidate]()
     if own.recogniser == "cross_validated":
@@ -85,7 +85,7 @@ def recognise(model: Hierarchy, data: TrainingData, demos: Demonstrations) -> tu
     taught = replace(labels, evidence=(evidence, tuning), starts=starts)
     learned = {f"recogniser.{name}": value.clone() for name, value in recogniser.state_dict().items()}
     spec = with_overrides(data.spec, {"control.power": power})
-    found = Recogniser(power=power, weight=weight, ridge=ridge, widths=list(widths), tried=tried)
+    found = Recogniser(power=power, weight=weight, ridge=ridge, widths=widths.tolist(), tried=tried)
     return replace(data, spec=spec, labels=taught, fitted=data.fitted | learned), found
 
 
@@ -113,7 +113,8 @@ def learn(windows: Windows, features: Tensor, options: Tensor, ridge: float) -> 
 
     rows, known = features.numpy(), options.numpy() - 1
     middle, spread = rows.mean(0), rows.std(0)
-    spread = np.where(spread > NARROWEST * np.abs(rows).max(0, initial=NARROWEST), spread, 1.0)
+    varying = spread > NARROWEST * np.abs(rows).max(0, initial=NARROWEST)
+    spread = np.where(varying & ~windows.alike.numpy(), spread, 1.0)
     classes, counts = np.unique(known, return_counts=True)
     for buffer in (windows.weight, windows.bias, windows.share):
         buffer.zero_()
@@ -130,12 +131,18 @@ NARROWEST = 1e-9
 """A feature varies where its standard deviation is a larger part of its largest value."""
 
 
-def _widths(options: Tensor) -> tuple[int, ...]:
-    """Half widths of windows in steps: a quarter and three quarters of the median labelled segment."""
-    edges = [np.flatnonzero(np.diff(own, prepend=-2, append=-2)) for own in options.numpy()]
-    lengths = [np.diff(at)[own[at[:-1]] > 0] for own, at in zip(options.numpy(), edges, strict=True)]
-    typical = float(np.median(np.concatenate(lengths)))
-    return tuple(max(1, round(share * typical)) for share in SHARES)
+def typical_length(options: Iterable[np.ndarray]) -> float:
+    """The median length of labelled segments, from the option of each step [T]; below 1 for none."""
+    lengths = []
+    for own in options:
+        edges = np.flatnonzero(np.diff(own, prepend=-2, append=-2))
+        lengths.append(np.diff(edges)[own[edges[:-1]] > 0])
+    return float(np.median(np.concatenate(lengths)))
+
+
+def half_widths(typical: float) -> Tensor:
+    """Half widths of windows in steps: a quarter and three quarters of a typical segment."""
+    return torch.tensor([max(1, round(share * typical)) for share in SHARES])
 
 
 def _tried(

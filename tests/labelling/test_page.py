@@ -9,6 +9,7 @@ import pytest
 from labelled import POOL, until
 from pages import SOON, at, items, keys, labels, needed, playwright, point, said, served, starts
 
+from ddco_pyro.events import Counted
 from ddco_pyro.labelling.background import Background
 from ddco_pyro.labelling.document import FREE, OPEN
 
@@ -331,6 +332,20 @@ def test_a_refit_says_how_far_it_is_is_cancelled_and_said_when_it_is_done(tab, s
     going.set()
     said(tab, "Refit 1 is done: expected wrong steps")
     playwright.expect(bar).to_be_hidden()
+
+
+def test_the_page_says_how_far_features_of_pictures_are(tab, session):
+    told, go = tab.locator("#features"), threading.Event()
+
+    def compute(on_event):
+        on_event(Counted("encoding", 4, done=1))
+        go.wait()
+        return {name: np.zeros((steps, 2), np.float32) for name, steps in session.document.lengths.items()}
+
+    session.encoding.begin(compute, session._look)
+    playwright.expect(told).to_have_text("features of pictures: 25%")
+    go.set()
+    playwright.expect(told).to_have_text("proposals read the pictures")
 
 
 @pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.slow)])

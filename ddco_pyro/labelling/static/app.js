@@ -72,7 +72,8 @@ function render(keep = true) {
   $("timeline").setAttribute("aria-valuemin", 0); $("timeline").setAttribute("aria-valuemax", demo.steps - 1);
   seek(cursor);
 }
-function status({ refit, warnings, dirty }) {
+function status({ refit, warnings, dirty, features }) {
+  $("features").textContent = features;
   $("fitting").hidden = !refit.running;
   const bar = $("fitting").querySelector("progress");
   if (refit.progress === null) bar.removeAttribute("value"); else bar.value = refit.progress;
