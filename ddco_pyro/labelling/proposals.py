@@ -23,12 +23,16 @@ from ddco_pyro.evaluation.inferred import Inferred, runs
 from ddco_pyro.fitting.fitted import Fit
 from ddco_pyro.labelling.document import CONFIRM, FREE, OPEN, PAINT, Change, Document
 from ddco_pyro.model.batch import Batch
+from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.recogniser import Windows
 from ddco_pyro.model.tables import NEVER, Tables
 from ddco_pyro.names import choice_names, label_name, option_name
 from ddco_pyro.segmenting.segments import LevelLabels, Segmented, Segments, segments
 from ddco_pyro.statistics import matching
 from ddco_pyro.training.recognition import half_widths, learn, typical_length
+
+Pictures = Mapping[str, np.ndarray]
+"""Features of the pictures of each step, [T, F] of each demonstration by name, which recognisers read; may be empty."""
 
 RIDGE = 50.0
 """Of the recogniser of the steps that a person has named."""
@@ -60,16 +64,24 @@ class Shown:
     probability: np.ndarray
 
 
-def read_beside(batch: Batch, names: Sequence[str], seen: Mapping[str, np.ndarray]) -> Tensor:
-    """What a recogniser reads beside observations: scaled controls, and features of pictures, [N, T, A' + F].
+def windows_of(
+    model: Hierarchy, count: int, typical: float, batches: Iterable[tuple[Sequence[str], Batch]], seen: Pictures
+) -> tuple[Windows, list[Tensor]]:
+    """A recogniser of so many options that has learned nothing yet, and what it reads, [N, T, 3 F] of each batch.
 
-    :param names: of the demonstrations of the batch.
-    :param seen: the features of each, [T, F]; empty for none.
+    :param typical: the length of a segment.
+    :param batches: with the names of their demonstrations.
     """
-    if not seen:
-        return batch.actions
-    pictures = [torch.from_numpy(seen[name]) for name in names]
-    return torch.cat([batch.actions, pad_sequence(pictures, batch_first=True)], dim=-1)
+    size = next((rows.shape[1] for rows in seen.values()), 0)
+    windows, found = Windows(count, model.input_shape, len(model.scaling.varying), past=False, pictures=size), []
+    windows.widths.copy_(half_widths(typical))
+    for names, batch in batches:
+        read = batch.actions
+        if seen:
+            pictures = pad_sequence([torch.from_numpy(seen[name]) for name in names], batch_first=True)
+            read = torch.cat([read, pictures], dim=-1)
+        found.append(windows.features(batch.inputs, read, batch.lengths))
+    return windows, found
 
 
 @dataclass(frozen=True)
@@ -96,7 +108,7 @@ class Proposals:
         An option that the model does not have yet clamps nothing.
     :param count: the options that a person can name.
     :param before: the person's option of each step [T] shown before; empty for the model's own numbers.
-    :param seen: features of the pictures of each step, [T, F]; empty for none.
+    :param seen: empty for none.
     :ivar options: of the person, for each option 0 to k of the model.
     """
 
@@ -108,12 +120,12 @@ class Proposals:
         labels: Mapping[str, np.ndarray],
         count: int,
         before: Mapping[str, np.ndarray] = MappingProxyType({}),
-        seen: Mapping[str, np.ndarray] = MappingProxyType({}),
+        seen: Pictures = MappingProxyType({}),
     ) -> None:
         self.fit, self.level = fit, level
         levels = fit.spec.hierarchy.levels if fit.spec.hierarchy else ()
         self.size = levels[level - 1].count
-        self.pieces, model = list(fit.infer(demos)), fit.hierarchy
+        self.pieces = list(fit.infer(demos))
         self.place = {name: (piece, row) for piece, own in enumerate(self.pieces) for row, name in enumerate(own.names)}
         with torch.no_grad():
             self.alone = [piece.outputs.tables(piece.batch.actions) for piece in self.pieces]
@@ -128,16 +140,10 @@ class Proposals:
         self.occurring = {option for option, _, _ in every_run} - {0}
         typical = float(np.median([stop - start for _, start, stop in every_run]))
         self.half = typical / 2
-        read, controls = [read_beside(own.batch, own.names, seen) for own in self.pieces], len(model.scaling.varying)
-        pictures = read[0].shape[-1] - controls
-        self.windows = Windows(self.size, model.input_shape, controls, past=False, pictures=pictures)
         if seen and any((own > 0).any() for own in labels.values()):
             typical = typical_length(labels.values())  # the model knows none where pictures alone show skills
-        self.windows.widths.copy_(half_widths(typical))
-        self.features = [
-            self.windows.features(piece.batch.inputs, beside, piece.batch.lengths)
-            for piece, beside in zip(self.pieces, read, strict=True)
-        ]
+        batches = [(piece.names, piece.batch) for piece in self.pieces]
+        self.windows, self.features = windows_of(fit.hierarchy, self.size, typical, batches, seen)
         every = torch.cat([self._rows(name) for name in demos.names])
         self.middle, self.spread = every.mean(0).numpy(), every.std(0).clamp(min=1e-9).numpy()
         self.whole = np.concatenate([self.centres(name, [0]) for name in demos.names])

@@ -15,15 +15,14 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.events import OnEvent, TrainingBegan, ignore
 from ddco_pyro.fitting.fit import fit
 from ddco_pyro.fitting.fitted import Fit
-from ddco_pyro.labelling.proposals import RIDGE, read_beside, weight
+from ddco_pyro.labelling.proposals import RIDGE, Pictures, weight, windows_of
 from ddco_pyro.model.batch import encode
-from ddco_pyro.model.recogniser import Windows
 from ddco_pyro.spec import Spec, with_overrides
 from ddco_pyro.training.checkpoint import TrainingData, fitted_of
 from ddco_pyro.training.labels import Labels
 from ddco_pyro.training.optimizers import optimizer_of
 from ddco_pyro.training.processes import one_thread
-from ddco_pyro.training.recognition import EM_STEPS, by_em, half_widths, learn, typical_length
+from ddco_pyro.training.recognition import EM_STEPS, by_em, learn, typical_length
 
 SAID = "said"
 """The labels of the demonstrations of a refit."""
@@ -42,7 +41,7 @@ def refit(
     demos: Demonstrations,
     labels: Mapping[str, np.ndarray],
     kept: Mapping[str, np.ndarray],
-    seen: Mapping[str, np.ndarray] = MappingProxyType({}),
+    seen: Pictures = MappingProxyType({}),
     on_event: OnEvent = ignore,
 ) -> Fit:
     """The model with so many options at a level, fitted to all demonstrations and to a person's labels.
@@ -53,8 +52,7 @@ def refit(
     :param labels: an option of each step, [T], by demonstration; below 1 for none.
     :param kept: the option that each step begins with whatever the recogniser finds, [T], by demonstration; below 1 for
         none.
-    :param seen: features of pictures, [T, F], by demonstration, which the recogniser of a single level reads that EM
-        trains; empty for none.
+    :param seen: read by the recogniser of a single level that EM trains.
     """
     spec, before = refit_spec(trained, level, count), trained.hierarchy
     said = tuple(replace(demo, labels={SAID: labels[demo.name]}) for demo in demos)
@@ -70,11 +68,7 @@ def refit(
         named = Labels(1, tuple(range(1, count + 1)), names, known, known)
         data = TrainingData(spec, size, batch, batch, names, fitted_of(before), named)
         model = data.hierarchy(0)
-        beside = read_beside(batch, names, seen)
-        controls = batch.actions.shape[-1]
-        windows = Windows(count, before.input_shape, controls, past=False, pictures=beside.shape[-1] - controls)
-        windows.widths.copy_(half_widths(typical_length(known.numpy())))
-        features = windows.features(batch.inputs, beside, batch.lengths)
+        windows, (features,) = windows_of(before, count, typical_length(known.numpy()), [(names, batch)], seen)
         learn(windows, features[known > 0], known[known > 0], RIDGE)
         own = _padded([kept[name] for name in names])
         silent, alive = own > 0, torch.arange(known.shape[1]) < batch.lengths[:, None]
