@@ -119,7 +119,7 @@ class Background:
 
 def _telling(call: Call, file: Path) -> Any:
     """The result of a call, which writes the share of its epochs or demonstrations that are done into a file."""
-    epochs, done, part = 0, 0, file.with_suffix(".part")
+    epochs, done = 0, 0
 
     def tell(event: Event) -> None:
         nonlocal epochs, done
@@ -128,7 +128,6 @@ def _telling(call: Call, file: Path) -> Any:
         epochs += (event.epochs or 0) if isinstance(event, TrainingBegan) else 0
         done += isinstance(event, EpochEnded)
         if epochs:
-            part.write_text(f"{min(done / epochs, 1.0):.4f}")
-            part.replace(file)
+            file.write_text(f"{min(done / epochs, 1.0):.4f}")
 
     return call(on_event=tell)

@@ -425,7 +425,8 @@ class Session:
     def _features_said(self) -> str:
         """How far features of pictures are, in words."""
         if self.encoding.running:
-            return f"features of pictures: {self.encoding.progress or 0:.0%}"
+            share = self.encoding.progress
+            return f"features of pictures: {'begun' if share is None else f'{share:.0%}'}"
         return "proposals read the pictures" if self.first.seen else ""
 
     def _unlike(self) -> list[str]:
