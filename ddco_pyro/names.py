@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ddco_pyro.data.labels import UNKNOWN
+from ddco_pyro.data.demonstration import UNKNOWN
 
 HIERARCHY = "ddco"
 """The name of a hierarchy whose options last, in tables."""
