@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ddco_pyro.data.demonstration import UNKNOWN
-
 HIERARCHY = "ddco"
 """The name of a hierarchy whose options last, in tables."""
 
@@ -50,13 +48,13 @@ def name_in_level(option: int, level: str, names: Sequence[str] = ()) -> str:
 
 
 def label_name(label: str, value: int, names: Sequence[str] = (), level: str = "option") -> str:
-    """``grasp`` where the file names label 2 of the labels ``phase``, else ``phase 2``; ``unknown`` for −1.
+    """``grasp`` where the file names label 2 of the labels ``phase``, else ``phase 2``; ``unknown`` below 0.
 
     Labels that are called as a level's options are are ``label 2``.
 
     :param names: of labels 0, 1, ...
     """
-    if value == UNKNOWN:
+    if value < 0:
         return "unknown"
     named = names[value].strip() if 0 <= value < len(names) else ""
     return named or f"{'label' if label in (level, 'option') else label} {value}"
