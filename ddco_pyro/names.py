@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from ddco_pyro.data.labels import UNKNOWN
+
 HIERARCHY = "ddco"
 """The name of a hierarchy whose options last, in tables."""
 
@@ -48,13 +50,13 @@ def name_in_level(option: int, level: str, names: Sequence[str] = ()) -> str:
 
 
 def label_name(label: str, value: int, names: Sequence[str] = (), level: str = "option") -> str:
-    """``grasp`` where the file names label 2 of the labels ``phase``, else ``phase 2``; ``unknown`` below 0.
+    """``grasp`` where the file names label 2 of the labels ``phase``, else ``phase 2``; ``unknown`` for −1.
 
     Labels that are called as a level's options are are ``label 2``.
 
     :param names: of labels 0, 1, ...
     """
-    if value < 0:
+    if value == UNKNOWN:
         return "unknown"
     named = names[value].strip() if 0 <= value < len(names) else ""
     return named or f"{'label' if label in (level, 'option') else label} {value}"

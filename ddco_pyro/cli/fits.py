@@ -36,7 +36,7 @@ def check(
         raise SpecError("name a spec, such as: ddco-pyro check specs/needle.yaml")
     loaded = load_spec(spec, overrides, allow_code)
     from ddco_pyro.cli import console
-    from ddco_pyro.data.demonstration import label_names
+    from ddco_pyro.data.labels import label_names
     from ddco_pyro.training.data import dimensions, in_file, outline, refuse_unfit
     from ddco_pyro.training.labels import used
     from ddco_pyro.training.networks import check_models

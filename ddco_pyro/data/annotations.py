@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from ddco_pyro.data.controls import few
-from ddco_pyro.data.demonstration import UNKNOWN, label_names
+from ddco_pyro.data.labels import UNKNOWN, label_names
 from ddco_pyro.data.sources import Source
 from ddco_pyro.errors import BadInput, nearest
 

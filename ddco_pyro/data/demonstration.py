@@ -9,7 +9,6 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from pydantic import TypeAdapter, ValidationError
 
 from ddco_pyro.data.arrays import (
     LARGEST,
@@ -34,21 +33,6 @@ NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 DIMENSION_NAMES = "dimension_names"
 """Attribute of a source: JSON, the names of the dimensions of observations, and of ``control``, by key."""
-
-LABEL_NAMES = "label_names"
-"""Attribute of a file of demonstrations: JSON, the names of labels 0, 1, ... for each name of labels."""
-
-UNKNOWN = -1
-"""The label of a step without ground truth."""
-
-EXCLUDE = "exclude"
-"""The mask of demonstrations that a person leaves out; ``init`` excludes them."""
-
-BOUNDARY, SOURCE = "_boundary", "_source"
-"""Ends of the names of labels beside those of a level: 1 where a segment begins, and who says what a step is."""
-
-SOURCES = ("open", "proposed", "accepted", "given")
-"""Who says what a step is: none, as a person left it open; the model; a person who accepts that; a person."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -309,16 +293,3 @@ def needed(demos: Iterable[Demonstration], copies: float = COPIES) -> float:
                 numbers += math.prod(array.shape[1:])
         features = max(features, numbers)
     return PROGRAM + size + copies * features * count * longest
-
-
-def label_names(attributes: Mapping[str, object]) -> dict[str, list[str]]:
-    """The names of labels 0, 1, ... in the attributes of a file (:data:`LABEL_NAMES`), by name of labels.
-
-    :raises DemonstrationsError: the attribute is something else.
-    """
-    try:
-        return TypeAdapter(dict[str, list[str]]).validate_json(str(attributes.get(LABEL_NAMES, "{}")))
-    except ValidationError:
-        raise DemonstrationsError(
-            f'attribute {LABEL_NAMES!r}: is no JSON such as {{"phase": ["reach", "grasp"]}}; correct or remove it'
-        ) from None

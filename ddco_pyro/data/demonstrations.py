@@ -12,9 +12,10 @@ from typing import overload
 import numpy as np
 
 from ddco_pyro.data.arrays import refuse_too_much
-from ddco_pyro.data.demonstration import LABEL_NAMES, NOTHING, Attribute, Demonstration, check, label_names, needed
+from ddco_pyro.data.demonstration import NOTHING, Attribute, Demonstration, check, needed
 from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.hdf5 import natural
+from ddco_pyro.data.labels import LABEL_NAMES, label_names
 from ddco_pyro.data.sources import open_own
 from ddco_pyro.data.sources.robomimic import frequency_of, robomimic_file, write_demonstration
 from ddco_pyro.data.tasks import (

@@ -14,17 +14,9 @@ import numpy as np
 from ddco_pyro.data.annotations import Labelled, LabelTable, labels_of_table
 from ddco_pyro.data.arrays import NUMBERS, LazyArray, Observed, is_picture, network_input
 from ddco_pyro.data.controls import few
-from ddco_pyro.data.demonstration import (
-    BOUNDARY,
-    LABEL_NAMES,
-    SOURCE,
-    UNKNOWN,
-    Attribute,
-    Demonstration,
-    check,
-    check_values,
-)
+from ddco_pyro.data.demonstration import Attribute, Demonstration, check, check_values
 from ddco_pyro.data.errors import DemonstrationsError
+from ddco_pyro.data.labels import BOUNDARY, LABEL_NAMES, SOURCE, UNKNOWN
 from ddco_pyro.data.pictures import resized
 from ddco_pyro.data.sources import Source, open_source
 from ddco_pyro.data.sources.folder import open_pooled

@@ -29,10 +29,11 @@ from ddco_pyro.data.controls import (
     rounding,
     same,
 )
-from ddco_pyro.data.demonstration import NOTHING, UNKNOWN, Attribute, different, label_names, problem_of
+from ddco_pyro.data.demonstration import NOTHING, Attribute, different, problem_of
 from ddco_pyro.data.demonstrations import check_division, problems_of_masks
 from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.hdf5 import natural
+from ddco_pyro.data.labels import UNKNOWN, label_names
 from ddco_pyro.data.likeness import EXCLUDE, Traits, reasons_told, traits_of, unlike
 from ddco_pyro.data.sources import Source, open_source
 from ddco_pyro.data.sources.metadata import clock_fault

@@ -12,11 +12,11 @@ import jinja2
 import numpy as np
 
 from ddco_pyro.data.controls import all_constant
-from ddco_pyro.data.demonstration import BOUNDARY, EXCLUDE
 from ddco_pyro.data.demonstrations import FEW, LEAST, check_division, with_values
 from ddco_pyro.data.errors import DemonstrationsError, printable
 from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.inspection import Field, Inspection, inspect
+from ddco_pyro.data.labels import BOUNDARY, EXCLUDE
 from ddco_pyro.errors import command
 from ddco_pyro.spec import EACH, parse_spec
 from ddco_pyro.spec.yaml import read_yaml

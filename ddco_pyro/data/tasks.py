@@ -7,8 +7,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ddco_pyro.data.demonstration import BOUNDARY, SOURCE, UNKNOWN, Attribute, Demonstration
+from ddco_pyro.data.demonstration import Attribute, Demonstration
 from ddco_pyro.data.errors import DemonstrationsError
+from ddco_pyro.data.labels import BOUNDARY, SOURCE, UNKNOWN
 from ddco_pyro.errors import nearest
 from ddco_pyro.spec import TASK
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from ddco_pyro.data.demonstration import BOUNDARY, SOURCE, UNKNOWN, label_names
+from ddco_pyro.data.labels import BOUNDARY, SOURCE, UNKNOWN, label_names
 from ddco_pyro.data.sources import open_source
 from ddco_pyro.data.tasks import are_several
 from ddco_pyro.drawing.page import Table

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from ddco_pyro.data.demonstration import label_names
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.files import only_one
 from ddco_pyro.data.hdf5 import natural
+from ddco_pyro.data.labels import label_names
 from ddco_pyro.errors import BadInput, path_of
 from ddco_pyro.events import Counted, OnEvent, ignore
 from ddco_pyro.fitting.digest import record, recorded

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from ddco_pyro.data.demonstration import label_names
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
+from ddco_pyro.data.labels import label_names
 from ddco_pyro.errors import BadInput, nearest
 from ddco_pyro.evaluation.agreement import confusion
 from ddco_pyro.metrics import NamedByLabel, TrainedLabels

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ddco_pyro.data.demonstration import SOURCES
+from ddco_pyro.data.labels import SOURCES
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.inferred import runs
 from ddco_pyro.labelling.document import CONFIRM, FREE, MARKS, OPEN, PAINT, Change, Document
@@ -23,7 +23,7 @@ LONGEST = 80
 class Segment:
     """A segment that is shown: an option 0 to k from one step to before another.
 
-    :param source: who says so, of :data:`~ddco_pyro.data.demonstration.SOURCES`; the option of an open segment is 0.
+    :param source: who says so, one of :data:`~ddco_pyro.data.labels.SOURCES`; the option of an open segment is 0.
     """
 
     start: int

@@ -14,8 +14,8 @@ from scipy.spatial.distance import cdist
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from ddco_pyro.data.demonstration import BOUNDARY, EXCLUDE, SOURCE, SOURCES, UNKNOWN, label_names
 from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.labels import BOUNDARY, EXCLUDE, SOURCE, SOURCES, UNKNOWN, label_names
 from ddco_pyro.data.sources import Source
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.agreement import agreement
@@ -312,7 +312,7 @@ def labels_shown(document: Document, name: str, shown: Shown) -> LevelLabels:
 
 
 def sources_shown(document: Document, name: str) -> np.ndarray:
-    """The place in :data:`~ddco_pyro.data.demonstration.SOURCES` of who says what each step is, [T]."""
+    """The place in :data:`~ddco_pyro.data.labels.SOURCES` of who says what each step is, [T]."""
     labels = document.labels[name]
     said = np.where(document.given[name], SOURCES.index("given"), SOURCES.index("accepted"))
     return np.select([labels == OPEN, labels == FREE], [SOURCES.index("open"), SOURCES.index("proposed")], said)

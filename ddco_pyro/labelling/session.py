@@ -17,8 +17,9 @@ import sklearn.linear_model
 import sklearn.metrics  # noqa: F401  (the first edit does not wait for these)
 
 from ddco_pyro.data.arrays import is_picture
-from ddco_pyro.data.demonstration import EXCLUDE, NOTHING, SOURCE
+from ddco_pyro.data.demonstration import NOTHING
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
+from ddco_pyro.data.labels import EXCLUDE, SOURCE
 from ddco_pyro.data.likeness import traits
 from ddco_pyro.data.sources import Source, format_of, open_source
 from ddco_pyro.data.sources.metadata import FREQUENCY

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ddco_pyro.data.demonstration import UNKNOWN
+from ddco_pyro.data.labels import UNKNOWN
 from ddco_pyro.errors import BadInput
 from ddco_pyro.evaluation.agreement import compared
 from ddco_pyro.evaluation.inferred import runs

@@ -7,9 +7,9 @@ from datetime import datetime
 from pathlib import Path
 
 from ddco_pyro.data.arrays import Observed
-from ddco_pyro.data.demonstration import label_names
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.files import write_text
+from ddco_pyro.data.labels import label_names
 from ddco_pyro.data.sources import open_source
 from ddco_pyro.drawing.page import Block, Card, Page, Section, Text, Warned, note
 from ddco_pyro.drawing.shown import pictures, stored_pictures

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 from markupsafe import Markup
 
-from ddco_pyro.data.demonstration import label_names
 from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.labels import label_names
 from ddco_pyro.drawing.figures import MOST_PATHS, paths_of_options, save
 from ddco_pyro.drawing.page import Block, Cell, Section, Table, Text, footnote, note
 from ddco_pyro.drawing.shown import in_words

@@ -12,9 +12,9 @@ from urllib.parse import quote
 import numpy as np
 
 from ddco_pyro.data.arrays import Observed
-from ddco_pyro.data.demonstration import BOUNDARY, SOURCE, SOURCES, UNKNOWN
 from ddco_pyro.data.demonstrations import Demonstration
 from ddco_pyro.data.files import write_text
+from ddco_pyro.data.labels import BOUNDARY, SOURCE, SOURCES, UNKNOWN
 from ddco_pyro.drawing.page import Block, Cell, Page, Section, Table, Text, footnote, note
 from ddco_pyro.drawing.timeline import Timelines, coded, following
 from ddco_pyro.drawing.words import NAT, duration, number, percent

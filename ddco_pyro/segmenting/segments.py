@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 
 from ddco_pyro.data.arrays import INFERENCE, refuse_too_much
-from ddco_pyro.data.demonstration import check_fitted, label_names, needed
+from ddco_pyro.data.demonstration import check_fitted, needed
 from ddco_pyro.data.demonstrations import Demonstration
 from ddco_pyro.data.errors import DemonstrationsError
+from ddco_pyro.data.labels import label_names
 from ddco_pyro.data.likeness import Traits, traits
 from ddco_pyro.data.sources import Source, open_source
 from ddco_pyro.data.tasks import of_tasks, with_task
@@ -61,7 +62,7 @@ class Segments:
     :param held_out: whether the run's fit held the demonstration out.
     :param labels: ground-truth labels in the file, name to [T].
     :param sources: where a person labelled: ``<level>_source`` to the place in
-        :data:`~ddco_pyro.data.demonstration.SOURCES` [T].
+        :data:`~ddco_pyro.data.labels.SOURCES` [T].
     :param task: the demonstration's own; empty where none is known.
     """
 

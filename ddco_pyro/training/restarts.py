@@ -43,10 +43,9 @@ from ddco_pyro.training.loop import train
 from ddco_pyro.training.networks import Dimensions, build_hierarchy, model_name
 from ddco_pyro.training.objective import TrainingError
 from ddco_pyro.training.optimizers import optimizer_of
-from ddco_pyro.training.prior import Prior
+from ddco_pyro.training.prior import Prior, cross_validated
 from ddco_pyro.training.processes import Ranks, described, device_of, one_thread
 from ddco_pyro.training.recognition import recognise
-from ddco_pyro.training.ridge import cross_validated
 from ddco_pyro.training.stages import EVERYTHING, plan, starts_of
 
 SOUNDING, BY_GRADIENT = 5, 50

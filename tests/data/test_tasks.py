@@ -14,9 +14,9 @@ from sklearn.metrics import normalized_mutual_info_score
 
 import ddco_pyro
 from ddco_pyro.acting.controller import Controller
-from ddco_pyro.data.demonstration import label_names
 from ddco_pyro.data.demonstrations import Demonstration, Demonstrations
 from ddco_pyro.data.inspection import inspect
+from ddco_pyro.data.labels import label_names
 from ddco_pyro.evaluation.agreement import agreement, of_equal_lengths
 from ddco_pyro.exporting import TOLERANCE, export, runner
 from ddco_pyro.spec import Spec, dump_spec, load_spec

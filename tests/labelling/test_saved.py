@@ -13,8 +13,8 @@ from command_line import done
 from labelled import accept, paint, refitted
 
 from ddco_pyro.cli.label import _fitted
-from ddco_pyro.data.demonstration import LABEL_NAMES, UNKNOWN
 from ddco_pyro.data.demonstrations import Demonstrations
+from ddco_pyro.data.labels import LABEL_NAMES, UNKNOWN
 from ddco_pyro.errors import BadInput
 from ddco_pyro.fitting.fitted import load
 from ddco_pyro.labelling.session import Session

@@ -39,8 +39,8 @@ from ddco_pyro.spec import RidgeSpec, parse_spec, with_overrides
 from ddco_pyro.training.em import Expectation
 from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.optimizers import is_linear
+from ddco_pyro.training.prior import cross_validated
 from ddco_pyro.training.restarts import Trainer
-from ddco_pyro.training.ridge import cross_validated
 
 
 def expectation(model, ridge, batch, trained=EVERYTHING, discovering=None):

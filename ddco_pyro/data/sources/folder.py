@@ -9,18 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ddco_pyro.data.demonstration import (
-    BOUNDARY,
-    LABEL_NAMES,
-    NOTHING,
-    SOURCE,
-    UNKNOWN,
-    Attribute,
-    Demonstration,
-    label_names,
-)
+from ddco_pyro.data.demonstration import NOTHING, Attribute, Demonstration
 from ddco_pyro.data.errors import DemonstrationsError, located
 from ddco_pyro.data.hdf5 import natural
+from ddco_pyro.data.labels import BOUNDARY, LABEL_NAMES, SOURCE, UNKNOWN, label_names
 from ddco_pyro.data.sources import Source, narrowed, open_source
 from ddco_pyro.data.tasks import Where, task_of
 from ddco_pyro.spec import TASK

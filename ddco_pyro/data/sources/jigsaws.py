@@ -19,8 +19,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ddco_pyro.data.demonstration import LABEL_NAMES, Attribute, Demonstration
+from ddco_pyro.data.demonstration import Attribute, Demonstration
 from ddco_pyro.data.errors import DemonstrationsError
+from ddco_pyro.data.labels import LABEL_NAMES
 from ddco_pyro.data.sources import Source
 
 WIDTH, ARM = 76, 19

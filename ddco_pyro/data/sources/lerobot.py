@@ -17,16 +17,9 @@ import cv2
 import numpy as np
 
 from ddco_pyro.data.arrays import PICTURES, LazyArray, Observed, channels_last, in_blocks, turned
-from ddco_pyro.data.demonstration import (
-    DIMENSION_NAMES,
-    EXCLUDE,
-    LABEL_NAMES,
-    SOURCE,
-    UNKNOWN,
-    Attribute,
-    Demonstration,
-)
+from ddco_pyro.data.demonstration import DIMENSION_NAMES, Attribute, Demonstration
 from ddco_pyro.data.errors import DemonstrationsError, reading
+from ddco_pyro.data.labels import EXCLUDE, LABEL_NAMES, SOURCE, UNKNOWN
 from ddco_pyro.data.sources import Source
 from ddco_pyro.data.sources.metadata import (
     check_count,

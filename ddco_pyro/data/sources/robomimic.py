@@ -16,10 +16,11 @@ import h5py
 import numpy as np
 
 from ddco_pyro.data.arrays import blocks, is_picture
-from ddco_pyro.data.demonstration import LABEL_NAMES, Attribute, Demonstration, label_names
+from ddco_pyro.data.demonstration import Attribute, Demonstration
 from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.files import whole_file
 from ddco_pyro.data.hdf5 import attributes_of, dataset_at, datasets, lazy, member, natural, opened, values_of, written
+from ddco_pyro.data.labels import LABEL_NAMES, label_names
 from ddco_pyro.data.sources import Source
 from ddco_pyro.data.sources.metadata import rate
 

@@ -14,7 +14,7 @@ from pkgutil import resolve_name
 from statistics import fmean
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
-from ddco_pyro.data.demonstration import SOURCE, SOURCES, UNKNOWN
+from ddco_pyro.data.labels import SOURCE, SOURCES, UNKNOWN
 from ddco_pyro.errors import BadInput
 from ddco_pyro.names import name_in_level
 
@@ -65,7 +65,7 @@ class Asked:
         return [run for run in demo.levels[self.level].runs(anew=False) if run[0] != UNKNOWN]
 
     def said_by(self, demo: Segments, start: int, stop: int) -> str | None:
-        """Who says what steps are, of :data:`~ddco_pyro.data.demonstration.SOURCES`; None where no person labelled."""
+        """Who says what steps are, one of :data:`~ddco_pyro.data.labels.SOURCES`; None where no person labelled."""
         known = demo.sources.get(self.level + SOURCE)
         return None if known is None else SOURCES[known[start:stop].min()]
 

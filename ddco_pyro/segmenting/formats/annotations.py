@@ -11,8 +11,8 @@ import jinja2
 import numpy as np
 
 from ddco_pyro.data.arrays import NUMBERS, blocks, is_picture
-from ddco_pyro.data.demonstration import SOURCE, SOURCES, UNKNOWN
 from ddco_pyro.data.files import whole_folder, write_text
+from ddco_pyro.data.labels import SOURCE, SOURCES, UNKNOWN
 from ddco_pyro.names import option_colour
 from ddco_pyro.segmenting.formats import Asked
 from ddco_pyro.segmenting.segments import Segmented, Segments

@@ -13,10 +13,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from ddco_pyro.data.demonstration import BOUNDARY, EXCLUDE, LABEL_NAMES, SOURCE, label_names
 from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.files import whole_file
 from ddco_pyro.data.hdf5 import attributes_of, opened, written
+from ddco_pyro.data.labels import BOUNDARY, EXCLUDE, LABEL_NAMES, SOURCE, label_names
 from ddco_pyro.errors import BadInput
 from ddco_pyro.names import choice_names
 from ddco_pyro.segmenting.formats import Asked, check_copy

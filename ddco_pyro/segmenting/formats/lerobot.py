@@ -15,8 +15,8 @@ import numpy as np
 import pyarrow
 from pyarrow import parquet
 
-from ddco_pyro.data.demonstration import SOURCE, SOURCES, UNKNOWN
 from ddco_pyro.data.files import whole_folder, write_text
+from ddco_pyro.data.labels import SOURCE, SOURCES, UNKNOWN
 from ddco_pyro.data.sources.lerobot import ANNOTATIONS, SUBTASK, WHO, LeRobot
 from ddco_pyro.data.sources.metadata import inside
 from ddco_pyro.errors import BadInput

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pandas
 
-from ddco_pyro.data.demonstration import BOUNDARY, SOURCES, UNKNOWN
 from ddco_pyro.data.files import whole_file
+from ddco_pyro.data.labels import BOUNDARY, SOURCES, UNKNOWN
 from ddco_pyro.drawing.shown import stored_pictures
 from ddco_pyro.names import option_name
 from ddco_pyro.segmenting.formats import Asked
