@@ -48,7 +48,7 @@ def toy_spec():
 
 @pytest.fixture(scope="session")
 def watched():
-    """What the fit of the toy task tells whoever watches it."""
+    """The events of the fit of the toy task."""
     return []
 
 

@@ -1,7 +1,7 @@
-"""Priors of weights: a ridge that demonstrations choose, and a library of options for a new task.
+"""The prior that a library of options is for a new task: a Gaussian centred at its weights, and one of σ.
 
-A library is a fitted model of the same networks, with weights W0 and standard deviations s. A ridge of ρ stands for as
-many steps that say W0, and a spread of c for as many controls that have the σ of the library:
+The library is a fitted model of the same networks, with weights W0 and standard deviations s. A ridge of ρ stands for
+as many steps that say W0, and a spread of c for as many controls that have the σ of the library:
 
     W ~ N(W0, 1/ρ),    W ~ N(W0, σ²/ρ) for means of continuous controls,    1/σ² ~ Gamma(c/2, c s²/2).
 
@@ -22,13 +22,9 @@ from pyro.distributions import Gamma, Normal, TorchDistribution, TransformedDist
 from torch import Tensor
 from torch.distributions.transforms import AffineTransform, ExpTransform
 
-from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.controls import raw_of
 from ddco_pyro.model.emissions import KINDS
 from ddco_pyro.model.hierarchy import Caller, Hierarchy
-from ddco_pyro.model.networks.perceptrons import Mlp
-from ddco_pyro.training.em import BIAS
-from ddco_pyro.training.initialization import Clusters
 
 Site = Callable[[str, TorchDistribution, Tensor, float], Tensor]
 """What is done at a site: its name, distribution, present value, and how many times its log-density counts."""
@@ -148,58 +144,3 @@ def _scales(caller: Caller, model: Hierarchy, std: Tensor) -> Tensor:
         columns += [one] * (size - count) + own
         place += count
     return torch.stack([*columns, *[one] * len(caller.std.of_state)], -1)
-
-
-# --- the ridge of a model without a library ---------------------------------------------------------------------------
-
-RAISED = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
-"""The ridges that are tried, in units of the spec's own."""
-FOLDS = 5
-"""The parts into which training demonstrations are divided, each left out in turn."""
-ENOUGH = 0.5
-"""Nats per step: a ridge is large enough where no other gains more. Larger ones give policies that act worse."""
-LEAST = 0.01
-"""σ of a policy, at least, in units of each dimension's spread."""
-
-
-def cross_validated(model: Hierarchy, batch: Batch, ridge: float, seed: int) -> float:
-    """The smallest of the ridges :data:`RAISED` that is large enough for the policies of a linear hierarchy.
-
-    For each cluster of observations and controls, as many as the lowest level has options, ridge regression predicts
-    the continuous controls of demonstrations that are left out. EM begins from such regressions.
-
-    :param batch: the training demonstrations; one alone leaves nothing to predict.
-    :param ridge: the spec's own.
-    """
-    scaling = model.scaling
-    dims = [dim for own, part in zip(scaling.groups, scaling.parts, strict=True) if part.continuous for dim in own]
-    (policy, *_), count = model.networks().values(), model.option_levels()[0].count if model.depth else 1
-    assert isinstance(policy, Mlp)  # EM trains no other
-    if len(batch) < 2 or not dims or not ridge or not policy.reads:
-        return ridge
-    given = batch.inputs.select(policy.reads).vector.double()
-    x = torch.cat([given, given.new_ones(*given.shape[:-1], 1)], dim=-1)
-    alive = batch.alive
-    clusters = Clusters(batch, count, seed, controls=True, read=policy.reads).choices(batch) if count > 1 else alive
-    fold = (torch.arange(len(batch)) % min(FOLDS, len(batch))).unsqueeze(1)
-    ridges = ridge * torch.tensor(RAISED, dtype=torch.float64)
-    total = torch.zeros_like(ridges)
-    for left_out in fold.unique():
-        for cluster in range(1, count + 1):
-            inside = alive & (clusters == cluster)
-            parts = inside & (fold != left_out), inside & (fold == left_out)
-            rows = [(x[where], batch.actions[where][:, dims].double()) for where in parts]
-            total += _score(*rows[0], *rows[1], ridges)
-    values = total / batch.steps
-    return float(ridges[int((values >= values.max() - ENOUGH).nonzero()[0])])
-
-
-def _score(x: Tensor, actions: Tensor, others: Tensor, their: Tensor, ridges: Tensor) -> Tensor:
-    """The log-likelihood of left-out controls under regressions with each of R ridges, up to a constant, [R] nats."""
-    prior = ridges.unsqueeze(-1).repeat(1, x.shape[-1])
-    prior[:, -1] = BIAS
-    weight = torch.linalg.solve(x.T @ x + torch.diag_embed(prior), x.T @ actions)  # [R, F, A]
-    square = (actions - x @ weight).square().sum(1) + (prior.unsqueeze(-1) * weight.square()).sum(1)
-    std = (square / max(len(x) + x.shape[-1] - 1, 1)).sqrt().clamp(min=LEAST)
-    error = (their - others @ weight) / std.unsqueeze(1)
-    return -0.5 * error.square().sum((1, 2)) - len(their) * std.log().sum(1)

@@ -38,12 +38,13 @@ from ddco_pyro.spec import Spec, with_overrides
 from ddco_pyro.training.checkpoint import Progress, Restart, TrainingData, copy_of, fitted_of
 from ddco_pyro.training.data import tuning_split
 from ddco_pyro.training.em import Expectation
+from ddco_pyro.training.initialization import cross_validated
 from ddco_pyro.training.labels import Labels
 from ddco_pyro.training.loop import train
 from ddco_pyro.training.networks import Dimensions, build_hierarchy, model_name
 from ddco_pyro.training.objective import TrainingError
 from ddco_pyro.training.optimizers import optimizer_of
-from ddco_pyro.training.prior import Prior, cross_validated
+from ddco_pyro.training.prior import Prior
 from ddco_pyro.training.processes import Ranks, described, device_of, one_thread
 from ddco_pyro.training.recognition import recognise
 from ddco_pyro.training.stages import EVERYTHING, plan, starts_of

@@ -37,9 +37,9 @@ from ddco_pyro.model.emissions import KINDS
 from ddco_pyro.model.outputs import bounded
 from ddco_pyro.spec import RidgeSpec, parse_spec, with_overrides
 from ddco_pyro.training.em import Expectation
+from ddco_pyro.training.initialization import cross_validated
 from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.optimizers import is_linear
-from ddco_pyro.training.prior import cross_validated
 from ddco_pyro.training.restarts import Trainer
 
 
